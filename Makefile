@@ -1,0 +1,38 @@
+# make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
+# make test   set up .venv and run all tests (those marked gpu skip themselves without a CUDA device)
+# make lint   check style
+# make clean  remove everything that can be made again, except results
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?= task=Rope method=adam seed=0
+
+BIN := $(VENV)/bin
+
+.PHONY: run test lint clean
+
+run: $(VENV)/.run.stamp
+	$(BIN)/python -m plab.run $(ARGS)
+
+test: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest -m ""
+
+lint: $(VENV)/.dev.stamp
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+
+clean:
+	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Installed again only when what is to be installed has changed. The dev set-up includes the other.
+$(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e .
+	touch $@
+
+$(VENV)/.dev.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
+	touch $@ $(VENV)/.run.stamp
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)

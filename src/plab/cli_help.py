@@ -1,0 +1,73 @@
+"""The text of ``--help``, made from the YAML files, so that it cannot disagree with them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from plab.config import choices, config_dir
+
+__all__ = ["help_text"]
+
+_USAGE = """\
+python -m plab.run [KEY=VALUE ...] [-m]
+
+Runs one task, variant, method and seed of PlasticineLab and writes one result file into results_dir.
+A run that was stopped goes on when the same command is given again; one that has finished is not repeated.
+
+EXAMPLES
+  python -m plab.run task=Rope method=adam seed=0
+  python -m plab.run task=Move variant=3 method=gd method.lr=0.05
+  python -m plab.run sim=reference sim.device=cuda             float64 on the GPU
+  python -m plab.run sim.particles_scale=0.2 method.iterations=20         a quick try
+  python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs, one after the other
+
+  python -m plab.run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
+
+FLAGS
+  -m, --multirun    run every combination of the values given with commas
+  --cfg job         print the configuration and stop; with --package sim, only that section
+  -h, --help        this text; --hydra-help explains Hydra's own flags
+"""
+
+_KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P<comment>.*))?$")
+
+
+def help_text() -> str:
+    """Return the text of ``--help``: usage, choices, and every key with its default and explanation."""
+    folder = config_dir()
+    parts = [_USAGE]
+    for group in ("task", "method", "sim"):
+        parts.append(f"{group.upper()}S" if group != "sim" else "SIMULATOR PRESETS")
+        parts += [
+            f"  {group}={name:<10} {_title(folder / group / f'{name}.yaml')}" for name in choices(group)
+        ]
+        parts.append("")
+    parts.append("KEYS, with their defaults")
+    parts += _keys(folder / "config.yaml", "")
+    parts += _keys(folder / "sim" / "fast.yaml", "sim.")
+    parts += _keys(folder / "method" / "adam.yaml", "method.")
+    parts.append("  and those of the task; here of Rope:")
+    parts += _keys(folder / "task" / "Rope.yaml", "task.")
+    return "\n".join(parts)
+
+
+def _title(path: Path) -> str:
+    return path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+
+
+def _keys(path: Path, prefix: str) -> Iterator[str]:
+    """Yield a line for each commented key of a YAML file, except Hydra's."""
+    parents: list[str] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        match = _KEY.match(line)
+        if match is None:
+            continue
+        depth = len(match["indent"]) // 2
+        parents[depth:] = [match["key"]]
+        if parents[0] in ("defaults", "hydra") or (len(parents) > 1 and parents[0] == "variants"):
+            continue
+        key = prefix + ".".join(parents)
+        value = re.sub(r"^[&*]\w+", "", match["value"].strip())
+        yield f"  {f'{key}={value}' if value else key:<52} {match['comment'] or ''}".rstrip()

@@ -1,0 +1,90 @@
+"""One-line explanations of what Hydra and OmegaConf reject, with the names that would do."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterator, Sequence
+
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
+
+__all__ = ["explain", "pick"]
+
+
+def pick(name: str, names: Sequence[str]) -> str:
+    """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
+    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.6)
+    guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
+    return f"{guess}choose from: {', '.join(names)}"
+
+
+def explain(error: HydraException | OmegaConfBaseException) -> str:
+    """Return one line that says what is wrong with a configuration.
+
+    Args:
+        error: What Hydra or OmegaConf raised.
+
+    Returns:
+        The line, without a full stop.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return f"{group} '{name}' does not exist; {pick(name, error.options)}"
+    if isinstance(error, OverrideParseException):
+        return f"cannot read '{error.override}': write key=value, and quote values with special characters"
+    cause = _omegaconf_cause(error)
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        return _unknown_key(cause)
+    if isinstance(cause, MissingMandatoryValue):
+        return f"{cause.full_key} has no value: give one"
+    if cause is not None:
+        place = f"{cause.full_key}: " if cause.full_key else ""
+        return place + _first_line(cause.msg or str(cause))
+    message = str(error)
+    if message.startswith("Ambiguous value for argument"):
+        argument = message.split("'")[1]
+        return f"'{argument}' gives several values: add -m to run each of them, or write [a,b] for a list"
+    if message.startswith("Could not override"):
+        # A choice for a group that the defaults do not have.
+        return _first_line(message)
+    return "; ".join(line.strip() for line in message.splitlines() if line.strip())
+
+
+def _omegaconf_cause(error: BaseException | None) -> OmegaConfBaseException | None:
+    while error is not None and not isinstance(error, OmegaConfBaseException):
+        error = error.__cause__
+    return error
+
+
+def _unknown_key(error: OmegaConfBaseException) -> str:
+    parent = error.parent_node
+    key = str(error.full_key or error.key)
+    last = key.rpartition(".")[2]
+    names = [str(name) for name in parent if name != "hydra"] if isinstance(parent, DictConfig) else []
+    # lr=0.1 instead of method.lr=0.1: name the key that ends like it.
+    deeper = [path for path in _paths(parent) if path.rpartition(".")[2] == last] if "." not in key else []
+    if deeper:
+        return f"unknown key '{key}'; did you mean {' or '.join(deeper[:3])}? choose from: {', '.join(names)}"
+    return f"unknown key '{key}'; {pick(last, names)}"
+
+
+def _paths(node: object, prefix: str = "") -> Iterator[str]:
+    """Dotted paths of all keys of dataclass nodes below a node."""
+    if not isinstance(node, DictConfig) or not dataclasses.is_dataclass(OmegaConf.get_type(node)):
+        return
+    for key in node:
+        if key != "hydra":
+            yield f"{prefix}{key}"
+            if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
+                yield from _paths(node[key], f"{prefix}{key}.")
+
+
+def _first_line(text: str) -> str:
+    return text.strip().splitlines()[0]

@@ -1,0 +1,237 @@
+"""What a run is judged by: mass tensors, target distance, losses, rewards, soft IoU, scores, observations.
+
+Plain NumPy in float64: the final evaluation and the tests use it; the simulator computes the same loss terms
+on its own grid, where their gradient is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = [
+    "OBSERVED_PARTICLES",
+    "TARGET_MASS",
+    "LossWeights",
+    "Scores",
+    "observation",
+    "rewards",
+    "scores",
+    "soft_iou",
+    "spread_mass",
+    "target_sdf",
+    "total_loss",
+]
+
+OBSERVED_PARTICLES = 200
+"""Particles in an observation, at least: every (particle count // this)-th is taken."""
+
+TARGET_MASS = 1e-4
+"""Mass above which a grid node belongs to the target."""
+
+
+@dataclass
+class LossWeights:
+    """Weights of the three terms of the step loss.
+
+    Attributes:
+        density: Weight of ``sum |S - S*|``.
+        sdf: Weight of ``sum sdf* S``.
+        contact: Weight of the moving manipulators' squared distances to the nearest particle.
+    """
+
+    density: float
+    sdf: float
+    contact: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How close an episode came to the target.
+
+    Attributes:
+        iou_initial: Soft IoU of the initial mass tensor and the target.
+        iou_final: Soft IoU of the final mass tensor and the target.
+        iou_target_self: Soft IoU of the target and itself, well below 1: the most that can be reached.
+        score_printed: The paper's printed formula ``(iou_final - iou_initial) / (1 - iou_initial)``.
+        score: What the paper's tables hold: ``(iou_final - iou_initial) / (iou_target_self - iou_initial)``,
+            clamped to [0, 1].
+    """
+
+    iou_initial: float
+    iou_final: float
+    iou_target_self: float
+    score_printed: float
+    score: float
+
+
+def spread_mass(x: ArrayLike, n: int, mass: float) -> np.ndarray:
+    """Spread particles of equal mass over the grid with the quadratic B-spline.
+
+    Node i is at i / n. A particle within half a cell of a lower face also reaches the ghost node at -1; that
+    share goes to node 0, so that no mass is lost.
+
+    Args:
+        x: Particle positions [domain units], shape [particle, 3].
+        n: Grid nodes per axis.
+        mass: Mass per particle.
+
+    Returns:
+        Mass tensor, shape [n, n, n], float64.
+
+    Raises:
+        ValueError: If the positions are not of shape [particle, 3], not finite, or reach beyond the grid.
+    """
+    x = np.asarray(x, dtype=np.float64)
+    if x.ndim != 2 or x.shape[1] != 3:
+        raise ValueError(f"positions have shape {list(x.shape)}, not [particle, 3]")
+    scaled = x * n
+    # Written so that nan fails it too. Beyond these limits a particle reaches nodes below -1 or above n - 1.
+    if not np.all((scaled >= -0.5) & (scaled < n - 1.5)):
+        raise ValueError(
+            f"positions outside the grid: each coordinate must be in [{-0.5 / n:.4g}, {1 - 1.5 / n:.4g})"
+        )
+    base = np.floor(scaled - 0.5)
+    f = scaled - base
+    weight = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+    node = np.maximum(base.astype(np.int64) + np.arange(3)[:, None, None], 0)
+    grid = np.zeros(n**3)
+    for i, j, k in np.ndindex(3, 3, 3):
+        flat = (node[i, :, 0] * n + node[j, :, 1]) * n + node[k, :, 2]
+        grid += np.bincount(flat, weight[i, :, 0] * weight[j, :, 1] * weight[k, :, 2], minlength=n**3)
+    return mass * grid.reshape(n, n, n)
+
+
+def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
+    """Distance of every grid node to the nearest node of the target.
+
+    Args:
+        mass: Mass tensor of the target, shape [n, n, n].
+        threshold: Mass above which a node belongs to the target.
+
+    Returns:
+        Distance [domain units], shape [n, n, n]; 0 on the target's nodes.
+
+    Raises:
+        ValueError: If no node holds more than the threshold.
+    """
+    # Imported here: SciPy's start-up would be paid by every `--help`.
+    from scipy.ndimage import distance_transform_edt
+
+    mass = np.asarray(mass, dtype=np.float64)
+    outside = ~(mass > threshold)
+    if outside.all():
+        raise ValueError(
+            f"the target is empty: no node holds more than {threshold:g}, the most is {mass.max():.3g}"
+        )
+    return distance_transform_edt(outside) / mass.shape[0]
+
+
+def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
+    """Soft intersection over union of two mass tensors, each divided by its own maximum.
+
+    Args:
+        a: Mass tensor, any shape.
+        b: Mass tensor of the same shape.
+
+    Returns:
+        ``sum(a b) / sum(a + b - a b)``, in [0, 1]; symmetric, and not 1 for a tensor and itself unless it is
+        binary.
+
+    Raises:
+        ValueError: If the shapes differ or a tensor holds no mass.
+    """
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    if a.shape != b.shape:
+        raise ValueError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
+    largest_a, largest_b = a.max(initial=0.0), b.max(initial=0.0)
+    # Written so that nan fails it too.
+    if not (0.0 < largest_a < np.inf and 0.0 < largest_b < np.inf):
+        raise ValueError(
+            f"mass tensors need finite mass somewhere: their maxima are {largest_a:g} and {largest_b:g}"
+        )
+    a, b = a / largest_a, b / largest_b
+    both = a * b
+    return float(both.sum() / (a + b - both).sum())
+
+
+def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
+    """Judge an episode by its first and last mass tensor.
+
+    Where the initial shape is as good as the target itself, so that nothing can be gained and the formulas
+    divide by zero, a score is 1 if the final shape is still as good, and 0 otherwise.
+
+    Args:
+        initial: Mass tensor at the start, shape [n, n, n].
+        final: Mass tensor after the last step, shape [n, n, n].
+        target: Mass tensor of the target, shape [n, n, n].
+
+    Returns:
+        The IoUs and both scores.
+    """
+    start, end, best = soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target)
+    return Scores(
+        iou_initial=start,
+        iou_final=end,
+        iou_target_self=best,
+        score_printed=_gain(start, end, 1.0),
+        score=min(max(_gain(start, end, best), 0.0), 1.0),
+    )
+
+
+def _gain(start: float, end: float, best: float) -> float:
+    """Share of the way from ``start`` to ``best`` that ``end`` has come."""
+    way = best - start
+    if way <= 1e-12:
+        return 1.0 if end >= best - 1e-12 else 0.0
+    return (end - start) / way
+
+
+def total_loss(terms: ArrayLike, weights: LossWeights) -> np.ndarray:
+    """Weigh and add the terms of the step loss.
+
+    Args:
+        terms: Density, SDF and contact term, in this order, shape [..., 3].
+        weights: Their weights.
+
+    Returns:
+        Loss, shape [...].
+    """
+    return np.asarray(terms) @ np.array([weights.density, weights.sdf, weights.contact])
+
+
+def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeights) -> np.ndarray:
+    """Reward of each step: the loss at the initial state minus the loss after the step.
+
+    Args:
+        initial_terms: Loss terms of the initial state, shape [..., 3].
+        step_terms: Loss terms after each environment step, shape [..., T, 3].
+        weights: Weights of the terms.
+
+    Returns:
+        Rewards, shape [..., T].
+    """
+    return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
+
+
+def observation(x: ArrayLike, v: ArrayLike, poses: Sequence[ArrayLike]) -> np.ndarray:
+    """What a policy sees: some particles, then the manipulators' poses.
+
+    Args:
+        x: Particle positions, shape [..., particle, 3].
+        v: Particle velocities, shape [..., particle, 3].
+        poses: One array per manipulator, shape [..., 7]: position and quaternion (w, x, y, z); chopsticks
+            [..., 8]: and their gap.
+
+    Returns:
+        Shape [..., 6 * observed + 7 * manipulators (+ 1 per chopsticks)]: position and velocity of every
+        (particle count // 200)-th particle, particle after particle, then the poses.
+    """
+    x, v = np.asarray(x), np.asarray(v)
+    stride = max(x.shape[-2] // OBSERVED_PARTICLES, 1)
+    particles = np.concatenate([x[..., ::stride, :], v[..., ::stride, :]], axis=-1)
+    flat = particles.reshape(*particles.shape[:-2], -1)
+    return np.concatenate([flat, *(np.asarray(pose) for pose in poses)], axis=-1)

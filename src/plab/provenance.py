@@ -1,0 +1,90 @@
+"""Where a result comes from: versions, platform, commit, device, start time."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+__all__ = ["provenance", "version_changes"]
+
+_PACKAGES = {
+    "plab": "plab",
+    "taichi": "taichi",
+    "torch": "torch",
+    "numpy": "numpy",
+    "h5py": "h5py",
+    "hydra": "hydra-core",
+}
+"""Recorded name to distribution name. The packages are not imported: torch alone takes seconds."""
+
+
+def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe the run that starts now.
+
+    Args:
+        config: Resolved configuration; gives device, precision and seed.
+
+    Returns:
+        Flat scalars, fit for HDF5 attributes. ``git_commit`` is empty where plab does not run from its
+        repository.
+    """
+    commit, dirty = _git()
+    return {
+        **{name: _version(distribution) for name, distribution in _PACKAGES.items()},
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cpu_count": os.cpu_count() or 0,
+        "git_commit": commit,
+        "git_dirty": dirty,
+        "device": config["sim"]["device"],
+        "precision": config["sim"]["precision"],
+        "seed": config["seed"],
+        "start_time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "resumed": 0,
+    }
+
+
+def version_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return what differs between two provenances and could change numbers, as ``name old -> new``."""
+    names = (*_PACKAGES, "python", "git_commit")
+    return [f"{n} {before.get(n)} -> {now[n]}" for n in names if before.get(n) != now[n]]
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _processor() -> str:
+    """Return the CPU's model name where Linux tells it, else what the platform module says."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def _git() -> tuple[str, bool]:
+    """Return the commit of plab's own repository ("" outside one), and whether tracked files differ."""
+    here = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed plab may lie inside somebody else's repository, whose commit says nothing about it.
+        git("ls-files", "--error-unmatch", here.name)
+        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return "", False

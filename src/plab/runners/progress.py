@@ -1,0 +1,77 @@
+"""Progress of a run: a bar with the time left on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column
+
+__all__ = ["Report", "show_progress"]
+
+Report = Callable[[int, str], None]
+"""Takes the number of steps done and a short text about how it goes."""
+
+PLAIN_EVERY = 10
+"""Steps between two lines where there is no terminal."""
+
+
+@contextmanager
+def show_progress(title: str, start: int, total: int, *, enabled: bool = True) -> Iterator[Report]:
+    """Show how far a run has come while the ``with`` block lasts.
+
+    Args:
+        title: What is running.
+        start: Steps done before.
+        total: Steps to do, the ones done before included.
+        enabled: Whether to show anything.
+
+    Yields:
+        Function to call after every step.
+    """
+    console = Console()
+    if not enabled:
+        yield lambda done, text: None
+    elif not console.is_terminal:
+        yield _plain(title, start, total)
+    else:
+        with Progress(*_columns(), console=console, expand=True) as progress:
+            task = progress.add_task(title, total=total, completed=start, text="")
+            yield lambda done, text: progress.update(task, completed=done, text=text)
+
+
+def _columns() -> tuple[ProgressColumn, ...]:
+    """Return the parts of the bar; on a narrow terminal the bar itself gives way, then the text."""
+
+    def whole() -> Column:
+        return Column(no_wrap=True)
+
+    return (
+        TextColumn("{task.description}", table_column=whole()),
+        BarColumn(bar_width=None, table_column=Column(ratio=1)),
+        MofNCompleteColumn(table_column=whole()),
+        TimeRemainingColumn(table_column=whole()),
+        TextColumn("{task.fields[text]}", table_column=whole()),
+    )
+
+
+def _plain(title: str, start: int, total: int) -> Report:
+    begin = time.monotonic()
+
+    def report(done: int, text: str) -> None:
+        if done - start == 1 or done % PLAIN_EVERY == 0 or done == total:
+            seconds = (time.monotonic() - begin) / max(done - start, 1) * (total - done)
+            print(f"{title} {done}/{total}, {timedelta(seconds=round(seconds))} left, {text}", flush=True)
+
+    return report

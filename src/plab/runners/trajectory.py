@@ -1,0 +1,266 @@
+"""Open-loop trajectory optimisation: a sequence of actions, improved by the gradient through the simulator.
+
+The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. To reproduce a result:
+
+    python -m plab.run task=Rope variant=1 method=adam seed=0
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from plab.config import build_scene, variant_task
+from plab.objective import rewards, scores, target_sdf, total_loss
+from plab.results import RunFile
+from plab.runners import RunError
+from plab.runners.progress import show_progress
+from plab.sim import DeviceError, SimulationError, Simulator
+from plab.targets import build_target
+
+if TYPE_CHECKING:
+    from plab.config import Config, TrajectoryConfig
+
+__all__ = ["OPTIMIZERS", "ActionSequence", "Problem", "run_trajectory"]
+
+
+def run_trajectory(cfg: Config, run: RunFile) -> None:
+    """Optimise a sequence of actions, evaluate the best one in the hard contact model, finish the file.
+
+    Args:
+        cfg: The composed configuration; ``cfg.method`` is a :class:`plab.config.TrajectoryConfig`.
+        run: The run's file; an earlier process's state in it is taken up.
+
+    Raises:
+        RunError: If the loss, the gradient or the state stops being finite.
+    """
+    with run.phase("build"):
+        problem = Problem(cfg)
+        actions = ActionSequence(cfg.method, problem.horizon, problem.action_dim, cfg.seed)
+        if run.result.resume is not None:
+            actions.restore(run.result.resume)
+    _optimise(cfg, problem, actions, run)
+    with run.phase("evaluate"):
+        evaluation, final_mass = _evaluate(problem, run.result.best_actions)
+    masses = {"initial": problem.initial_mass, "final": final_mass, "target": problem.target_mass}
+    run.finish(evaluation, masses)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout gave.
+
+    Attributes:
+        measures: Loss, its terms, reward and scores, as in the columns of the results.
+        gradient: Gradient of the trajectory loss, shape [T, A], or None.
+        final_mass: Mass tensor of the last state, shape [n, n, n].
+    """
+
+    measures: dict[str, float]
+    gradient: np.ndarray | None
+    final_mass: np.ndarray
+
+
+class Problem:
+    """One task with its simulator: what actions are judged by.
+
+    Attributes:
+        initial_mass: Mass tensor of the initial state, shape [n, n, n].
+        target_mass: Mass tensor of the target, shape [n, n, n].
+    """
+
+    def __init__(self, cfg: Config) -> None:
+        """Build scene, target and simulator."""
+        scene = build_scene(cfg)
+        self.horizon, self.action_dim = scene.horizon, scene.action_dim
+        self._weights = cfg.method.loss_weights
+        self.target_mass = build_target(scene, variant_task(cfg).target)
+        sim = cfg.sim
+        try:
+            self._simulator = Simulator(
+                [scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
+            )
+        except DeviceError as error:
+            raise RunError(str(error)) from error
+        self._simulator.set_target(self.target_mass[None], target_sdf(self.target_mass)[None])
+        self._simulator.set_loss_weights(self._weights.density, self._weights.sdf, self._weights.contact)
+        self._simulator.reset()
+        self.initial_mass = self._simulator.mass_tensor()[0]
+
+    def set_contact(self, model: str, softness: float = 0.0) -> None:
+        """Choose the contact model of the rollouts to come: ``soft``, with its decay rate, or ``hard``."""
+        self._simulator.set_contact(model, softness=softness)
+
+    def rollout(self, actions: np.ndarray, *, gradient: bool) -> Rollout:
+        """Run actions from the initial state.
+
+        Args:
+            actions: Actions in [-1, 1], shape [T, A].
+            gradient: Whether to compute the gradient of the trajectory loss.
+
+        Raises:
+            RunError: If the loss, the gradient or the state is not finite, or the gradient needs more memory.
+        """
+        try:
+            result = self._simulator.rollout(actions[None], gradient=gradient)
+        except (SimulationError, MemoryError) as error:
+            raise RunError(str(error)) from error
+        terms = result.step_terms[0]
+        slope = result.gradient[0] if gradient else None
+        # Before the scores: a tensor that is not finite has none.
+        _require_finite("loss", total_loss(terms, self._weights))
+        if slope is not None:
+            _require_finite("gradient", slope)
+        final_mass = self._simulator.mass_tensor()[0]
+        _require_finite("mass tensor", final_mass)
+        return Rollout(self._measures(result.initial_terms[0], terms, final_mass), slope, final_mass)
+
+    def _measures(self, initial: np.ndarray, terms: np.ndarray, final_mass: np.ndarray) -> dict[str, float]:
+        """Return loss, reward and scores of an episode from its terms [3], [T, 3] and last mass tensor."""
+        density, sdf, contact = terms.sum(axis=0)
+        judged = scores(self.initial_mass, final_mass, self.target_mass)
+        return {
+            "loss": float(total_loss(terms, self._weights).sum()),
+            "loss_density": float(density),
+            "loss_sdf": float(sdf),
+            "loss_contact": float(contact),
+            "reward": float(rewards(initial, terms, self._weights).sum()),
+            "iou": judged.iou_final,
+            "score": judged.score,
+            "score_printed": judged.score_printed,
+            "iou_initial": judged.iou_initial,
+            "iou_target_self": judged.iou_target_self,
+        }
+
+
+def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
+    return torch.optim.Adam([parameter], lr=method.lr, betas=tuple(method.betas), eps=method.eps)
+
+
+def _momentum(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
+    """v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
+    # torch's SGD weighs the gradient by 1 - dampening.
+    m = method.momentum
+    optimizer = torch.optim.SGD([parameter], lr=method.lr, momentum=m, dampening=m)
+    # Without a buffer it takes the first gradient undampened, ten times too large at m = 0.9.
+    optimizer.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
+    return optimizer
+
+
+OPTIMIZERS = {"adam": _adam, "gd": _momentum}
+"""Update rules by the name that ``method.optimizer`` gives."""
+
+
+class ActionSequence:
+    """The actions of an episode and the optimiser that improves them.
+
+    Attributes:
+        parameter: Actions, each in [-1, 1], shape [T, A], float64.
+    """
+
+    def __init__(self, method: TrajectoryConfig, horizon: int, action_dim: int, seed: int) -> None:
+        """Draw the first actions, uniform in +-``method.action_init``.
+
+        Args:
+            method: Update rule and its parameters.
+            horizon: Environment steps T.
+            action_dim: Length A of the action vector.
+            seed: Seed of the draw.
+        """
+        self._generator = torch.Generator().manual_seed(seed)
+        unit = torch.rand((horizon, action_dim), generator=self._generator, dtype=torch.float64)
+        self.parameter = ((2.0 * unit - 1.0) * method.action_init).requires_grad_()
+        self._optimizer = OPTIMIZERS[method.optimizer](self.parameter, method)
+
+    def numpy(self) -> np.ndarray:
+        """Return a copy of the actions, shape [T, A]."""
+        return self.parameter.detach().numpy().copy()
+
+    def step(self, gradient: np.ndarray) -> None:
+        """Update the actions by a gradient of shape [T, A] and clip them to [-1, 1]."""
+        self.parameter.grad = torch.from_numpy(np.array(gradient, dtype=np.float64))
+        self._optimizer.step()
+        with torch.no_grad():
+            self.parameter.clamp_(-1.0, 1.0)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next steps depend on, as arrays."""
+        buffers = self._optimizer.state[self.parameter]
+        return {
+            "actions": self.numpy(),
+            "optimizer": {name: buffer.numpy().copy() for name, buffer in buffers.items()},
+            "random": self._generator.get_state().numpy(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        with torch.no_grad():
+            self.parameter.copy_(torch.from_numpy(state["actions"]))
+        buffers = {name: torch.from_numpy(array) for name, array in state["optimizer"].items()}
+        self._optimizer.state[self.parameter] = buffers
+        self._generator.set_state(torch.from_numpy(state["random"]))
+
+
+def _optimise(cfg: Config, problem: Problem, actions: ActionSequence, run: RunFile) -> None:
+    """Do the iterations that the file does not hold yet."""
+    problem.set_contact(cfg.method.contact, cfg.method.softness)
+    start, total = len(run.result.iterations), cfg.method.iterations
+    title = f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
+    with show_progress(title, start, total, enabled=cfg.progress) as report:
+        for iteration in range(start, total):
+            # The first rollout of a process compiles the kernels.
+            with run.phase("compile" if iteration == start else "optimise"):
+                row, changes = _iterate(problem, actions, iteration, run.result.best_loss)
+            run.record(row, actions.state(), **changes)
+            best = f"best {run.result.best_loss:.5g}"
+            report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best}")
+
+
+_COLUMNS = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
+
+
+def _iterate(
+    problem: Problem, actions: ActionSequence, iteration: int, best_loss: float
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Do one iteration: rollout with gradient, row, update of the actions.
+
+    Returns:
+        The row of the iteration, and the fields of the result that change: the best so far, if this is it.
+    """
+    start = time.perf_counter()
+    tried = actions.numpy()
+    try:
+        rollout = problem.rollout(tried, gradient=True)
+        actions.step(rollout.gradient)
+    except RunError as error:
+        raise RunError(f"iteration {iteration}: {error}") from error
+    row = {"iteration": iteration} | {name: rollout.measures[name] for name in _COLUMNS}
+    row["gradient_norm"] = float(np.linalg.norm(rollout.gradient))
+    row["seconds"] = time.perf_counter() - start
+    # Written so that the first loss beats the NaN that stands for none.
+    better = not row["loss"] >= best_loss
+    best = {"best_actions": tried, "best_iteration": iteration, "best_loss": row["loss"]}
+    return row, best if better else {}
+
+
+def _evaluate(problem: Problem, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+    """Run the best actions in the hard contact model; return its scalars and the last mass tensor."""
+    problem.set_contact("hard")
+    try:
+        rollout = problem.rollout(actions, gradient=False)
+    except RunError as error:
+        raise RunError(f"final evaluation: {error}") from error
+    return rollout.measures, rollout.final_mass
+
+
+def _require_finite(what: str, values: np.ndarray) -> None:
+    """Raise unless all values are finite; of a series over time, shape [T], say where it stops being so."""
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        place = f" at environment step {bad[0] + 1}" if np.ndim(values) == 1 else ""
+        raise RunError(f"{what} is {values.flat[bad[0]]}{place}")

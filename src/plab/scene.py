@@ -1,0 +1,288 @@
+"""What is in a scene: bodies of plasticine, manipulators, material, floor.
+
+A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi, Hydra or
+Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start from it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = [
+    "MANIPULATOR_SHAPES",
+    "Body",
+    "Manipulator",
+    "ManipulatorShape",
+    "Scene",
+    "SceneError",
+    "sample_particles",
+]
+
+Vec3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class SceneError(ValueError):
+    """A scene that cannot be simulated; the message says why and which value would do."""
+
+
+@dataclass(frozen=True)
+class ManipulatorShape:
+    """What all manipulators of one shape have in common.
+
+    Attributes:
+        size_names: Names of the entries of :attr:`Manipulator.size`, in order; all lengths [domain units].
+        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation) or ``static``.
+        action_names: Name of each action component, in order. Each is clipped to [-1, 1].
+    """
+
+    size_names: tuple[str, ...]
+    motion: str
+    action_names: tuple[str, ...]
+
+
+_XYZ = ("x", "y", "z")
+_ROTATION = ("rotation_x", "rotation_y", "rotation_z")
+
+MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
+    "Sphere": ManipulatorShape(("radius",), "translate", _XYZ),
+    "Capsule": ManipulatorShape(("h", "r"), "translate", _XYZ),
+    "RollingPin": ManipulatorShape(("h", "r"), "roll", ("roll", "yaw", "vertical")),
+    "Chopsticks": ManipulatorShape(("h", "r"), "grip", (*_XYZ, *_ROTATION, "close")),
+    "Torus": ManipulatorShape(("tx", "ty"), "translate", _XYZ),
+    "Cylinder": ManipulatorShape(("radius", "half_height"), "static", ()),
+    "Box": ManipulatorShape(("half_x", "half_y", "half_z"), "rigid", (*_XYZ, *_ROTATION)),
+}
+"""The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks (two parallel
+capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y), Box."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """One body of plasticine, filled with particles at t = 0.
+
+    Attributes:
+        shape: ``sphere`` or ``box``.
+        center: Centre [domain units].
+        size: Sphere: ``(radius,)``. Box: full edge lengths ``(x, y, z)``.
+        particles: Number of particles drawn uniformly inside.
+    """
+
+    shape: str
+    center: Vec3
+    size: tuple[float, ...]
+    particles: int
+
+    def half_extent(self) -> np.ndarray:
+        """Half of the bounding box's edges, shape [3]."""
+        return np.full(3, self.size[0]) if self.shape == "sphere" else np.asarray(self.size, dtype=float) / 2
+
+
+@dataclass(frozen=True)
+class Manipulator:
+    """One rigid, kinematic manipulator.
+
+    Attributes:
+        shape: Key of :data:`MANIPULATOR_SHAPES`.
+        size: Lengths named by ``MANIPULATOR_SHAPES[shape].size_names``.
+        position: Position at t = 0.
+        rotation: Unit quaternion (w, x, y, z) at t = 0.
+        scale: Motion over one environment step at action 1, one number per action component (lengths, or radians).
+        friction: Coulomb friction coefficient with the plasticine.
+        lower_bound: Lowest position, clamped after every substep.
+        upper_bound: Highest position.
+        gap: Distance between the axes of the chopsticks at t = 0; unused by other shapes.
+        minimal_gap: Smallest gap the chopsticks can close to.
+    """
+
+    shape: str
+    size: tuple[float, ...]
+    position: Vec3
+    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    scale: tuple[float, ...] = ()
+    friction: float = 0.9
+    lower_bound: Vec3 = (0.0, 0.0, 0.0)
+    upper_bound: Vec3 = (1.0, 1.0, 1.0)
+    gap: float = 0.06
+    minimal_gap: float = 0.06
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action components, 0 for a static manipulator."""
+        return len(MANIPULATOR_SHAPES[self.shape].action_names)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that the simulator needs to know about one environment.
+
+    Attributes:
+        name: Task name, for messages.
+        bodies: Bodies of plasticine.
+        manipulators: Manipulators, in the order in which they act on the grid and in the action vector.
+        youngs_modulus: Young's modulus E.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
+        floor_friction: Floor friction: 0 slips, 10 and more sticks, Coulomb-like in between.
+        gravity: Acceleration added to every grid node; the suite's is (0, -30, 0).
+        grid_size: Grid nodes per axis; node i is at i / grid_size.
+        dt: Time step of one substep.
+        substeps: Substeps per environment step.
+        horizon: Environment steps per episode.
+        particle_seed: Seed of the particles' positions.
+    """
+
+    name: str
+    bodies: tuple[Body, ...]
+    manipulators: tuple[Manipulator, ...]
+    youngs_modulus: float = 5000.0
+    poisson_ratio: float = 0.2
+    yield_stress: float = 50.0
+    floor_friction: float = 1.5
+    gravity: Vec3 = (0.0, -30.0, 0.0)
+    grid_size: int = 64
+    dt: float = 1e-4
+    substeps: int = 19
+    horizon: int = 50
+    particle_seed: int = 0
+
+    @property
+    def dx(self) -> float:
+        """Grid spacing."""
+        return 1.0 / self.grid_size
+
+    @property
+    def particle_volume(self) -> float:
+        """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab release.
+
+        It cancels in the motion and only scales the mass tensor, hence the loss.
+        """
+        return (0.5 * self.dx) ** 2
+
+    @property
+    def particle_mass(self) -> float:
+        """Mass per particle; the density is 1."""
+        return self.particle_volume
+
+    @property
+    def shear_modulus(self) -> float:
+        """Lame parameter mu."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """Lame parameter lambda."""
+        nu = self.poisson_ratio
+        return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+    @property
+    def action_dim(self) -> int:
+        """Length of the action vector: the moving manipulators' components, concatenated."""
+        return sum(m.action_dim for m in self.manipulators)
+
+    @property
+    def particle_count(self) -> int:
+        """Particles of all bodies."""
+        return sum(b.particles for b in self.bodies)
+
+    @property
+    def stable_dt(self) -> float:
+        """Largest admissible time step: the elastic wave of speed sqrt(lambda + 2 mu) crosses one cell."""
+        return self.dx / math.sqrt(self.lame_lambda + 2.0 * self.shear_modulus)
+
+    def validate(self) -> None:
+        """Check that the scene can be simulated.
+
+        Raises:
+            SceneError: With the reason and a value that would do.
+        """
+        _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
+        _require(self.youngs_modulus > 0, f"youngs_modulus {self.youngs_modulus:g} must be positive")
+        _require(
+            0 <= self.poisson_ratio < 0.5,
+            f"poisson_ratio {self.poisson_ratio:g} is outside [0, 0.5)",
+        )
+        _require(self.yield_stress >= 0, f"yield_stress {self.yield_stress:g} must not be negative")
+        _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
+        _require(self.dt > 0, f"dt {self.dt:g} must be positive")
+        steps = math.ceil(self.substeps * self.dt / self.stable_dt)
+        _require(
+            self.dt <= self.stable_dt,
+            f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of this material and grid: "
+            f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}",
+        )
+        _require(len(self.bodies) > 0, "a scene needs at least one body")
+        for number, body in enumerate(self.bodies):
+            self._validate_body(number, body)
+        for number, manipulator in enumerate(self.manipulators):
+            self._validate_manipulator(number, manipulator)
+
+    def _validate_body(self, number: int, body: Body) -> None:
+        label = f"bodies[{number}]"
+        _require(body.shape in ("sphere", "box"), f"{label}: shape '{body.shape}' is not one of sphere, box")
+        entries = 1 if body.shape == "sphere" else 3
+        _require(len(body.size) == entries, f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}")
+        _require(min(body.size) > 0, f"{label}: sizes must be positive, not {body.size}")
+        _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
+        top = 1.0 - 3.0 * self.dx
+        low = np.asarray(body.center) - body.half_extent()
+        high = np.asarray(body.center) + body.half_extent()
+        for axis, name in enumerate("xyz"):
+            # Bodies rest on the floor at y = 0 exactly; half a rounding error below it is not outside.
+            inside = low[axis] >= -1e-9 and high[axis] <= top + 1e-9
+            half = body.half_extent()[axis]
+            _require(
+                inside,
+                f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain 0 .. {top:.4g}: "
+                f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
+            )
+
+    def _validate_manipulator(self, number: int, manipulator: Manipulator) -> None:
+        label = f"manipulators[{number}]"
+        shape = MANIPULATOR_SHAPES.get(manipulator.shape)
+        if shape is None:
+            names = ", ".join(MANIPULATOR_SHAPES)
+            raise SceneError(f"{label}: shape '{manipulator.shape}' is not one of {names}")
+        names = ", ".join(shape.size_names)
+        _require(
+            len(manipulator.size) == len(shape.size_names) and min(manipulator.size) > 0,
+            f"{label}: a {manipulator.shape} needs positive sizes ({names}), not {manipulator.size}",
+        )
+        _require(
+            len(manipulator.scale) == manipulator.action_dim,
+            f"{label}: a {manipulator.shape} needs {manipulator.action_dim} scale(s), not {len(manipulator.scale)}",
+        )
+        norm = math.sqrt(sum(c * c for c in manipulator.rotation))
+        _require(abs(norm - 1.0) < 1e-3, f"{label}: rotation has length {norm:.4g}, not 1: give a unit quaternion")
+        _require(manipulator.friction >= 0, f"{label}: friction {manipulator.friction:g} must not be negative")
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise SceneError(message)
+
+
+def sample_particles(scene: Scene) -> np.ndarray:
+    """Draw the particles' initial positions, uniformly inside each body.
+
+    Args:
+        scene: The scene; ``particle_seed`` and the bodies decide the result.
+
+    Returns:
+        Positions [domain units], shape [particle, 3], float64, body after body.
+    """
+    rng = np.random.default_rng(scene.particle_seed)
+    parts = []
+    for body in scene.bodies:
+        if body.shape == "box":
+            unit = rng.random((body.particles, 3)) - 0.5
+            parts.append(np.asarray(body.center) + unit * np.asarray(body.size))
+        else:
+            direction = rng.normal(size=(body.particles, 3))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            radius = body.size[0] * np.cbrt(rng.random((body.particles, 1)))
+            parts.append(np.asarray(body.center) + radius * direction)
+    return np.concatenate(parts)

@@ -1,0 +1,404 @@
+"""Kernels: the phases of a substep put together for the CPU and for CUDA.
+
+On the CPU one launch does a whole environment step. A team of threads works on one environment, meeting at barriers
+between phases (a launch costs a hundred microseconds of waking threads, a barrier less than one); with more environments
+than threads every thread has environments of its own. On CUDA each phase of a substep is one launch over all environments.
+"""
+
+import taichi as ti
+
+from plab.sim.grid_phases import GridPhases
+from plab.sim.loss_phases import LossPhases
+from plab.sim.particle_phases import ParticlePhases
+from plab.sim.pose_phases import PosePhases
+from plab.sim.storage import BLOCK, STATE
+from plab.sim.transfer import spline
+
+__all__ = ["CpuEngine"]
+
+BLOCK_NODES = BLOCK**3
+
+SPLIT = 512
+"""Taichi hands out CPU loops in chunks of at least this many iterations; one iteration in each does a thread's work."""
+
+PADDING = 32
+"""Distance of the teams' barrier counters, so that no two share a cache line."""
+
+
+class Phases(ParticlePhases, GridPhases, PosePhases, LossPhases):
+    """All phases."""
+
+
+@ti.data_oriented
+class CpuEngine(Phases):
+    """Kernels for the CPU."""
+
+    # -- threads ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def barrier(self, team):
+        """Wait until every thread of the team is here."""
+        if ti.static(self.team_size > 1):
+            ticket = ti.atomic_add(self.arrivals[team * PADDING], 1)
+            goal = (ticket // self.team_size + 1) * self.team_size
+            # An atomic that changes nothing: a plain load could be hoisted out of the loop.
+            while ti.atomic_or(self.arrivals[team * PADDING], 0) < goal:
+                pass
+
+    @ti.func
+    def first_tile(self, c):
+        """First tile of a chunk."""
+        return c * self.tiles // self.chunks
+
+    @ti.func
+    def lanes_of(self, tile):
+        """Particles in a tile."""
+        return ti.min(self.lanes, self.particles - tile * self.lanes)
+
+    @ti.func
+    def first_entry(self, e, c):
+        """First entry of a chunk's share of the environment's block list."""
+        return e * self.blocks + c * self.block_count[e] // self.chunks
+
+    # -- phases of one chunk ---------------------------------------------------------------------------------------
+
+    @ti.func
+    def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
+        """Material update and scatter of momentum and mass."""
+        grid_index = e * self.chunks + c
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            entry9 = (e * self.tiles + tile) * 9
+            self.material_tile(state, source, self.tile_entry(after, e, tile), entry9, e, True)
+            for lane in range(self.lanes_of(tile)):
+                base, fx = self.stencil(self.vector(state, source, lane))
+                self.mark(grid_index, base, stamp)
+                self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
+
+    @ti.func
+    def grid_chunk(self, e, c, s):
+        """Grid update of a share of the environment's blocks; the private grids are cleared for the next substep."""
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            near = self.near_manipulators(e, s, block)
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                total = self.take(self.momentum, e, node, holders)
+                v = self.update_node(e, s, i, near, total)
+                self.velocity[e * self.nodes + node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+
+    @ti.func
+    def take(self, grid: ti.template(), e, node, holders):
+        """Sum a node over the private grids of the chunks that hold it, and clear it there."""
+        total = ti.Vector.zero(self.real, 4)
+        for c in range(self.chunks):
+            if holders & (1 << c):
+                at = (e * self.chunks + c) * self.nodes + node
+                total += grid[at]
+                grid[at] = ti.Vector.zero(self.real, 4)
+        return total
+
+    @ti.func
+    def gather_chunk(self, state: ti.template(), before, after, e, c, time):
+        """Velocities, affine matrices and positions after the substep."""
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                self.gather_particle(state, source, target, lane, e, time)
+
+    @ti.func
+    def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
+        """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
+        grid_index = e * self.chunks + c
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            entry9 = (e * self.tiles + tile) * 9
+            self.material_tile(state, source, target, entry9, e, False)
+            for lane in range(self.lanes_of(tile)):
+                x = self.vector(state, source, lane)
+                base, fx = self.stencil(x)
+                self.mark(grid_index, base, stamp)
+                self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
+                h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
+                self.scatter(self.velocity_bar, grid_index * self.nodes + self.node_index(base), spline(fx), h)
+
+    @ti.func
+    def grid_chunk_adjoint(self, e, c, s):
+        """Grid update and its adjoint for a share of the environment's blocks."""
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            near = self.near_manipulators(e, s, block)
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                total = self.take(self.momentum, e, node, holders)
+                bar4 = self.take(self.velocity_bar, e, node, holders)
+                v, total_bar = self.update_node_adjoint(
+                    e * self.chunks + c, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
+                )
+                self.velocity[e * self.nodes + node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+                self.momentum_bar[e * self.nodes + node] = total_bar
+
+    @ti.func
+    def gather_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c):
+        """Adjoints of the particles before the substep."""
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            entry9 = (e * self.tiles + tile) * 9
+            for lane in range(self.lanes_of(tile)):
+                self.gather_particle_adjoint(state, source, target, bar, entry, entry9, lane, e)
+            self.material_tile_adjoint(state, source, bar, entry, entry9, e)
+
+    # -- losses of one chunk ---------------------------------------------------------------------------------------
+
+    @ti.func
+    def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
+        """Spread mass, and find the particle nearest to each manipulator."""
+        grid_index = e * self.chunks + c
+        for m in ti.static(range(self.manipulators)):
+            self.contact_part[e, c, m] = 1e9
+            self.contact_particle[e, c, m] = 0
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(slot, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                x = self.vector(state, source, lane)
+                base, fx = self.stencil(x)
+                self.mark(grid_index, base, stamp)
+                self.scatter_mass(grid_index, base, fx)
+                for shape, start, stop in ti.static(self.runs):
+                    if ti.static(shape != "Cylinder"):
+                        for m in range(start, stop):
+                            d = self.end_distance(shape, e, m, x)
+                            if d < self.contact_part[e, c, m]:
+                                self.contact_part[e, c, m] = d
+                                self.contact_particle[e, c, m] = tile * self.lanes + lane
+
+    @ti.func
+    def grid_loss_chunk(self, e, c):
+        """Loss terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
+        part = ti.Vector.zero(ti.f64, 2)
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                mass = self.take(self.momentum, e, node, holders)[3]
+                density, sdf, slope = self.node_loss(e, i, mass)
+                part[0] += density
+                part[1] += sdf
+                self.velocity[e * self.nodes + node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
+        self.loss_part[e, c] = part
+
+    @ti.func
+    def join_losses(self, e, terms: ti.template(), at):
+        """Sum the chunks' parts into three unweighted terms; the nearest particles go to chunk 0's entries."""
+        part = ti.Vector.zero(ti.f64, 2)
+        for c in range(self.chunks):
+            part += self.loss_part[e, c]
+            for m in ti.static(range(self.manipulators)):
+                if self.contact_part[e, c, m] < self.contact_part[e, 0, m]:
+                    self.contact_part[e, 0, m] = self.contact_part[e, c, m]
+                    self.contact_particle[e, 0, m] = self.contact_particle[e, c, m]
+        for m in ti.static(range(self.manipulators)):
+            if ti.static(self.motions[m] == "static"):
+                self.contact_part[e, 0, m] = 0.0
+        terms[at] = self.target_sum[e] + part[0]
+        terms[at + 1] = part[1]
+        terms[at + 2] = self.contact_term(e)
+
+    @ti.func
+    def losses_of_team(self, state: ti.template(), slot, e, team, rank, stamp, terms: ti.template(), at):
+        """Loss terms of one environment."""
+        for r in range(self.rounds(rank)):
+            self.scatter_mass_chunk(state, slot, e, rank + r * self.team_size, stamp)
+        self.barrier(team)
+        if rank == 0:
+            self.collect_blocks(e, stamp)
+        self.barrier(team)
+        for r in range(self.rounds(rank)):
+            self.grid_loss_chunk(e, rank + r * self.team_size)
+        self.barrier(team)
+        if rank == 0:
+            self.join_losses(e, terms, at)
+        self.barrier(team)
+
+    @ti.func
+    def rounds(self, rank):
+        """Chunks that a thread of a team works on."""
+        return (self.chunks - rank + self.team_size - 1) // self.team_size
+
+    @ti.func
+    def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
+        """Add the gradient of the density and SDF terms to the particles' position adjoints."""
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(slot, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                base, fx = self.stencil(self.vector(state, source, lane))
+                slope = self.mass_slope(self.velocity, e, base, fx)
+                for i in ti.static(range(3)):
+                    bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
+
+    @ti.func
+    def contact_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
+        """Add the gradient of the contact term to the nearest particles' and the poses' adjoints."""
+        for shape, start, stop in ti.static(self.runs):
+            if ti.static(shape != "Cylinder"):
+                for m in range(start, stop):
+                    if self.contact_part[e, 0, m] > 0.0:
+                        particle = self.contact_particle[e, 0, m]
+                        tile = particle // self.lanes
+                        lane = particle - tile * self.lanes
+                        x = self.vector(state, self.tile_entry(slot, e, tile), lane)
+                        x_bar = self.contact_adjoint_at(shape, e, m, x)
+                        entry = self.tile_entry(0, e, tile)
+                        for i in ti.static(range(3)):
+                            bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
+
+    # -- kernels ---------------------------------------------------------------------------------------------------
+
+    @ti.kernel
+    def step(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        poses: ti.types.ndarray(ndim=1),
+        actions: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        stride: ti.i32,
+        t: ti.i32,
+        pose_before: ti.i32,
+        pose_after: ti.i32,
+        stamp: ti.i32,
+    ):
+        """One environment step from time slot ``slot``; each substep moves on by ``stride`` slots (0: in place)."""
+        for team in range(self.teams):
+            self.arrivals[team * PADDING] = 0
+        for q in range(self.threads * SPLIT):
+            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
+                team = q // SPLIT // self.team_size
+                rank = q // SPLIT % self.team_size
+                for turn in range((self.batch - team + self.teams - 1) // self.teams):
+                    e = team + turn * self.teams
+                    if rank == 0:
+                        self.advance_manipulators(e, actions, poses, t, pose_before, pose_after)
+                    for s in range(self.substeps):
+                        before = slot + s * stride
+                        for r in range(self.rounds(rank)):
+                            self.scatter_chunk(
+                                state, before, before + stride, e, rank + r * self.team_size, stamp + s
+                            )
+                        self.barrier(team)
+                        if rank == 0:
+                            self.collect_blocks(e, stamp + s)
+                        self.barrier(team)
+                        for r in range(self.rounds(rank)):
+                            self.grid_chunk(e, rank + r * self.team_size, s)
+                        self.barrier(team)
+                        for r in range(self.rounds(rank)):
+                            self.gather_chunk(
+                                state, before, before + stride, e, rank + r * self.team_size, t * self.substeps + s
+                            )
+
+    @ti.kernel
+    def losses(self, state: ti.types.ndarray(ndim=1), slot: ti.i32, terms: ti.types.ndarray(ndim=1), at: ti.i32, stamp: ti.i32):
+        """Unweighted loss terms of all environments, written to ``terms`` from entry ``at``."""
+        for team in range(self.teams):
+            self.arrivals[team * PADDING] = 0
+        for q in range(self.threads * SPLIT):
+            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
+                team = q // SPLIT // self.team_size
+                rank = q // SPLIT % self.team_size
+                for turn in range((self.batch - team + self.teams - 1) // self.teams):
+                    e = team + turn * self.teams
+                    self.losses_of_team(state, slot, e, team, rank, stamp, terms, at + 3 * e)
+
+    @ti.kernel
+    def step_adjoint(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        bar: ti.types.ndarray(ndim=1),
+        poses: ti.types.ndarray(ndim=1),
+        actions: ti.types.ndarray(ndim=1),
+        actions_bar: ti.types.ndarray(ndim=1),
+        terms: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        t: ti.i32,
+        stamp: ti.i32,
+    ):
+        """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of its loss.
+
+        ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar`` likewise.
+        """
+        for team in range(self.teams):
+            self.arrivals[team * PADDING] = 0
+        for q in range(self.threads * SPLIT):
+            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
+                team = q // SPLIT // self.team_size
+                rank = q // SPLIT % self.team_size
+                for turn in range((self.batch - team + self.teams - 1) // self.teams):
+                    e = team + turn * self.teams
+                    end = slot + self.substeps
+                    if rank == 0:
+                        self.advance_manipulators(e, actions, poses, t, t, t + 1)
+                    self.barrier(team)
+                    self.losses_of_team(state, end, e, team, rank, stamp, terms, 3 * e)
+                    for r in range(self.rounds(rank)):
+                        self.loss_gradient_chunk(state, end, bar, e, rank + r * self.team_size)
+                    self.barrier(team)
+                    if rank == 0:
+                        self.contact_gradient(state, end, bar, e)
+                    self.barrier(team)
+                    for back in range(self.substeps):
+                        s = self.substeps - 1 - back
+                        now = stamp + 1 + back
+                        for r in range(self.rounds(rank)):
+                            self.scatter_chunk_adjoint(
+                                state, slot + s, slot + s + 1, bar, e, rank + r * self.team_size, now
+                            )
+                        self.barrier(team)
+                        if rank == 0:
+                            self.collect_blocks(e, now)
+                        self.barrier(team)
+                        for r in range(self.rounds(rank)):
+                            self.grid_chunk_adjoint(e, rank + r * self.team_size, s)
+                        self.barrier(team)
+                        if rank == 0:
+                            self.retreat_manipulators(e, s, actions, actions_bar, t)
+                        for r in range(self.rounds(rank)):
+                            self.gather_chunk_adjoint(
+                                state, slot + s, slot + s + 1, bar, e, rank + r * self.team_size
+                            )
+                        self.barrier(team)
+
+    @ti.kernel
+    def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):
+        """Place all manipulators at slot ``slot`` of the pose history."""
+        for e in range(self.batch):
+            self.place_manipulators(e, poses, slot)
+
+    @ti.kernel
+    def export_mass(self, out: ti.types.ndarray(ndim=1)):
+        """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
+        for e in range(self.batch):
+            for entry in range(e * self.blocks, e * self.blocks + self.block_count[e]):
+                for r in range(BLOCK_NODES):
+                    i = self.node_of_block(self.block_list[entry], r)
+                    index = self.tensor_index(e, i)
+                    if index >= 0:
+                        out[index] = self.velocity[e * self.nodes + self.linear(i)][0]
+
+    @ti.kernel
+    def copy_slot(self, source: ti.types.ndarray(ndim=1), source_slot: ti.i32, target: ti.types.ndarray(ndim=1), target_slot: ti.i32):
+        """Copy the particle state of all environments between time slots."""
+        size = self.batch * self.tiles * STATE
+        for i in range(size):
+            target[target_slot * size + i] = source[source_slot * size + i]

@@ -1,0 +1,344 @@
+"""Phases of a substep that run over grid nodes: gravity, contact with the manipulators, walls; and their adjoints."""
+
+import math
+
+import taichi as ti
+
+from plab.sim.shapes import hessian_product, nearer_stick, signed_distance
+from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
+
+__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases"]
+
+MASS_MIN = 1e-12
+"""Nodes with less mass are skipped."""
+
+STRENGTH_MIN = 0.1
+"""Soft contact of less strength is not applied."""
+
+WALL = 3
+"""Nodes this close to a face of the domain belong to the wall."""
+
+STICKING = 10.0
+"""From this floor friction on, the floor sticks."""
+
+
+@ti.func
+def sdf_point(shape: ti.template(), p, size, gap):
+    """Derivative of the chopsticks' local point, relative to the nearer stick, with respect to the gap."""
+    out = 0.0 * gap
+    if ti.static(shape == "Chopsticks"):
+        out = -0.5 * nearer_stick(p, size, gap)
+    return out
+
+
+class GridPhases(Storage):
+    """Grid update and its adjoint, one node at a time."""
+
+    @ti.func
+    def node_of_block(self, block, r):
+        """Array index (3) of node r of a block."""
+        nb = self.blocks_per_axis
+        corner = ti.Vector([block // (nb * nb), (block // nb) % nb, block % nb]) * BLOCK
+        return corner + ti.Vector([r // (BLOCK * BLOCK), (r // BLOCK) % BLOCK, r % BLOCK])
+
+    @ti.func
+    def linear(self, i):
+        """Linear index of a node within one grid from its array index."""
+        return (i[0] * self.axis + i[1]) * self.axis + i[2]
+
+    @ti.func
+    def position(self, i):
+        """Position of a node from its array index."""
+        return (ti.cast(i, self.real) - 1.0) * self.dx
+
+    @ti.func
+    def strength(self, d):
+        """Contact strength at distance d; 0 where contact is not applied."""
+        alpha = self.alpha[None]
+        s = d * 0.0
+        if d <= 0.0:
+            s = 1.0 + 0.0 * d
+        elif alpha > 0.0:
+            s = ti.exp(-alpha * d)
+            if s <= STRENGTH_MIN:
+                s = 0.0 * d
+        return s
+
+    @ti.func
+    def near_manipulators(self, e, s, block):
+        """Bit mask of the manipulators that can reach a node of a block in substep s.
+
+        Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
+        """
+        mask = 0
+        centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
+        alpha = self.alpha[None]
+        reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
+        if alpha > 0.0:
+            reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
+        for shape, start, stop in ti.static(self.runs):
+            for m in range(start, stop):
+                p = self.frame_rotation[e, s, m].transpose() @ (centre - self.frame_centre[e, s, m])
+                d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+                if d <= reach:
+                    mask = mask | (1 << m)
+        return mask
+
+    # -- contact ---------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def rigid_velocity(self, m_turns: ti.template(), e, s, m, p):
+        """Velocity of the manipulator's material at a local point p."""
+        u = self.frame_velocity[e, s, m]
+        if ti.static(m_turns):
+            u += self.frame_spin[e, s, m] @ p
+        return u
+
+    @ti.func
+    def slide(self, r, normal, friction):
+        """Relative velocity after full contact: no normal part, the tangential one reduced by Coulomb friction."""
+        rn = r.dot(normal)
+        t = r - rn * normal
+        length = t.norm()
+        factor = 0.0 * rn
+        if length + rn * friction > 0.0 and length > 0.0:
+            factor = 1.0 + rn * friction / length
+        return factor * t
+
+    @ti.func
+    def contact(self, shape: ti.template(), e, s, m, x, v):
+        """Velocity of a node after contact with manipulator m."""
+        out = v
+        rotation = self.frame_rotation[e, s, m]
+        p = rotation.transpose() @ (x - self.frame_centre[e, s, m])
+        d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+        strength = self.strength(d)
+        if strength > 0.0:
+            normal = rotation @ n_local
+            u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
+            r = v - u
+            if r.dot(normal) < 0.0:
+                out = u + (1.0 - strength) * r + strength * self.slide(r, normal, self.friction[e, m])
+        return out
+
+    def turns(self, shape: str) -> bool:
+        """Whether manipulators of this shape rotate; decided while compiling."""
+        return shape in ("RollingPin", "Chopsticks", "Box")
+
+    @ti.func
+    def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):
+        """Adjoint of v under :meth:`contact`; the frame's adjoint is accumulated."""
+        out = bar
+        rotation = self.frame_rotation[e, s, m]
+        offset = x - self.frame_centre[e, s, m]
+        p = rotation.transpose() @ offset
+        gap = self.frame_gap[e, s, m]
+        d, n_local = signed_distance(shape, p, self.size[e, m], gap)
+        strength = self.strength(d)
+        if strength > 0.0:
+            normal = rotation @ n_local
+            r = v - self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
+            rn = r.dot(normal)
+            if rn < 0.0:
+                friction = self.friction[e, m]
+                t0 = r - rn * normal
+                length = t0.norm()
+                t = t0 * 0.0
+                t0_bar = t0 * 0.0
+                rn_bar = 0.0 * rn
+                if length + rn * friction > 0.0 and length > 0.0:
+                    factor = 1.0 + rn * friction / length
+                    along = t0.dot(bar) / length
+                    t = factor * t0
+                    t0_bar = strength * (factor * bar - (friction * rn * along / (length * length)) * t0)
+                    rn_bar = strength * friction * along
+                rn_bar -= normal.dot(t0_bar)
+                r_bar = (1.0 - strength) * bar + t0_bar + rn_bar * normal
+                normal_bar = rn_bar * r - rn * t0_bar
+                d_bar = 0.0 * d
+                if d > 0.0:
+                    d_bar = -self.alpha[None] * strength * bar.dot(t - r)
+                self.frame_adjoint(shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar)
+                out = r_bar
+        return out
+
+    @ti.func
+    def frame_adjoint(
+        self, shape: ti.template(), grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, u_bar
+    ):
+        """Accumulate the adjoint of manipulator m's frame from those of normal, distance and rigid velocity."""
+        if ti.static(shape != "Cylinder"):
+            rotation = self.frame_rotation[e, s, m]
+            size = self.size[e, m]
+            gap = self.frame_gap[e, s, m]
+            n_bar = rotation.transpose() @ normal_bar
+            from_distance = d_bar * n_local + hessian_product(shape, p, size, gap, n_bar)
+            p_bar = from_distance
+            if ti.static(self.turns(shape)):
+                p_bar += self.frame_spin[e, s, m].transpose() @ u_bar
+            centre_bar = -(rotation @ p_bar)
+            for i in ti.static(range(3)):
+                self.accumulate_frame(grid_index, m, i, centre_bar[i])
+                self.accumulate_frame(grid_index, m, 3 + i, u_bar[i])
+                if ti.static(self.turns(shape)):
+                    for j in ti.static(range(3)):
+                        self.accumulate_frame(
+                            grid_index, m, 6 + 3 * i + j, normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
+                        )
+                        self.accumulate_frame(grid_index, m, 15 + 3 * i + j, u_bar[i] * p[j])
+            if ti.static(shape == "Chopsticks"):
+                self.accumulate_frame(
+                    grid_index, m, FRAME_ADJOINT - 1, sdf_point(shape, p, size, gap) * from_distance[0]
+                )
+
+    @ti.func
+    def accumulate_frame(self, grid_index, m, entry, value):
+        """Add to a frame's adjoint: plainly where one thread owns it, atomically on CUDA."""
+        wide = ti.cast(value, ti.f64)
+        if ti.static(self.cuda):
+            ti.atomic_add(self.frame_bar[grid_index, m, entry], wide)
+        else:
+            self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
+
+    # -- walls -----------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def wall_free(self, i, v, axis: ti.template()):
+        """Velocity after the frictionless walls of one axis."""
+        out = v
+        node = i[axis] - 1
+        if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
+            out[axis] = 0.0
+        return out
+
+    @ti.func
+    def wall_free_adjoint(self, i, v, bar, axis: ti.template()):
+        """Adjoint of v under :meth:`wall_free`."""
+        out = bar
+        node = i[axis] - 1
+        if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
+            out[axis] = 0.0
+        return out
+
+    @ti.func
+    def floor(self, v, friction):
+        """Velocity after the floor, for a floor node with v_y < 0."""
+        out = v * 0.0
+        if friction < STICKING:
+            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+            factor = 0.0 * length
+            if length + friction * v[1] > 0.0 and length > 0.0:
+                factor = 1.0 + friction * v[1] / length
+            out[0] = factor * v[0]
+            out[2] = factor * v[2]
+        return out
+
+    @ti.func
+    def floor_adjoint(self, v, friction, bar):
+        """Adjoint of v under :meth:`floor`."""
+        out = v * 0.0
+        if friction < STICKING:
+            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
+            if length + friction * v[1] > 0.0 and length > 0.0:
+                factor = 1.0 + friction * v[1] / length
+                along = (v[0] * bar[0] + v[2] * bar[2]) / length
+                back = friction * v[1] * along / (length * length)
+                out[0] = factor * bar[0] - back * v[0]
+                out[1] = friction * along
+                out[2] = factor * bar[2] - back * v[2]
+        return out
+
+    @ti.func
+    def on_floor(self, i, v):
+        """Whether the floor acts on a node, beyond stopping it as any wall does."""
+        return i[1] - 1 < WALL and v[1] < 0.0
+
+    @ti.func
+    def walls(self, i, v, friction):
+        """Velocity of a node after walls and floor, axis by axis."""
+        v1 = self.wall_free(i, v, 0)
+        if friction > 0.0 and self.on_floor(i, v1):
+            v1 = self.floor(v1, friction)
+        else:
+            v1 = self.wall_free(i, v1, 1)
+        return self.wall_free(i, v1, 2)
+
+    @ti.func
+    def walls_adjoint(self, i, v, friction, bar):
+        """Adjoint of v under :meth:`walls`."""
+        v1 = self.wall_free(i, v, 0)
+        v2 = v1
+        floored = friction > 0.0 and self.on_floor(i, v1)
+        if floored:
+            v2 = self.floor(v1, friction)
+        out = self.wall_free_adjoint(i, v2, bar, 2)
+        if floored:
+            out = self.floor_adjoint(v1, friction, out)
+        else:
+            out = self.wall_free_adjoint(i, v1, out, 1)
+        return self.wall_free_adjoint(i, v, out, 0)
+
+    # -- one node --------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def free_velocity(self, e, total):
+        """Velocity of a node of positive mass after gravity, from its momentum and mass."""
+        p = self.material[e]
+        return ti.Vector(
+            [total[0] / total[3] + self.dt * p[4], total[1] / total[3] + self.dt * p[5], total[2] / total[3] + self.dt * p[6]]
+        )
+
+    @ti.func
+    def after_manipulators(self, e, s, x, v, near, count):
+        """Velocity of a node after contact with the first ``count`` manipulators, where they are near."""
+        out = v
+        for shape, start, stop in ti.static(self.runs):
+            for m in range(start, ti.min(stop, count)):
+                if near & (1 << m):
+                    out = self.contact(shape, e, s, m, x, out)
+        return out
+
+    @ti.func
+    def update_node(self, e, s, i, near, total):
+        """Velocity of a node at the end of the grid update, from its momentum and mass."""
+        v = ti.Vector([0.0 * total[0], 0.0 * total[0], 0.0 * total[0]])
+        if total[3] > MASS_MIN:
+            v = self.free_velocity(e, total)
+            if near != 0:
+                v = self.after_manipulators(e, s, self.position(i), v, near, self.manipulators)
+            v = self.walls(i, v, self.material[e][3])
+        return v
+
+    @ti.func
+    def update_node_adjoint(self, grid_index, e, s, i, near, total, bar):
+        """Grid update of a node together with its adjoint.
+
+        Returns:
+            Velocity (3), and the adjoint of momentum and mass (4) given the velocity's adjoint ``bar``. The
+            manipulators' frame adjoints are accumulated.
+        """
+        v_out = bar * 0.0
+        out = total * 0.0
+        if total[3] > MASS_MIN:
+            free = self.free_velocity(e, total)
+            x = self.position(i)
+            v = free
+            if near != 0:
+                v = self.after_manipulators(e, s, x, free, near, self.manipulators)
+            friction = self.material[e][3]
+            v_out = self.walls(i, v, friction)
+            v_bar = self.walls_adjoint(i, v, friction, bar)
+            if near != 0:
+                for shape, start, stop in ti.static(tuple(reversed(self.runs))):
+                    for back in range(stop - start):
+                        m = stop - 1 - back
+                        if near & (1 << m):
+                            # Few manipulators are near a node: what precedes m is cheaper redone than stored.
+                            v_in = self.after_manipulators(e, s, x, free, near, m)
+                            v_bar = self.contact_adjoint(shape, grid_index, e, s, m, x, v_in, v_bar)
+            mass_bar = 0.0 * total[3]
+            for k in ti.static(range(3)):
+                out[k] = v_bar[k] / total[3]
+                mass_bar -= v_bar[k] * total[k] / (total[3] * total[3])
+            out[3] = mass_bar
+        return v_out, out

@@ -1,0 +1,143 @@
+"""Mass tensor and loss terms of a state, and their adjoint.
+
+The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to the layer
+below the domain counts at the face's node, so that the tensor holds all mass.
+"""
+
+import taichi as ti
+
+from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
+from plab.sim.shapes import signed_distance
+from plab.sim.storage import Storage
+from plab.sim.transfer import spline, spline_slope
+
+__all__ = ["LossPhases"]
+
+vec4 = ti.types.vector(4, ti.f64)
+
+
+class LossPhases(Storage):
+    """Density, SDF and contact terms of the loss."""
+
+    @ti.func
+    def folded_node(self, base, i: ti.template(), j: ti.template(), k: ti.template()):
+        """Array index along each axis of a stencil's node in the mass tensor's sense."""
+        return ti.max(base + ti.Vector([i, j, k]), 1)
+
+    @ti.func
+    def scatter_mass(self, grid_index, base, fx):
+        """Add one particle's mass to its 27 nodes."""
+        w = spline(fx)
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                for k in ti.static(range(3)):
+                    at = self.folded_node(base, i, j, k)
+                    node = grid_index * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
+                    share = self.mass * w[i][0] * w[j][1] * w[k][2]
+                    if ti.static(self.cuda):
+                        ti.atomic_add(self.momentum[node][3], share)
+                    else:
+                        self.momentum[node][3] = self.momentum[node][3] + share
+
+    @ti.func
+    def tensor_index(self, e, i):
+        """Linear index into the batch of n^3 tensors from a node's array index, or -1 outside of them."""
+        k = i - 1
+        out = ((e * self.n + k[0]) * self.n + k[1]) * self.n + k[2]
+        if k.min() < 0 or k.max() >= self.n:
+            out = -1
+        return out
+
+    @ti.func
+    def node_loss(self, e, i, mass):
+        """Density and SDF terms of one node, relative to an empty node, and d (weighted loss) / d mass."""
+        density = 0.0 * mass
+        sdf = 0.0 * mass
+        slope = 0.0 * mass
+        index = self.tensor_index(e, i)
+        # Written so that NaN is not taken for an empty node.
+        if index >= 0 and not (mass <= 0.0):
+            difference = mass - self.target[index]
+            weights = self.loss_weights[None]
+            density = ti.abs(difference) - self.target[index]
+            sdf = self.target_sdf[index] * mass
+            sign = 0.0 * mass
+            if difference > 0.0:
+                sign = 1.0
+            elif difference < 0.0:
+                sign = -1.0
+            slope = weights[0] * sign + weights[1] * self.target_sdf[index]
+        return density, sdf, slope
+
+    @ti.func
+    def mass_slope(self, grid: ti.template(), e, base, fx):
+        """Gradient of the weighted density and SDF terms with respect to one particle's position."""
+        w = spline(fx)
+        dw = spline_slope(fx)
+        out = fx * 0.0
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                for k in ti.static(range(3)):
+                    at = self.folded_node(base, i, j, k)
+                    value = grid[e * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]][3]
+                    out += value * ti.Vector(
+                        [dw[i][0] * w[j][1] * w[k][2], w[i][0] * dw[j][1] * w[k][2], w[i][0] * w[j][1] * dw[k][2]]
+                    )
+        return (self.mass * self.inv_dx) * out
+
+    # -- contact term ----------------------------------------------------------------------------------------------
+
+    @ti.func
+    def pose_rotation(self, e, m):
+        """Rotation matrix of a manipulator at the end of the environment step, 3x3 float64."""
+        pose = self.pose[e, self.substeps, m]
+        return rotation_matrix(vec4(pose[3], pose[4], pose[5], pose[6]))
+
+    @ti.func
+    def local_point(self, e, m, x):
+        """A world point in the manipulator's frame at the end of the environment step."""
+        pose = self.pose[e, self.substeps, m]
+        centre = ti.Vector([pose[0], pose[1], pose[2]])
+        return ti.cast(self.pose_rotation(e, m).transpose() @ (ti.cast(x, ti.f64) - centre), self.real)
+
+    @ti.func
+    def end_distance(self, shape: ti.template(), e, m, x):
+        """Distance of a world point at the end of the environment step."""
+        gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
+        d, _n = signed_distance(shape, self.local_point(e, m, x), self.size[e, m], gap)
+        return d
+
+    @ti.func
+    def contact_term(self, e):
+        """Sum over moving manipulators of the squared distance to the nearest particle."""
+        total = ti.cast(0.0, ti.f64)
+        for m in range(self.manipulators):
+            d = self.contact_part[e, 0, m]
+            if d > 0.0:
+                total += ti.cast(d, ti.f64) * d
+        return total
+
+    @ti.func
+    def contact_adjoint_at(self, shape: ti.template(), e, m, x):
+        """Adjoint of the nearest particle's position under the weighted contact term; pose_bar is accumulated."""
+        gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
+        p = self.local_point(e, m, x)
+        d, n = signed_distance(shape, p, self.size[e, m], gap)
+        n64 = ti.cast(n, ti.f64)
+        d_bar = 2.0 * ti.cast(self.loss_weights[None][2], ti.f64) * ti.max(ti.cast(d, ti.f64), 0.0)
+        rotation = self.pose_rotation(e, m)
+        x_bar = d_bar * (rotation @ n64)
+        pose = self.pose[e, self.substeps, m]
+        offset = ti.cast(x, ti.f64) - ti.Vector([pose[0], pose[1], pose[2]])
+        for i in ti.static(range(3)):
+            self.pose_bar[e, m][i] -= x_bar[i]
+        if ti.static(self.turns(shape)):
+            q_bar = rotation_matrix_adjoint(
+                vec4(pose[3], pose[4], pose[5], pose[6]), d_bar * offset.outer_product(n64)
+            )
+            for i in ti.static(range(4)):
+                self.pose_bar[e, m][3 + i] += q_bar[i]
+        if ti.static(shape == "Chopsticks"):
+            side = ti.select(p[0] < 0.0, -1.0, 1.0)
+            self.pose_bar[e, m][7] -= 0.5 * side * d_bar * n64[0]
+        return ti.cast(x_bar, self.real)

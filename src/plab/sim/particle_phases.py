@@ -1,0 +1,373 @@
+"""Phases of a substep that run over particles: material and scatter before the grid, gather after it; and adjoints."""
+
+import taichi as ti
+
+from plab.sim.material import return_map, return_map_adjoint
+from plab.sim.spectral import spectral_return_map, spectral_return_map_adjoint
+from plab.sim.storage import BLOCK, STATE, Storage
+from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
+
+__all__ = ["ParticlePhases"]
+
+REACHING = tuple(sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8))
+"""For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
+
+
+@ti.func
+def as_matrix(a: ti.template()):
+    """A row-major tuple of 9 scalars as a 3x3 matrix."""
+    return ti.Matrix([[a[0], a[1], a[2]], [a[3], a[4], a[5]], [a[6], a[7], a[8]]])
+
+
+class ParticlePhases(Storage):
+    """Material update, particle-to-grid and grid-to-particle transfers and their adjoints."""
+
+    # -- access to the particle state ------------------------------------------------------------------------------
+
+    @ti.func
+    def tile_entry(self, slot, e, tile):
+        """Index of the first entry of a tile."""
+        return ((slot * self.batch + e) * self.tiles + tile) * STATE
+
+    @ti.func
+    def load(self, state: ti.template(), entry, lane, count: ti.template()):
+        """``count`` scalars of one particle."""
+        return [state[entry + i][lane] for i in range(count)]
+
+    @ti.func
+    def vector(self, state: ti.template(), entry, lane):
+        """Three scalars of one particle as a vector."""
+        return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
+
+    @ti.func
+    def stencil(self, x):
+        """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5).
+
+        The index is clamped so that not even a NaN leads out of the grid.
+        """
+        q = x * self.inv_dx
+        base = ti.cast(ti.floor(q - 0.5), ti.i32)
+        base = ti.min(ti.max(base, -1), self.n - 4)
+        return base + 1, q - ti.cast(base, self.real)
+
+    @ti.func
+    def node_index(self, base):
+        """Linear index of a node within one grid."""
+        return (base[0] * self.axis + base[1]) * self.axis + base[2]
+
+    @ti.func
+    def unclamped(self, x, v):
+        """Per axis 1 where advection by v stays inside the domain, else 0."""
+        y = x + self.dt * v
+        out = x * 0.0
+        for i in ti.static(range(3)):
+            out[i] = ti.select(y[i] < 0.0 or y[i] > self.x_max, 0.0, 1.0)
+        return out
+
+    # -- material --------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def served(self, z_squared, j):
+        """Whether the series served a single particle; not for NaN."""
+        return z_squared <= self.series.z_squared_max and j >= self.series.j_min and j <= self.series.j_max
+
+    @ti.func
+    def all_served(self, z_squared, j):
+        """Whether the series served all lanes of a tile."""
+        return self.served(z_squared.max(), j.max()) and j.min() >= self.series.j_min
+
+    @ti.func
+    def stress_and_momentum(self, tau: ti.template(), c: ti.template()):
+        """A = stress_scale tau + mass C from a symmetric tau (6) and a full C (9)."""
+        return [self.stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + self.mass * c[i] for i in range(9)]
+
+    @ti.func
+    def stress_adjoint(self, a_bar: ti.template()):
+        """Symmetric part of the adjoint of tau (6) from that of A (9)."""
+        half = 0.5 * self.stress_scale
+        return (
+            2.0 * half * a_bar[0],
+            2.0 * half * a_bar[4],
+            2.0 * half * a_bar[8],
+            half * (a_bar[1] + a_bar[3]),
+            half * (a_bar[2] + a_bar[6]),
+            half * (a_bar[5] + a_bar[7]),
+        )
+
+    @ti.func
+    def material_tile(self, state: ti.template(), source, target, entry9, e, update: ti.template()):
+        """Return mapping and A = stress_scale tau + mass C for a tile on the CPU.
+
+        Args:
+            state: Particle state.
+            source: Entry of the tile before the substep.
+            target: Entry of the tile after it.
+            entry9: Entry of the tile in ``affine``.
+            e: Environment.
+            update: Whether the new F is stored.
+        """
+        p = self.material[e]
+        c = [state[source + 6 + i] for i in range(9)]
+        f = [state[source + 15 + i] for i in range(9)]
+        f_new, tau, z2, j = return_map(c, f, self.dt, p[0], p[1], p[2], self.series)
+        if self.all_served(z2, j):
+            a = self.stress_and_momentum(tau, c)
+            for i in ti.static(range(9)):
+                if ti.static(update):
+                    state[target + 15 + i] = f_new[i]
+                self.affine[entry9 + i] = a[i]
+        else:
+            for lane in range(self.lanes):
+                self.spectral_material(state, source, target, entry9, lane, e, update)
+
+    @ti.func
+    def spectral_material(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
+        """:meth:`material_tile` for one particle, by singular values."""
+        p = self.material[e]
+        c = as_matrix(self.load(state, source + 6, lane, 9))
+        f = as_matrix(self.load(state, source + 15, lane, 9))
+        f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
+        for i in ti.static(range(9)):
+            if ti.static(update):
+                state[target + 15 + i][lane] = f_new[i // 3, i % 3]
+            self.affine[entry9 + i][lane] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
+
+    @ti.func
+    def material_particle(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
+        """:meth:`material_tile` for one particle on CUDA."""
+        p = self.material[e]
+        c = self.load(state, source + 6, lane, 9)
+        f = self.load(state, source + 15, lane, 9)
+        f_new, tau, z2, j = return_map(c, f, self.dt, p[0], p[1], p[2], self.series)
+        if self.served(z2, j):
+            a = self.stress_and_momentum(tau, c)
+            for i in ti.static(range(9)):
+                if ti.static(update):
+                    state[target + 15 + i][lane] = f_new[i]
+                self.affine[entry9 + i][lane] = a[i]
+        else:
+            self.spectral_material(state, source, target, entry9, lane, e, update)
+
+    @ti.func
+    def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e):
+        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``), on the CPU."""
+        p = self.material[e]
+        c = [state[source + 6 + i] for i in range(9)]
+        f = [state[source + 15 + i] for i in range(9)]
+        f_bar = [bar[target + 15 + i] for i in range(9)]
+        a_bar = [self.affine[entry9 + i] for i in range(9)]
+        tau_bar = self.stress_adjoint(a_bar)
+        c_out, f_out, z2, j = return_map_adjoint(c, f, f_bar, tau_bar, self.dt, p[0], p[1], p[2], self.series)
+        if self.all_served(z2, j):
+            for i in ti.static(range(9)):
+                bar[target + 6 + i] = c_out[i] + self.mass * a_bar[i]
+                bar[target + 15 + i] = f_out[i]
+        else:
+            for lane in range(self.lanes):
+                self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
+
+    @ti.func
+    def spectral_material_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e):
+        """:meth:`material_tile_adjoint` for one particle, by singular values."""
+        p = self.material[e]
+        c = as_matrix(self.load(state, source + 6, lane, 9))
+        f = as_matrix(self.load(state, source + 15, lane, 9))
+        f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
+        a_bar = as_matrix(self.load(self.affine, entry9, lane, 9))
+        tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
+        tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
+        g_bar = spectral_return_map_adjoint(f + self.dt * (c @ f), f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
+        c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
+        f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
+        for i in ti.static(range(9)):
+            bar[target + 6 + i][lane] = c_bar[i // 3, i % 3]
+            bar[target + 15 + i][lane] = f_bar[i // 3, i % 3]
+
+    @ti.func
+    def material_particle_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e):
+        """:meth:`material_tile_adjoint` for one particle on CUDA."""
+        p = self.material[e]
+        c = self.load(state, source + 6, lane, 9)
+        f = self.load(state, source + 15, lane, 9)
+        f_bar = self.load(bar, target + 15, lane, 9)
+        a_bar = self.load(self.affine, entry9, lane, 9)
+        tau_bar = self.stress_adjoint(a_bar)
+        c_out, f_out, z2, j = return_map_adjoint(c, f, f_bar, tau_bar, self.dt, p[0], p[1], p[2], self.series)
+        if self.served(z2, j):
+            for i in ti.static(range(9)):
+                bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
+                bar[target + 15 + i][lane] = f_out[i]
+        else:
+            self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
+
+    # -- transfers -------------------------------------------------------------------------------------------------
+
+    @ti.func
+    def add(self, grid: ti.template(), node, value):
+        """Add to a grid node: plainly where one thread owns the grid, atomically on CUDA."""
+        if ti.static(self.cuda):
+            ti.atomic_add(grid[node], value)
+        else:
+            grid[node] = grid[node] + value
+
+    @ti.func
+    def scatter(self, grid: ti.template(), node, w: ti.template(), q: ti.template()):
+        """Scatter an affine field of 4-vectors: value at the base node q[0] and increments q[1:4] along x, y, z."""
+        for i in ti.static(range(3)):
+            qi = q[0] + float(i) * q[1]
+            for j in ti.static(range(3)):
+                qj = qi + float(j) * q[2]
+                wij = w[i][0] * w[j][1]
+                row = node + (i * self.axis + j) * self.axis
+                for k in ti.static(range(3)):
+                    self.add(grid, row + k, (wij * w[k][2]) * (qj + float(k) * q[3]))
+
+    @ti.func
+    def affine_field(self, value, last, a: ti.template(), fx, scale):
+        """An affine field value + scale A (node - particle) in the form that :meth:`scatter` takes."""
+        c0 = column(a, 0, scale * self.dx)
+        c1 = column(a, 1, scale * self.dx)
+        c2 = column(a, 2, scale * self.dx)
+        return [widen(value, last) - fx[0] * c0 - fx[1] * c1 - fx[2] * c2, c0, c1, c2]
+
+    @ti.func
+    def scatter_particle(self, state: ti.template(), source, entry9, lane, grid_index, base, fx):
+        """Particle to grid: momentum and mass."""
+        a = self.load(self.affine, entry9, lane, 9)
+        v = self.vector(state, source + 3, lane)
+        q = self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
+        self.scatter(self.momentum, grid_index * self.nodes + self.node_index(base), spline(fx), q)
+
+    @ti.func
+    def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
+        """The affine field that the particle's adjoint contributes to the adjoint of the grid velocities."""
+        open_axes = self.unclamped(x, self.vector(state, after + 3, lane))
+        v_bar = self.vector(bar, target + 3, lane) + self.dt * open_axes * self.vector(bar, target, lane)
+        c_bar = self.load(bar, target + 6, lane, 9)
+        return self.affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx * self.inv_dx)
+
+    @ti.func
+    def gather_particle(self, state: ti.template(), source, target, lane, e, time):
+        """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
+        x = self.vector(state, source, lane)
+        base, fx = self.stencil(x)
+        m0, mx, my, mz = gather(
+            self.velocity, e * self.nodes + self.node_index(base), self.axis * self.axis, self.axis, spline(fx)
+        )
+        cx = 4.0 * self.inv_dx * (mx - fx[0] * m0)
+        cy = 4.0 * self.inv_dx * (my - fx[1] * m0)
+        cz = 4.0 * self.inv_dx * (mz - fx[2] * m0)
+        for i in ti.static(range(3)):
+            state[target + 3 + i][lane] = m0[i]
+            state[target + 6 + 3 * i][lane] = cx[i]
+            state[target + 7 + 3 * i][lane] = cy[i]
+            state[target + 8 + 3 * i][lane] = cz[i]
+            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * m0[i], 0.0), self.x_max)
+        speed = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
+        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
+        if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
+            self.fault[e] = time + 1
+
+    @ti.func
+    def gather_particle_adjoint(self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e):
+        """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
+        x = self.vector(state, source, lane)
+        base, fx = self.stencil(x)
+        a = self.load(self.affine, entry9, lane, 9)
+        v = self.vector(state, source + 3, lane)
+        v_after = self.vector(state, after + 3, lane)
+        q = self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
+        h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
+        m0, mx, my, mz, gx, gy, gz = gather_adjoint(
+            self.velocity,
+            self.momentum_bar,
+            e * self.nodes + self.node_index(base),
+            self.axis * self.axis,
+            self.axis,
+            spline(fx),
+            spline_slope(fx),
+            q,
+            h,
+        )
+        slope = ti.Vector([gx.sum(), gy.sum(), gz.sum()])
+        c_bar = self.load(bar, target + 6, lane, 9)
+        scale = 4.0 * self.inv_dx * self.inv_dx
+        open_axes = self.unclamped(x, v_after)
+        ax = self.dx * (mx - fx[0] * m0)
+        ay = self.dx * (my - fx[1] * m0)
+        az = self.dx * (mz - fx[2] * m0)
+        for i in ti.static(range(3)):
+            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from the scatter.
+            offsets = scale * (c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]) + (
+                a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2]
+            )
+            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
+            bar[target + 3 + i][lane] = self.mass * m0[i]
+            self.affine[entry9 + 3 * i][lane] = ax[i]
+            self.affine[entry9 + 3 * i + 1][lane] = ay[i]
+            self.affine[entry9 + 3 * i + 2][lane] = az[i]
+
+    # -- which blocks hold mass ------------------------------------------------------------------------------------
+
+    @ti.func
+    def block_of(self, base):
+        """Linear index of the block of a base node, and which axes its stencil crosses into the next block (3 bits)."""
+        b = base // BLOCK
+        r = base - b * BLOCK
+        crossing = (
+            ti.select(r[0] >= BLOCK - 2, 1, 0) + ti.select(r[1] >= BLOCK - 2, 2, 0) + ti.select(r[2] >= BLOCK - 2, 4, 0)
+        )
+        return (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2], crossing
+
+    @ti.func
+    def neighbour(self, block, corner: ti.template()):
+        """Linear index of the block one further along the axes whose bits are set in ``corner``."""
+        shift = ti.static(
+            (corner & 1) * self.blocks_per_axis**2 + ((corner >> 1) & 1) * self.blocks_per_axis + ((corner >> 2) & 1)
+        )
+        return block + shift
+
+    @ti.func
+    def mark(self, grid_index, base, stamp):
+        """Note on the CPU that a chunk's particle touches the blocks around a base node."""
+        block, crossing = self.block_of(base)
+        entry = grid_index * self.blocks + block
+        if self.mark_stamp[entry] != stamp:
+            self.mark_stamp[entry] = stamp
+            self.mark_code[entry] = 0
+            count = self.mark_count[grid_index]
+            self.mark_list[grid_index * self.blocks + count] = block
+            self.mark_count[grid_index] = count + 1
+        self.mark_code[entry] = self.mark_code[entry] | (1 << crossing)
+
+    @ti.func
+    def collect_blocks(self, e, stamp):
+        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing else."""
+        count = 0
+        for c in range(self.chunks):
+            grid_index = e * self.chunks + c
+            for r in range(self.mark_count[grid_index]):
+                block = self.mark_list[grid_index * self.blocks + r]
+                code = self.mark_code[grid_index * self.blocks + block]
+                for corner in ti.static(range(8)):
+                    if code & ti.static(REACHING[corner]):
+                        entry = e * self.blocks + self.neighbour(block, corner)
+                        if self.block_stamp[entry] != stamp:
+                            self.block_stamp[entry] = stamp
+                            self.block_chunks[entry] = 0
+                            self.block_list[e * self.blocks + count] = entry - e * self.blocks
+                            count += 1
+                        self.block_chunks[entry] = self.block_chunks[entry] | (1 << c)
+            self.mark_count[grid_index] = 0
+        self.block_count[e] = count
+
+    @ti.func
+    def mark_shared(self, e, base, stamp):
+        """Note on CUDA, where there is one list for all environments, that a particle touches the blocks around a node."""
+        block, crossing = self.block_of(base)
+        for corner in ti.static(range(8)):
+            if (crossing & corner) == corner:
+                entry = e * self.blocks + self.neighbour(block, corner)
+                if self.block_stamp[entry] < stamp:
+                    if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
+                        self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry

@@ -1,0 +1,131 @@
+"""Phases of a substep that move the manipulators, forward and adjoint."""
+
+import taichi as ti
+
+from plab.sim.motion import (
+    advance_pose,
+    advance_pose_adjoint,
+    rotation_matrix,
+    rotation_matrix_adjoint,
+)
+from plab.sim.storage import FRAME_ADJOINT, Storage
+
+__all__ = ["PosePhases"]
+
+vec3 = ti.types.vector(3, ti.f64)
+vec4 = ti.types.vector(4, ti.f64)
+vec7 = ti.types.vector(7, ti.f64)
+vec8 = ti.types.vector(8, ti.f64)
+mat3 = ti.types.matrix(3, 3, ti.f64)
+
+
+@ti.func
+def quaternion(pose):
+    """The rotation of a pose."""
+    return vec4(pose[3], pose[4], pose[5], pose[6])
+
+
+class PosePhases(Storage):
+    """Poses within one environment step and the frames in which contact is computed."""
+
+    @ti.func
+    def substep_motion(self, e, m: ti.template(), actions: ti.template(), t):
+        """One substep's share of the clipped, scaled action of manipulator m."""
+        u = vec7(0.0)
+        for i in ti.static(range(self.action_dims[m])):
+            a = actions[(t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)]
+            u[i] = ti.min(ti.max(a, -1.0), 1.0) * self.scale[e, m][i] / self.substeps
+        return u
+
+    @ti.func
+    def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
+        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot ``after``."""
+        for m in ti.static(range(self.manipulators)):
+            entry = (before * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                self.pose[e, 0, m][i] = poses[entry * 8 + i]
+            u = self.substep_motion(e, m, actions, t)
+            for s in range(self.substeps):
+                self.pose[e, s + 1, m] = advance_pose(
+                    self.motions[m], self.pose[e, s, m], u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+                )
+                self.set_frame(e, s, m)
+            entry = (after * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                poses[entry * 8 + i] = self.pose[e, self.substeps, m][i]
+
+    @ti.func
+    def place_manipulators(self, e, poses: ti.template(), slot):
+        """Take slot ``slot`` of the pose history as the end of an environment step, for the losses."""
+        for m in ti.static(range(self.manipulators)):
+            entry = (slot * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                self.pose[e, self.substeps, m][i] = poses[entry * 8 + i]
+
+    @ti.func
+    def set_frame(self, e, s, m: ti.template()):
+        """Centre, rotation and rates of a manipulator in substep s; the rates are differences taken in float64."""
+        start = self.pose[e, s, m]
+        end = self.pose[e, s + 1, m]
+        r0 = rotation_matrix(quaternion(start))
+        r1 = rotation_matrix(quaternion(end))
+        inv_dt = ti.cast(1.0, ti.f64) / self.dt
+        for i in ti.static(range(3)):
+            self.frame_centre[e, s, m][i] = ti.cast(start[i], self.real)
+            self.frame_velocity[e, s, m][i] = ti.cast((end[i] - start[i]) * inv_dt, self.real)
+            for j in ti.static(range(3)):
+                self.frame_rotation[e, s, m][i, j] = ti.cast(r0[i, j], self.real)
+                self.frame_spin[e, s, m][i, j] = ti.cast((r1[i, j] - r0[i, j]) * inv_dt, self.real)
+        self.frame_gap[e, s, m] = ti.cast(start[7], self.real)
+
+    @ti.func
+    def collect_frame_adjoint(self, e, m: ti.template()):
+        """Sum the chunks' frame adjoints of one manipulator, and clear them."""
+        bar = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
+        for c in range(self.chunks):
+            for i in ti.static(range(FRAME_ADJOINT)):
+                bar[i] += self.frame_bar[e * self.chunks + c, m, i]
+                self.frame_bar[e * self.chunks + c, m, i] = 0.0
+        return bar
+
+    @ti.func
+    def retreat_manipulator(self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t):
+        """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
+        frame = self.collect_frame_adjoint(e, m)
+        inv_dt = ti.cast(1.0, ti.f64) / self.dt
+        bar = self.pose_bar[e, m]
+        start = self.pose[e, s, m]
+        rotation_bar = mat3(0.0)
+        spin_bar = mat3(0.0)
+        for i in ti.static(range(3)):
+            bar[i] += frame[3 + i] * inv_dt
+            for j in ti.static(range(3)):
+                rotation_bar[i, j] = frame[6 + 3 * i + j]
+                spin_bar[i, j] = frame[15 + 3 * i + j] * inv_dt
+        turning = ti.static(self.motions[m] in ("roll", "grip", "rigid"))
+        if ti.static(turning):
+            q_bar = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
+            for i in ti.static(range(4)):
+                bar[3 + i] += q_bar[i]
+        u = self.substep_motion(e, m, actions, t)
+        pose_bar, u_bar = advance_pose_adjoint(
+            self.motions[m], start, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m], bar
+        )
+        for i in ti.static(range(3)):
+            pose_bar[i] += frame[i] - frame[3 + i] * inv_dt
+        if ti.static(turning):
+            q_bar = rotation_matrix_adjoint(quaternion(start), rotation_bar - spin_bar)
+            for i in ti.static(range(4)):
+                pose_bar[3 + i] += q_bar[i]
+        pose_bar[7] += frame[24]
+        self.pose_bar[e, m] = pose_bar
+        for i in ti.static(range(self.action_dims[m])):
+            entry = (t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)
+            if ti.abs(actions[entry]) <= 1.0:
+                actions_bar[entry] += u_bar[i] * self.scale[e, m][i] / self.substeps
+
+    @ti.func
+    def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
+        """Adjoint of all manipulators' motion in substep s."""
+        for m in ti.static(range(self.manipulators)):
+            self.retreat_manipulator(e, m, s, actions, actions_bar, t)

@@ -1,0 +1,195 @@
+"""Memory of the batched simulator: constants fixed when it is built, and Taichi fields.
+
+Layout. Particle state is one array of tiles: a tile holds ``lanes`` particles, each of its 24 entries a vector of lanes
+(x 0:3, v 3:6, C 6:15, F 15:24), so that the material update runs on SIMD registers on the CPU and loads coalesce on CUDA.
+Tile t of environment e at time slot s is entry ``((s * batch + e) * tiles + t) * 24 + component``.
+
+Grids are dense in memory and sparse in use: only blocks of 4^3 nodes that hold mass are read, written and cleared. Array
+index i along an axis is node i - 1: the layer below the domain is there because particles within dx/2 of the floor
+reach it. On the CPU an environment's particles are split into ``chunks`` of consecutive particles with a private grid each,
+so that scattering needs no atomics and its result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+
+from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.sim.material import Series
+from plab.sim.runtime import Runtime
+
+__all__ = ["BLOCK", "CHUNKS", "FRAME_ADJOINT", "STATE", "Storage"]
+
+STATE = 24
+"""Entries per particle: x (3), v (3), C (9), F (9)."""
+
+BLOCK = 4
+"""Edge of a block of grid nodes."""
+
+CHUNKS = 8
+"""Private grids per environment on the CPU: a constant, because the order of summation follows from it."""
+
+FRAME_ADJOINT = 25
+"""Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap (1)."""
+
+LANES = {"cpu": 8, "cuda": 32}
+
+
+class Storage:
+    """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
+
+    def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
+        """Allocate what forward simulation needs.
+
+        Args:
+            scenes: One per environment, alike in all but the per-environment data.
+            runtime: The Taichi runtime in force.
+        """
+        first = scenes[0]
+        self.cuda = runtime.device == "cuda"
+        self.real = runtime.real
+        self.batch = len(scenes)
+        self.particles = first.particle_count
+        self.lanes = LANES[runtime.device]
+        self.tiles = -(-self.particles // self.lanes)
+        self.chunks = 1 if self.cuda else CHUNKS
+        self.substeps = first.substeps
+        self.series = Series.for_precision(runtime.precision)
+        self._set_grid(first)
+        self._set_threads(runtime.threads)
+        self._set_manipulators(scenes)
+        self._allocate()
+        self._fill_parameters(scenes)
+
+    def _set_grid(self, scene: Scene) -> None:
+        self.n = scene.grid_size
+        self.dx = scene.dx
+        self.inv_dx = float(scene.grid_size)
+        self.dt = scene.dt
+        self.mass = scene.particle_mass
+        self.stress_scale = -scene.dt * scene.particle_volume * 4.0 * self.inv_dx**2
+        self.x_max = 1.0 - 3.0 * scene.dx
+        self.blocks_per_axis = -(-self.n // BLOCK)
+        self.axis = self.blocks_per_axis * BLOCK
+        self.nodes = self.axis**3
+        self.blocks = self.blocks_per_axis**3
+
+    def _set_threads(self, threads: int) -> None:
+        self.threads = threads
+        # Threads beyond one per environment team up on its chunks.
+        self.team_size = min(self.chunks, max(1, threads // self.batch))
+        self.teams = min(self.batch, threads // self.team_size)
+
+    def _set_manipulators(self, scenes: Sequence[Scene]) -> None:
+        manipulators = scenes[0].manipulators
+        self.manipulators = len(manipulators)
+        self.shapes = tuple(m.shape for m in manipulators)
+        self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
+        dims = [m.action_dim for m in manipulators]
+        self.action_offsets = tuple(int(o) for o in np.cumsum([0, *dims])[:-1])
+        self.action_dims = tuple(dims)
+        self.actions_per_step = sum(dims)
+        # Consecutive manipulators of one shape share one loop, hence one compiled body.
+        runs: list[tuple[str, int, int]] = []
+        for number, shape in enumerate(self.shapes):
+            if runs and runs[-1][0] == shape:
+                runs[-1] = (shape, runs[-1][1], number + 1)
+            else:
+                runs.append((shape, number, number + 1))
+        self.runs = tuple(runs)
+
+    def _allocate(self) -> None:
+        real, b = self.real, self.batch
+        m = max(1, self.manipulators)
+        grids = b * self.chunks
+        self.lane_type = ti.types.vector(self.lanes, real)
+        # Material per environment: mu, lambda, yield strain, floor friction, gravity (3).
+        self.material = ti.Vector.field(7, real, shape=b)
+        self.size = ti.Vector.field(3, real, shape=(b, m))
+        self.friction = ti.field(real, shape=(b, m))
+        self.scale = ti.Vector.field(7, ti.f64, shape=(b, m))
+        self.low = ti.Vector.field(3, ti.f64, shape=(b, m))
+        self.high = ti.Vector.field(3, ti.f64, shape=(b, m))
+        self.minimal_gap = ti.field(ti.f64, shape=(b, m))
+        self.alpha = ti.field(real, shape=())
+        self.loss_weights = ti.Vector.field(3, real, shape=())
+        # Poses of one environment step, and what contact needs of them.
+        self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
+        self.frame_centre = ti.Vector.field(3, real, shape=(b, self.substeps, m))
+        self.frame_rotation = ti.Matrix.field(3, 3, real, shape=(b, self.substeps, m))
+        self.frame_velocity = ti.Vector.field(3, real, shape=(b, self.substeps, m))
+        self.frame_spin = ti.Matrix.field(3, 3, real, shape=(b, self.substeps, m))
+        self.frame_gap = ti.field(real, shape=(b, self.substeps, m))
+        # Stress and momentum gradient A (9) of each particle within one substep.
+        self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
+        self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
+        self.velocity = ti.Vector.field(4, real, shape=b * self.nodes)
+        self._allocate_blocks(grids)
+        self.target = ti.field(real, shape=b * self.n**3)
+        self.target_sdf = ti.field(real, shape=b * self.n**3)
+        self.target_sum = ti.field(ti.f64, shape=b)
+        self.loss_part = ti.Vector.field(2, ti.f64, shape=(b, self.chunks))
+        self.contact_part = ti.field(real, shape=(b, self.chunks, m))
+        self.contact_particle = ti.field(ti.i32, shape=(b, self.chunks, m))
+        self.fault = ti.field(ti.i32, shape=b)
+
+    def _allocate_blocks(self, grids: int) -> None:
+        b = self.batch
+        # A block is in use when its stamp is the current substep's.
+        self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_list = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_count = ti.field(ti.i32, shape=b)
+        self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
+        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next block.
+        private = 1 if self.cuda else grids
+        self.mark_stamp = ti.field(ti.i32, shape=private * self.blocks)
+        self.mark_code = ti.field(ti.i32, shape=private * self.blocks)
+        self.mark_list = ti.field(ti.i32, shape=private * self.blocks)
+        self.mark_count = ti.field(ti.i32, shape=private)
+        self.arrivals = ti.field(ti.i32, shape=32 * max(1, self.teams))
+
+    def allocate_adjoint(self) -> None:
+        """Allocate what only gradients need, once."""
+        if hasattr(self, "velocity_bar"):
+            return
+        real, b, m = self.real, self.batch, max(1, self.manipulators)
+        self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
+        self.momentum_bar = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
+        self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+
+    def _fill_parameters(self, scenes: Sequence[Scene]) -> None:
+        numpy_real = np.float32 if self.real == ti.f32 else np.float64
+        self.material.from_numpy(
+            np.array(
+                [
+                    [
+                        s.shear_modulus,
+                        s.lame_lambda,
+                        # An infinite yield stress would turn the unused branch into infinity times zero.
+                        min(s.yield_stress / (2.0 * s.shear_modulus), 1e30),
+                        s.floor_friction,
+                        *s.gravity,
+                    ]
+                    for s in scenes
+                ],
+                dtype=numpy_real,
+            )
+        )
+        if self.manipulators == 0:
+            return
+
+        def table(rows: list, width: int, dtype: type) -> np.ndarray:
+            padded = [[[*row, *([0.0] * (width - len(row)))] for row in scene] for scene in rows]
+            return np.array(padded, dtype=dtype)
+
+        tools = [s.manipulators for s in scenes]
+        self.size.from_numpy(table([[m.size for m in t] for t in tools], 3, numpy_real))
+        self.scale.from_numpy(table([[m.scale for m in t] for t in tools], 7, np.float64))
+        self.low.from_numpy(table([[m.lower_bound for m in t] for t in tools], 3, np.float64))
+        self.high.from_numpy(table([[m.upper_bound for m in t] for t in tools], 3, np.float64))
+        self.friction.from_numpy(np.array([[m.friction for m in t] for t in tools], dtype=numpy_real))
+        self.minimal_gap.from_numpy(np.array([[m.minimal_gap for m in t] for t in tools], dtype=np.float64))

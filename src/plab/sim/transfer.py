@@ -1,0 +1,161 @@
+"""Transfers between one particle and its 27 grid nodes: quadratic B-splines, APIC, moving least squares.
+
+A field that is affine around the particle is a 4-vector at the base node and three increments, one per axis, also
+4-vectors: three components of momentum or velocity and the mass (or nothing). All arithmetic is on such 4-vectors, which
+LLVM keeps in SIMD registers. Sums over the stencil go axis by axis: over z first, then y, then x.
+"""
+
+import taichi as ti
+
+__all__ = [
+    "column",
+    "gather",
+    "gather_adjoint",
+    "spline",
+    "spline_slope",
+    "widen",
+]
+
+
+@ti.func
+def spline(f):
+    """B-spline weights at node offsets 0, 1, 2; f is x / dx - base, a 3-vector in [0.5, 1.5)."""
+    return [0.5 * (1.5 - f) * (1.5 - f), 0.75 - (f - 1.0) * (f - 1.0), 0.5 * (f - 0.5) * (f - 0.5)]
+
+
+@ti.func
+def spline_slope(f):
+    """Derivatives of :func:`spline` with respect to f."""
+    return [f - 1.5, 2.0 - 2.0 * f, f - 0.5]
+
+
+@ti.func
+def widen(v, last):
+    """A 3-vector and a scalar as a 4-vector."""
+    return ti.Vector([v[0], v[1], v[2], last])
+
+
+@ti.func
+def column(a: ti.template(), j: ti.template(), scale):
+    """Column j of a row-major 3x3 tuple, scaled, as a 4-vector with 0 at the end."""
+    return ti.Vector([scale * a[j], scale * a[3 + j], scale * a[6 + j], 0.0 * a[j]])
+
+
+@ti.func
+def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template()):
+    """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil.
+
+    Args:
+        grid: Field of 4-vectors.
+        node: Index of the base node.
+        stride_x: Index distance of neighbours along x.
+        stride_y: Index distance of neighbours along y.
+        w: :func:`spline` weights.
+
+    Returns:
+        Sum of w g, and of w g times the node's offset (0, 1, 2) along x, y and z.
+    """
+    m0 = grid[node] * 0.0
+    mx = m0
+    my = m0
+    mz = m0
+    for i in ti.static(range(3)):
+        r0 = m0 * 0.0
+        ry = m0 * 0.0
+        rz = m0 * 0.0
+        for j in ti.static(range(3)):
+            row = node + i * stride_x + j * stride_y
+            g0 = w[0][2] * grid[row]
+            g1 = w[1][2] * grid[row + 1]
+            g2 = w[2][2] * grid[row + 2]
+            s0 = w[j][1] * (g0 + g1 + g2)
+            r0 += s0
+            rz += w[j][1] * (g1 + 2.0 * g2)
+            if ti.static(j > 0):
+                ry += float(j) * s0
+        m0 += w[i][0] * r0
+        my += w[i][0] * ry
+        mz += w[i][0] * rz
+        if ti.static(i > 0):
+            mx += (float(i) * w[i][0]) * r0
+    return m0, mx, my, mz
+
+
+@ti.func
+def gather_adjoint(
+    velocity: ti.template(),
+    momentum_bar: ti.template(),
+    node,
+    stride_x,
+    stride_y,
+    w: ti.template(),
+    dw: ti.template(),
+    q: ti.template(),
+    h: ti.template(),
+):
+    """What a particle's adjoint needs of the grid, in one pass over its stencil.
+
+    Args:
+        velocity: Field of grid velocities, 4-vectors whose last entry is ignored.
+        momentum_bar: Field of adjoints of the grid's momentum and mass, 4-vectors.
+        node: Index of the base node.
+        stride_x: Index distance of neighbours along x.
+        stride_y: Index distance of neighbours along y.
+        w: :func:`spline` weights.
+        dw: :func:`spline_slope`.
+        q: The scattered affine field: value at the base node and increments along x, y, z, with the mass at the end.
+        h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
+
+    Returns:
+        Moments of momentum_bar as in :func:`gather`, and the sum over nodes of grad_f w (momentum_bar . q + velocity . h)
+        as three 4-vectors, still to be summed over their entries.
+    """
+    m0 = velocity[node] * 0.0
+    mx = m0
+    my = m0
+    mz = m0
+    gx = m0
+    gy = m0
+    gz = m0
+    for i in ti.static(range(3)):
+        r0 = m0 * 0.0
+        ry = m0 * 0.0
+        rz = m0 * 0.0
+        c0 = m0 * 0.0
+        cy = m0 * 0.0
+        cz = m0 * 0.0
+        qi = q[0] + float(i) * q[1]
+        hi = h[0] + float(i) * h[1]
+        for j in ti.static(range(3)):
+            row = node + i * stride_x + j * stride_y
+            qj = qi + float(j) * q[2]
+            hj = hi + float(j) * h[2]
+            s0 = m0 * 0.0
+            s1 = m0 * 0.0
+            t0 = m0 * 0.0
+            t1 = m0 * 0.0
+            for k in ti.static(range(3)):
+                p = momentum_bar[row + k]
+                chi = p * (qj + float(k) * q[3]) + velocity[row + k] * (hj + float(k) * h[3])
+                t0 += w[k][2] * chi
+                t1 += dw[k][2] * chi
+                wp = w[k][2] * p
+                s0 += wp
+                if ti.static(k > 0):
+                    s1 += float(k) * wp
+            c0 += w[j][1] * t0
+            cy += dw[j][1] * t0
+            cz += w[j][1] * t1
+            r0 += w[j][1] * s0
+            rz += w[j][1] * s1
+            if ti.static(j > 0):
+                ry += (float(j) * w[j][1]) * s0
+        m0 += w[i][0] * r0
+        my += w[i][0] * ry
+        mz += w[i][0] * rz
+        gx += dw[i][0] * c0
+        gy += w[i][0] * cy
+        gz += w[i][0] * cz
+        if ti.static(i > 0):
+            mx += (float(i) * w[i][0]) * r0
+    return m0, mx, my, mz, gx, gy, gz

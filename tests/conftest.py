@@ -1,0 +1,14 @@
+"""What all tests share: those marked ``gpu`` are skipped where there is no CUDA device."""
+
+from __future__ import annotations
+
+import pytest
+
+from plab.run import cuda_is_usable
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    needing = [item for item in items if "gpu" in item.keywords]
+    if needing and not cuda_is_usable():
+        for item in needing:
+            item.add_marker(pytest.mark.skip(reason="no usable CUDA device"))

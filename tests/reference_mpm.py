@@ -1,0 +1,569 @@
+"""A slow, plain reference of the physics: the oracle that the fast simulator is compared with.
+
+One environment, float64 torch on a dense grid, differentiable with torch autograd. It follows the paper's
+formulas literally (singular value decomposition, Hencky strain, one tensor operation per formula) and shares
+no code with the simulator. Lengths are in units of the unit cube, y is up.
+
+The grid has one ghost layer: node indices run from -1 to n - 1 on each axis, node i lies at i dx, and the
+kernel's base node is the true floor(x / dx - 0.5), so no weight is ever negative. Grid arrays are flat,
+[(n + 1)^3].
+
+The derivative of the singular value decomposition does not exist where singular values coincide (F = I in
+particular): differentiate from a start whose deformation gradients have distinct singular values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from plab.scene import MANIPULATOR_SHAPES, Manipulator, Scene, sample_particles
+
+__all__ = [
+    "State",
+    "env_step",
+    "initial_state",
+    "loss_terms",
+    "mass_tensor",
+    "rollout_loss",
+    "signed_distance",
+    "substep",
+]
+
+BOUND = 3  # grid layers of each wall
+MASS_THRESHOLD = 1e-12  # nodes with at most this mass are skipped
+MIN_SINGULAR_VALUE = 0.05
+ROLL_RADIUS = 0.03  # displacement of a rolling pin per radian of roll
+STRENGTH_THRESHOLD = 0.1  # weakest soft contact that is applied
+STICKY_FLOOR = 10.0  # floor friction from which the floor sticks
+
+
+@dataclass
+class State:
+    """State of one environment, everything float64.
+
+    Attributes:
+        x: Particle positions, shape [particle, 3].
+        v: Particle velocities, shape [particle, 3].
+        C: APIC velocity gradients, C[i, j] = d v_i / d x_j, shape [particle, 3, 3].
+        F: Deformation gradients, shape [particle, 3, 3].
+        poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [manipulator, 8].
+    """
+
+    x: Tensor
+    v: Tensor
+    C: Tensor
+    F: Tensor
+    poses: Tensor
+
+
+def initial_state(scene: Scene, x: Tensor | None = None) -> State:
+    """State at t = 0: at rest, undeformed.
+
+    Args:
+        scene: The scene.
+        x: Particle positions, shape [particle, 3]; drawn by :func:`plab.scene.sample_particles` unless given.
+    """
+    x = torch.as_tensor(sample_particles(scene) if x is None else x, dtype=torch.float64)
+    rows = [(*m.position, *m.rotation, m.gap) for m in scene.manipulators]
+    return State(
+        x=x,
+        v=torch.zeros_like(x),
+        C=torch.zeros(len(x), 3, 3, dtype=torch.float64),
+        F=_identity().repeat(len(x), 1, 1),
+        poses=torch.tensor(rows, dtype=torch.float64).reshape(-1, 8),
+    )
+
+
+def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
+    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A]."""
+    for _ in range(scene.substeps):
+        state = substep(scene, state, action, alpha)
+    return state
+
+
+def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
+    """Advance by one substep.
+
+    Args:
+        scene: The scene.
+        state: State at the start of the substep.
+        action: Action of the environment step, shape [A], clipped to [-1, 1] here.
+        alpha: Stiffness of soft contact; 0 is the hard model.
+    """
+    F_trial = (_identity() + scene.dt * state.C) @ state.F
+    F, R = return_mapping(scene, F_trial)
+    momentum, mass = _particles_to_grid(scene, state, kirchhoff_stress(scene, F, R))
+    end_poses = move_manipulators(scene, state.poses, action)
+    velocity = _grid_update(scene, momentum, mass, state.poses, end_poses, alpha)
+    v, C = _grid_to_particles(scene, state.x, velocity)
+    x = (state.x + scene.dt * v).clamp(0.0, 1.0 - 3.0 * scene.dx)
+    return State(x, v, C, F, end_poses)
+
+
+# --------------------------------------------------------------------------------------------------- material
+
+
+def proper_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """F = U diag(S) V^T with rotations U and V; the smallest singular value is negative where det F < 0.
+
+    Args:
+        F: Matrices, shape [..., 3, 3].
+
+    Returns:
+        U [..., 3, 3], S [..., 3] and V^T [..., 3, 3].
+    """
+    U, S, Vt = torch.linalg.svd(F)
+    keep = torch.ones_like(S[..., :2])
+    flip_U = torch.cat([keep, torch.linalg.det(U.detach()).sign()[..., None]], dim=-1)
+    flip_V = torch.cat([keep, torch.linalg.det(Vt.detach()).sign()[..., None]], dim=-1)
+    return U * flip_U[..., None, :], S * flip_U * flip_V, Vt * flip_V[..., :, None]
+
+
+def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mapping of von Mises plasticity in Hencky strain.
+
+    Args:
+        scene: The scene, for the yield stress and the shear modulus.
+        F_trial: Trial deformation gradients, shape [particle, 3, 3].
+
+    Returns:
+        Deformation gradients F and their rotations R = U V^T, both [particle, 3, 3].
+    """
+    U, S, Vt = proper_svd(F_trial)
+    e = S.clamp(min=MIN_SINGULAR_VALUE).log()
+    e_dev = e - e.mean(dim=-1, keepdim=True)
+    length = ((e_dev * e_dev).sum(dim=-1, keepdim=True) + 1e-8).sqrt()
+    dg = length - scene.yield_stress / (2.0 * scene.shear_modulus)
+    yields = dg > 0
+    dg = torch.where(yields, dg, 0.0)  # an infinite yield stress must not reach the other branch's derivative
+    F_yield = (U * (e - dg / length * e_dev).exp()[..., None, :]) @ Vt
+    return torch.where(yields[..., None], F_yield, F_trial), U @ Vt
+
+
+def kirchhoff_stress(scene: Scene, F: Tensor, R: Tensor) -> Tensor:
+    """Fixed-corotated stress tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Kirchhoff), [particle, 3, 3]."""
+    J = torch.linalg.det(F)[:, None, None]
+    return 2.0 * scene.shear_modulus * (F - R) @ F.mT + scene.lame_lambda * J * (J - 1.0) * _identity()
+
+
+# -------------------------------------------------------------------------------------------------- transfers
+
+
+def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The 27 nodes around each particle.
+
+    Args:
+        scene: The scene.
+        x: Particle positions, shape [particle, 3].
+
+    Returns:
+        Node indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3].
+    """
+    base = (x.detach() / scene.dx - 0.5).floor()
+    fx = x / scene.dx - base
+    w = torch.stack([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2], dim=1)
+    corner = torch.cartesian_prod(torch.arange(3), torch.arange(3), torch.arange(3))
+    weight = w[:, corner[:, 0], 0] * w[:, corner[:, 1], 1] * w[:, corner[:, 2], 2]
+    node = base.long()[:, None, :] + corner
+    return node, weight, node * scene.dx - x[:, None, :]
+
+
+def _flat(scene: Scene, node: Tensor) -> Tensor:
+    """Position of the nodes [..., 3], whose indices start at -1, in a flat grid array."""
+    i, j, k = (node + 1).unbind(dim=-1)
+    side = scene.grid_size + 1
+    return (i * side + j) * side + k
+
+
+def _nodes(scene: Scene) -> Tensor:
+    """Indices of all nodes in the order of a flat grid array, shape [(n + 1)^3, 3]."""
+    axis = torch.arange(-1, scene.grid_size)
+    return torch.cartesian_prod(axis, axis, axis)
+
+
+def _particles_to_grid(scene: Scene, state: State, tau: Tensor) -> tuple[Tensor, Tensor]:
+    """P2G: momentum [(n + 1)^3, 3] and mass [(n + 1)^3] of the nodes."""
+    m = scene.particle_mass
+    node, weight, offset = _stencil(scene, state.x)
+    affine = -scene.dt * scene.particle_volume * 4.0 / scene.dx**2 * tau + m * state.C
+    p = weight[..., None] * (m * state.v[:, None, :] + (affine[:, None] @ offset[..., None]).squeeze(-1))
+    index = _flat(scene, node).reshape(-1)
+    size = (scene.grid_size + 1) ** 3
+    momentum = torch.zeros(size, 3, dtype=torch.float64).index_add(0, index, p.reshape(-1, 3))
+    mass = torch.zeros(size, dtype=torch.float64).index_add(0, index, m * weight.reshape(-1))
+    return momentum, mass
+
+
+def _grid_to_particles(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    """G2P: the particles' v [particle, 3] and C [particle, 3, 3] from the nodes' velocity [(n + 1)^3, 3]."""
+    node, weight, offset = _stencil(scene, x)
+    wv = weight[..., None] * velocity[_flat(scene, node)]
+    return wv.sum(dim=1), 4.0 / scene.dx**2 * (wv[..., :, None] * offset[..., None, :]).sum(dim=1)
+
+
+def mass_tensor(scene: Scene, x: Tensor) -> Tensor:
+    """Mass of the grid nodes, shape [n, n, n]; the ghost nodes' mass goes to their neighbour, node 0.
+
+    Args:
+        scene: The scene.
+        x: Particle positions, shape [particle, 3].
+    """
+    n = scene.grid_size
+    node, weight, _ = _stencil(scene, x)
+    i, j, k = node.clamp(min=0).unbind(dim=-1)
+    index = ((i * n + j) * n + k).reshape(-1)
+    share = scene.particle_mass * weight.reshape(-1)
+    return torch.zeros(n**3, dtype=torch.float64).index_add(0, index, share).reshape(n, n, n)
+
+
+# ------------------------------------------------------------------------------------------------ grid update
+
+
+def _grid_update(
+    scene: Scene, momentum: Tensor, mass: Tensor, poses: Tensor, end_poses: Tensor, alpha: float
+) -> Tensor:
+    """Velocity of the nodes [(n + 1)^3, 3] after gravity, manipulators and walls, in this order."""
+    active = (mass > MASS_THRESHOLD).nonzero().squeeze(-1)
+    node = _nodes(scene)[active]
+    v = momentum[active] / mass[active, None] + scene.dt * torch.tensor(scene.gravity, dtype=torch.float64)
+    for manipulator, pose, end_pose in zip(scene.manipulators, poses, end_poses, strict=True):
+        points = node * scene.dx
+        d, normal = signed_distance(manipulator, pose, points)
+        u = rigid_velocity(pose, end_pose, points, scene.dt)
+        v = contact(v, u, d, normal, manipulator.friction, alpha)
+    v = walls(scene, node, v)
+    return torch.zeros_like(momentum).index_put((active,), v)
+
+
+def contact(v: Tensor, u: Tensor, d: Tensor, normal: Tensor, friction: float, alpha: float) -> Tensor:
+    """Velocity of the nodes [node, 3] after contact with one manipulator.
+
+    Args:
+        v: Velocity of the nodes before, shape [node, 3].
+        u: Rigid velocity of the manipulator at the nodes, shape [node, 3].
+        d: Signed distances, shape [node].
+        normal: Outward normals, shape [node, 3].
+        friction: Coulomb friction coefficient.
+        alpha: Stiffness of soft contact; 0 is the hard model.
+    """
+    s = torch.exp(-alpha * d.clamp(min=0.0))[:, None]  # min(exp(-alpha d), 1) that cannot overflow
+    touches = d <= 0
+    if alpha > 0:
+        touches = touches | (s[:, 0] > STRENGTH_THRESHOLD)
+    r = v - u
+    r_n = (r * normal).sum(dim=-1, keepdim=True)
+    t = r - r_n.clamp(max=0.0) * normal
+    length = _norm(t)[:, None]
+    scale = (length + r_n * friction).clamp(min=0.0) / torch.where(length > 0, length, 1.0)
+    t = torch.where(r_n < 0, scale * t, t)
+    return torch.where(touches[:, None], u + (1.0 - s) * r + s * t, v)
+
+
+def walls(scene: Scene, node: Tensor, v: Tensor) -> Tensor:
+    """Velocity of the nodes [node, 3] after the walls and the floor, axis x, then y, then z."""
+    for axis in range(3):
+        outward = torch.zeros(3, dtype=torch.bool)
+        outward[axis] = True
+        low = (node[:, axis] < BOUND) & (v[:, axis] < 0)
+        stopped = floor_contact(v, scene.floor_friction) if axis == 1 else torch.where(outward, 0.0, v)
+        v = torch.where(low[:, None], stopped, v)
+        high = (node[:, axis] > scene.grid_size - BOUND) & (v[:, axis] > 0)
+        v = torch.where(high[:, None] & outward, 0.0, v)
+    return v
+
+
+def floor_contact(v: Tensor, friction: float) -> Tensor:
+    """Velocity of nodes [node, 3] that meet the floor with v_y < 0."""
+    tangential = v * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+    if friction == 0:
+        return tangential
+    if friction >= STICKY_FLOOR:
+        return torch.zeros_like(v)
+    length = _norm(tangential)
+    scale = (1.0 + friction * v[:, 1] / torch.where(length > 0, length, 1.0)).clamp(min=0.0)
+    return scale[:, None] * tangential
+
+
+# ---------------------------------------------------------------------------------------- manipulators: poses
+
+
+def move_manipulators(scene: Scene, poses: Tensor, action: Tensor) -> Tensor:
+    """Poses at the end of a substep.
+
+    Args:
+        scene: The scene.
+        poses: Poses at its start, shape [manipulator, 8].
+        action: Action of the environment step, shape [A].
+
+    Returns:
+        Poses, shape [manipulator, 8].
+    """
+    actions = action.to(torch.float64).clamp(-1.0, 1.0).split([m.action_dim for m in scene.manipulators])
+    ends = []
+    for manipulator, pose, part in zip(scene.manipulators, poses, actions, strict=True):
+        motion = part * torch.tensor(manipulator.scale, dtype=torch.float64) / scene.substeps
+        ends.append(_move(manipulator, pose, motion))
+    return torch.stack(ends) if ends else poses
+
+
+def _move(manipulator: Manipulator, pose: Tensor, motion: Tensor) -> Tensor:
+    """Pose [8] of one manipulator after the motion [action component] of one substep."""
+    rule = MANIPULATOR_SHAPES[manipulator.shape].motion
+    if rule == "static":
+        return pose
+    position, q, gap = pose[:3], pose[3:7], pose[7:]
+    if rule == "translate":
+        displacement = motion
+    elif rule == "roll":
+        displacement, q = _roll(q, motion)
+    elif rule == "grip":
+        displacement, q = motion[:3], quaternion_product(q, rotation_quaternion(motion[3:6]))
+        gap = (gap - motion[6:]).clamp(min=manipulator.minimal_gap)
+    elif rule == "rigid":
+        displacement, q = motion[:3], quaternion_product(rotation_quaternion(motion[3:6]), q)
+    else:
+        raise NotImplementedError(f"motion rule '{rule}'")
+    low = torch.tensor(manipulator.lower_bound, dtype=torch.float64)
+    high = torch.tensor(manipulator.upper_bound, dtype=torch.float64)
+    return torch.cat([(position + displacement).clamp(low, high), q, gap])
+
+
+def _roll(q: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """Displacement [3] and new rotation [4] of a rolling pin; motion is (roll, yaw, vertical)."""
+    roll, yaw, vertical = motion
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    axis = rotate(q, -up)
+    along = torch.linalg.cross(up, axis) * roll * ROLL_RADIUS
+    displacement = torch.stack([along[0], vertical, along[2]])
+    turned = quaternion_product(rotation_quaternion(-yaw * up), q)
+    return displacement, quaternion_product(turned, rotation_quaternion(roll * up))
+
+
+def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of the quaternions a and b, both w, x, y, z, shape [4]."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def rotation_quaternion(rotvec: Tensor) -> Tensor:
+    """Quaternion [4] (cos(|w| / 2), w / |w| sin(|w| / 2)) of the rotation vector w [3], smooth at 0."""
+    h2 = (rotvec * rotvec).sum() / 4.0  # squared half angle
+    if h2 < 1e-4:  # the series' next terms are below rounding
+        cosine = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0)))
+        sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0)))
+    else:
+        cosine, sinc = h2.sqrt().cos(), h2.sqrt().sin() / h2.sqrt()
+    return torch.cat([cosine[None], sinc / 2.0 * rotvec])
+
+
+def rotate(q: Tensor, points: Tensor) -> Tensor:
+    """Rotate points [..., 3] by the quaternion q [4].
+
+    Only the direction of q counts: a quaternion that is not quite of unit length would otherwise scale the
+    points, and the rigid velocity divides that error by the time step.
+    """
+    w, xyz = q[0], q[1:].expand_as(points)
+    cross = torch.linalg.cross(xyz, points)
+    return points + 2.0 / (q * q).sum() * (w * cross + torch.linalg.cross(xyz, cross))
+
+
+def from_frame(pose: Tensor, points: Tensor) -> Tensor:
+    """Rigid transform of points [..., 3] from the frame of the pose [8] to the world."""
+    return rotate(pose[3:7], points) + pose[:3]
+
+
+def to_frame(pose: Tensor, points: Tensor) -> Tensor:
+    """Inverse of :func:`from_frame`."""
+    return rotate(_conjugate(pose[3:7]), points - pose[:3])
+
+
+def rigid_velocity(pose: Tensor, end_pose: Tensor, points: Tensor, dt: float) -> Tensor:
+    """Velocity of points [..., 3] carried from one pose [8] to another in the time dt."""
+    return (from_frame(end_pose, to_frame(pose, points)) - points) / dt
+
+
+def _conjugate(q: Tensor) -> Tensor:
+    return torch.cat([q[:1], -q[1:]])
+
+
+# ----------------------------------------------------------------------------- manipulators: signed distances
+
+
+def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance to a manipulator and its gradient, the outward normal.
+
+    Args:
+        manipulator: Shape and size.
+        pose: Pose, shape [8].
+        points: Points in the world, shape [..., 3].
+
+    Returns:
+        Distances [...], negative inside, and normals in the world frame [..., 3]. Where symmetry leaves a
+        direction of the normal undefined (on the axis of a capsule, say) that part of it is 0.
+    """
+    d, normal = _DISTANCES[manipulator.shape](manipulator.size, pose[7], to_frame(pose, points))
+    return d, rotate(pose[3:7], normal)
+
+
+def _sphere(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance and normal, own frame, of a sphere."""
+    return _norm(p) - size[0], _direction(p)
+
+
+def _segment(p: Tensor, low: float, high: float, radius: float) -> tuple[Tensor, Tensor]:
+    """Distance and normal of a capsule around the segment of the y axis from low to high."""
+    x, y, z = p.unbind(dim=-1)
+    to_axis = torch.stack([x, y - y.clamp(low, high), z], dim=-1)
+    return _norm(to_axis) - radius, _direction(to_axis)
+
+
+def _capsule(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    h, r = size
+    return _segment(p, -h / 2.0, h / 2.0, r)
+
+
+def _chopsticks(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearer of two sticks; the one at +gap/2 where both are equally far."""
+    h, r = size
+    shift = torch.stack([gap / 2.0, torch.zeros_like(gap), torch.zeros_like(gap)])
+    d_a, normal_a = _segment(p - shift, -h, 0.0, r)
+    d_b, normal_b = _segment(p + shift, -h, 0.0, r)
+    nearer = d_a <= d_b
+    return torch.where(nearer, d_a, d_b), torch.where(nearer[..., None], normal_a, normal_b)
+
+
+def _torus(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Ring of radius tx about the y axis, thick by radius ty."""
+    tx, ty = size
+    radial = _radial(p)
+    q = torch.stack([_norm(radial) - tx, p[..., 1]], dim=-1)
+    gradient = _direction(q)
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    return _norm(q) - ty, gradient[..., :1] * _direction(radial) + gradient[..., 1:] * up
+
+
+def _cylinder(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Solid cylinder about the y axis: a rectangle in the half plane of radius and height."""
+    radius, half_height = size
+    radial = _radial(p)
+    d, gradient = _corner(torch.stack([_norm(radial) - radius, p[..., 1].abs() - half_height], dim=-1))
+    return d, gradient[..., :1] * _direction(radial) + gradient[..., 1:] * (p - radial).sign()
+
+
+def _box(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    d, gradient = _corner(p.abs() - torch.tensor(size, dtype=torch.float64))
+    return d, gradient * p.sign()
+
+
+def _corner(q: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance to the corner {q <= 0} and its gradient.
+
+    Args:
+        q: Signed distances to the faces, shape [..., face].
+
+    Returns:
+        Distance [...] and gradient [..., face]; inside, of the nearest face (the first of equally near ones).
+    """
+    positive = q.clamp(min=0.0)
+    outside = (q > 0).any(dim=-1)
+    nearest = torch.nn.functional.one_hot(q.argmax(dim=-1), q.shape[-1]).to(q.dtype)
+    d = torch.where(outside, _norm(positive), (q * nearest).sum(dim=-1))
+    return d, torch.where(outside[..., None], _direction(positive), nearest)
+
+
+_DISTANCES = {
+    "Sphere": _sphere,
+    "Capsule": _capsule,
+    "RollingPin": _capsule,
+    "Chopsticks": _chopsticks,
+    "Torus": _torus,
+    "Cylinder": _cylinder,
+    "Box": _box,
+}
+
+
+def _radial(p: Tensor) -> Tensor:
+    """Part of p [..., 3] perpendicular to the y axis."""
+    return p * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def _norm(a: Tensor) -> Tensor:
+    """Length of the vectors a [..., axis]; derivative 0 at 0."""
+    square = (a * a).sum(dim=-1)
+    return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
+
+
+def _direction(a: Tensor) -> Tensor:
+    """Unit vectors along a [..., axis]; 0 at 0."""
+    length = _norm(a)[..., None]
+    return a / torch.where(length > 0, length, 1.0)
+
+
+def _identity() -> Tensor:
+    return torch.eye(3, dtype=torch.float64)
+
+
+# ------------------------------------------------------------------------------------------------------- loss
+
+
+def loss_terms(scene: Scene, state: State, target_mass: Tensor, target_sdf: Tensor) -> Tensor:
+    """The unweighted terms of one step's loss: density, sdf, contact.
+
+    Args:
+        scene: The scene.
+        state: State at the end of the environment step.
+        target_mass: Target mass tensor, shape [n, n, n].
+        target_sdf: Distance to the target, shape [n, n, n].
+
+    Returns:
+        Terms, shape [3].
+    """
+    mass = mass_tensor(scene, state.x)
+    contact_term = torch.zeros((), dtype=torch.float64)
+    for manipulator, pose in zip(scene.manipulators, state.poses, strict=True):
+        if MANIPULATOR_SHAPES[manipulator.shape].motion != "static":
+            d, _ = signed_distance(manipulator, pose, state.x)
+            contact_term = contact_term + d.clamp(min=0.0).min() ** 2
+    return torch.stack([(mass - target_mass).abs().sum(), (target_sdf * mass).sum(), contact_term])
+
+
+def rollout_loss(
+    scene: Scene,
+    state: State,
+    actions: Tensor,
+    alpha: float,
+    target_mass: Tensor,
+    target_sdf: Tensor,
+    weights: tuple[float, float, float] = (10, 10, 1),
+) -> tuple[Tensor, State]:
+    """Sum of the step losses over a rollout.
+
+    Args:
+        scene: The scene.
+        state: State at the start.
+        actions: Actions, shape [T, A].
+        alpha: Stiffness of soft contact; 0 is the hard model.
+        target_mass: Target mass tensor, shape [n, n, n].
+        target_sdf: Distance to the target, shape [n, n, n].
+        weights: Weights of density, sdf and contact.
+
+    Returns:
+        The loss, a scalar, and the state at the end.
+    """
+    loss = torch.zeros((), dtype=torch.float64)
+    weight = torch.tensor(weights, dtype=torch.float64)
+    for action in actions:
+        state = env_step(scene, state, action, alpha)
+        loss = loss + weight @ loss_terms(scene, state, target_mass, target_sdf)
+    return loss, state

@@ -1,0 +1,188 @@
+"""Objective against direct formulas: loops over particles and nodes, one number at a time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from plab.objective import (
+    LossWeights,
+    observation,
+    rewards,
+    scores,
+    soft_iou,
+    spread_mass,
+    target_sdf,
+    total_loss,
+)
+
+N = 8
+
+positions = arrays(
+    np.float64, st.tuples(st.integers(1, 5), st.just(3)), elements=st.floats(0.0, 1.0 - 3.0 / N)
+)
+tensors = arrays(np.float64, (3, 3, 3), elements=st.floats(0.0, 4.0)).filter(lambda a: a.max() > 1e-3)
+
+
+def naive_kernel(distance: float) -> float:
+    """Quadratic B-spline of a distance in cells."""
+    d = abs(distance)
+    if d < 0.5:
+        return 0.75 - d * d
+    return 0.5 * (1.5 - d) ** 2 if d < 1.5 else 0.0
+
+
+def naive_mass(x: np.ndarray, n: int, mass: float) -> np.ndarray:
+    """Visit every node for every particle, with a layer of ghost nodes below 0 that is folded onto node 0."""
+    grid = np.zeros((n, n, n))
+    for p in x:
+        for node in np.ndindex(n + 1, n + 1, n + 1):
+            i, j, k = (index - 1 for index in node)
+            w = naive_kernel(p[0] * n - i) * naive_kernel(p[1] * n - j) * naive_kernel(p[2] * n - k)
+            grid[max(i, 0), max(j, 0), max(k, 0)] += mass * w
+    return grid
+
+
+@settings(max_examples=30, deadline=None)
+@given(positions)
+def test_spread_mass_is_the_b_spline_and_conserves_mass(x):
+    mass = spread_mass(x, N, 0.25)
+    np.testing.assert_allclose(mass, naive_mass(x, N, 0.25), atol=1e-14)
+    assert mass.sum() == pytest.approx(0.25 * len(x), rel=1e-12)
+    assert mass.min() >= 0
+
+
+def test_spread_mass_of_a_particle_on_the_floor():
+    # At y = 0 the nodes -1, 0, 1 get 1/8, 3/4, 1/8; the ghost's share goes to node 0.
+    column = spread_mass([[0.5, 0.0, 0.5]], N, 1.0).sum(axis=(0, 2))
+    np.testing.assert_allclose(column, [0.875, 0.125] + [0.0] * (N - 2))
+
+
+@pytest.mark.parametrize(
+    "x", [[[0.5, -0.2, 0.5]], [[0.5, 0.95, 0.5]], [[math.nan, 0.5, 0.5]], [[0.5, 0.5]], [0.5]]
+)
+def test_spread_mass_refuses_what_is_off_the_grid(x):
+    with pytest.raises(ValueError, match="positions"):
+        spread_mass(x, N, 1.0)
+
+
+def test_target_sdf_is_the_distance_to_the_nearest_target_node(rng):
+    mass = np.where(rng.random((N, N, N)) < 0.02, 1.0, 1e-4)
+    sdf = target_sdf(mass)
+    inside = np.argwhere(mass > 1e-4)
+    for node in np.ndindex(N, N, N):
+        nearest = min(math.dist(node, other) for other in inside)
+        assert sdf[node] == pytest.approx(nearest / N, abs=1e-12)
+    assert np.array_equal(sdf == 0, mass > 1e-4)
+
+
+def test_target_sdf_of_nothing():
+    with pytest.raises(ValueError, match="the target is empty"):
+        target_sdf(np.full((4, 4, 4), 1e-4))
+
+
+@given(tensors, tensors)
+def test_soft_iou_is_its_formula(a, b):
+    top_a, top_b = a.max(), b.max()
+    both = either = 0.0
+    for p, q in zip(a.ravel() / top_a, b.ravel() / top_b, strict=True):
+        both += p * q
+        either += p + q - p * q
+    iou = soft_iou(a, b)
+    assert iou == pytest.approx(both / either, rel=1e-9, abs=1e-12)
+    assert 0 <= iou <= 1 + 1e-12
+    assert soft_iou(b, a) == pytest.approx(iou, rel=1e-12)
+    assert soft_iou(3 * a, 0.5 * b) == pytest.approx(iou, rel=1e-9)
+
+
+def test_soft_iou_of_a_binary_tensor_and_itself_is_one():
+    a = np.zeros((3, 3, 3))
+    a[1, 1, :] = 0.7
+    assert soft_iou(a, a) == 1.0
+    assert soft_iou(a, np.roll(a, 1, axis=0)) == 0.0
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 2, 2)), np.full((2, 2, 2), np.nan), np.full((2, 2, 2), np.inf)])
+def test_soft_iou_needs_mass(bad):
+    with pytest.raises(ValueError, match="finite mass"):
+        soft_iou(bad, np.ones((2, 2, 2)))
+
+
+def test_soft_iou_needs_equal_shapes():
+    with pytest.raises(ValueError, match="different shapes"):
+        soft_iou(np.ones((2, 2, 2)), np.ones((3, 3, 3)))
+
+
+def test_scores_are_their_formulas(rng):
+    initial, final, target = (rng.random((4, 4, 4)) ** power for power in (6.0, 2.0, 3.0))
+    s = scores(initial, final, target)
+    start, end, best = soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target)
+    assert (s.iou_initial, s.iou_final, s.iou_target_self) == (start, end, best)
+    assert s.score_printed == pytest.approx((end - start) / (1 - start))
+    assert s.score == pytest.approx(min(max((end - start) / (best - start), 0), 1))
+    assert 0 < s.score_printed < s.score
+
+
+def test_scores_at_the_ends(rng):
+    target, other = rng.random((4, 4, 4)) ** 3, rng.random((4, 4, 4)) ** 8
+    assert scores(other, target, target).score == 1.0
+    assert scores(other, other, target).score == 0.0
+    # Worse than the start: clamped, while the printed formula goes below 0.
+    worse = np.zeros((4, 4, 4))
+    worse[np.unravel_index(target.argmin(), target.shape)] = 1.0
+    assert scores(other, worse, target).score == 0.0
+    assert scores(other, worse, target).score_printed < 0.0
+
+
+def test_scores_where_nothing_can_be_gained():
+    target = np.zeros((3, 3, 3))
+    target[1] = 1.0
+    moved = np.roll(target, 1, axis=0)
+    stayed, left = scores(target, target, target), scores(target, moved, target)
+    assert (stayed.score, stayed.score_printed) == (1.0, 1.0)
+    assert (left.score, left.score_printed) == (0.0, 0.0)
+
+
+def test_total_loss_and_rewards(rng):
+    weights = LossWeights(density=10.0, sdf=5.0, contact=2.0)
+    initial, steps = rng.random((2, 3)), rng.random((2, 6, 3))
+    loss, reward = total_loss(steps, weights), rewards(initial, steps, weights)
+    assert loss.shape == reward.shape == (2, 6)
+    for b, t in np.ndindex(2, 6):
+        d, s, c = steps[b, t]
+        d0, s0, c0 = initial[b]
+        assert loss[b, t] == pytest.approx(10 * d + 5 * s + 2 * c)
+        assert reward[b, t] == pytest.approx(10 * (d0 - d) + 5 * (s0 - s) + 2 * (c0 - c))
+    assert rewards(initial[0], steps[0], weights).shape == (6,)
+
+
+@pytest.mark.parametrize(
+    ("particles", "observed"), [(10, 10), (199, 199), (200, 200), (399, 399), (450, 225), (1000, 200)]
+)
+def test_observation(rng, particles, observed):
+    x, v = rng.random((particles, 3)), rng.random((particles, 3))
+    ball, sticks = rng.random(7), rng.random(8)
+    seen = observation(x, v, [ball, sticks])
+    assert seen.shape == (6 * observed + 15,)
+    stride = max(particles // 200, 1)
+    for number in (0, 1, observed - 1):
+        np.testing.assert_array_equal(seen[6 * number : 6 * number + 3], x[number * stride])
+        np.testing.assert_array_equal(seen[6 * number + 3 : 6 * number + 6], v[number * stride])
+    np.testing.assert_array_equal(seen[-15:], np.concatenate([ball, sticks]))
+
+
+def test_observation_of_a_batch(rng):
+    x, v, pose = rng.random((4, 500, 3)), rng.random((4, 500, 3)), rng.random((4, 7))
+    seen = observation(x, v, [pose])
+    assert seen.shape == (4, 6 * 250 + 7)
+    np.testing.assert_array_equal(seen[2], observation(x[2], v[2], [pose[2]]))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)

@@ -1,0 +1,297 @@
+"""Trajectory optimisation on a coarse scene: update rules, best actions, resumption, failures."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from plab.config import Config, load_config
+from plab.objective import scores
+from plab.results import RunResult, read, result_path
+from plab.runners import RunError, run_config, trajectory
+from plab.runners.trajectory import ActionSequence, Problem
+
+ITERATIONS = 4
+
+COARSE = (
+    "task=Rope",
+    "sim=reference",
+    "sim.grid_size=16",
+    "sim.horizon=3",
+    "sim.substeps=5",
+    "sim.dt=4e-4",
+    "sim.particles_scale=0.03",
+    f"method.iterations={ITERATIONS}",
+    "progress=false",
+)
+"""300 particles, 15 substeps."""
+
+TIMES = ["seconds"]
+"""Columns that differ from run to run."""
+
+
+def make_config(folder: Path, *overrides: str) -> Config:
+    return load_config([*COARSE, f"results_dir={folder}", *overrides])
+
+
+def run(cfg: Config) -> RunResult:
+    score = run_config(cfg)
+    result = read(result_path(cfg))
+    assert result.status == "finished" and result.evaluation["score"] == score
+    return result
+
+
+def assert_same_numbers(a: RunResult, b: RunResult) -> None:
+    """Assert that two runs agree bit for bit in everything but times and provenance."""
+    rows = [result.iterations.drop(columns=TIMES) for result in (a, b)]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+    assert np.array_equal(a.best_actions, b.best_actions)
+    assert (a.best_iteration, a.best_loss) == (b.best_iteration, b.best_loss)
+    assert a.evaluation == b.evaluation
+    for name in ("initial", "final", "target"):
+        assert np.array_equal(a.masses[name], b.masses[name]), name
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """An uninterrupted run."""
+    return run(make_config(tmp_path_factory.mktemp("results")))
+
+
+# ---------------------------------------------------------------- update rules
+
+
+@pytest.fixture
+def method(tmp_path: Path):
+    return make_config(tmp_path).method
+
+
+def test_first_actions_are_uniform_and_follow_the_seed(method) -> None:
+    first = ActionSequence(method, 50, 6, seed=7).numpy()
+    assert first.shape == (50, 6) and first.dtype == np.float64
+    assert np.abs(first).max() <= method.action_init
+    assert np.abs(first).max() > 0.9 * method.action_init and abs(first.mean()) < 0.1 * method.action_init
+    assert np.array_equal(first, ActionSequence(method, 50, 6, seed=7).numpy())
+    assert not np.array_equal(first, ActionSequence(method, 50, 6, seed=8).numpy())
+
+
+def test_gd_is_momentum_on_weighted_gradients(method) -> None:
+    """v <- 0.9 v + 0.1 g from v = 0, the first step included; actions <- clip(actions - lr v)."""
+    actions = ActionSequence(replace(method, optimizer="gd", lr=0.5, momentum=0.9), 2, 2, seed=0)
+    gradients = [np.array([[1.0, -2.0], [0.5, 30.0]]), np.array([[3.0, 1.0], [0.0, 0.0]]), np.ones((2, 2))]
+    expected, v = actions.numpy(), np.zeros((2, 2))
+    for gradient in gradients:
+        actions.step(gradient)
+        v = 0.9 * v + 0.1 * gradient
+        expected = np.clip(expected - 0.5 * v, -1.0, 1.0)
+        np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-14, atol=1e-16)
+    assert actions.numpy()[1, 1] == -1.0
+
+
+def test_adam_is_adam(method) -> None:
+    actions = ActionSequence(replace(method, optimizer="adam", lr=0.1), 1, 3, seed=0)
+    gradients = [np.array([[1.0, -2e-3, 1e-9]]), np.array([[-0.5, 4.0, 0.0]])]
+    expected, m, s = actions.numpy(), np.zeros((1, 3)), np.zeros((1, 3))
+    for step, gradient in enumerate(gradients, start=1):
+        actions.step(gradient)
+        m, s = 0.9 * m + 0.1 * gradient, 0.999 * s + 0.001 * gradient**2
+        expected = expected - 0.1 * (m / (1 - 0.9**step)) / (np.sqrt(s / (1 - 0.999**step)) + 1e-8)
+        np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("optimizer", sorted(trajectory.OPTIMIZERS))
+def test_restored_actions_go_on_alike(method, optimizer: str) -> None:
+    method = replace(method, optimizer=optimizer)
+    rng = np.random.default_rng(0)
+    one, other = ActionSequence(method, 3, 2, seed=0), ActionSequence(method, 3, 2, seed=1)
+    one.step(rng.normal(size=(3, 2)))
+    other.restore(one.state())
+    for _ in range(3):
+        gradient = rng.normal(size=(3, 2))
+        one.step(gradient)
+        other.step(gradient)
+        assert np.array_equal(one.numpy(), other.numpy())
+
+
+# ---------------------------------------------------------------- whole runs
+
+
+def test_file_holds_the_whole_run(finished: RunResult) -> None:
+    rows = finished.iterations
+    assert rows["iteration"].tolist() == list(range(ITERATIONS))
+    assert np.isfinite(rows.to_numpy()).all() and (rows["gradient_norm"] > 0).all()
+    terms = rows[["loss_density", "loss_sdf", "loss_contact"]].to_numpy()
+    np.testing.assert_allclose(rows["loss"], terms @ [10.0, 10.0, 1.0], rtol=1e-12)
+    # reward = T * initial loss - loss: their sum does not depend on the actions.
+    np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-12)
+    judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
+    assert finished.evaluation["score"] == judged.score
+    assert finished.evaluation["iou"] == judged.iou_final
+    assert set(finished.wall_time) == {"build", "compile", "optimise", "evaluate"}
+    assert finished.provenance["precision"] == "float64" and finished.provenance["resumed"] == 0
+    assert finished.resume is None
+
+
+def test_best_actions_are_kept(tmp_path: Path) -> None:
+    # Steps this large overshoot, so that the last actions are not the best.
+    cfg = make_config(tmp_path, "method.lr=1.0", "method.iterations=5")
+    result = run(cfg)
+    best = int(result.iterations["loss"].argmin())
+    assert result.best_iteration == best
+    assert result.best_loss == result.iterations["loss"][best]
+    assert np.abs(result.best_actions).max() <= 1.0
+    problem = Problem(cfg)
+    problem.set_contact("soft", cfg.method.softness)
+    again = problem.rollout(result.best_actions, gradient=True)
+    assert again.measures["loss"] == result.best_loss
+    problem.set_contact("hard")
+    hard = problem.rollout(result.best_actions, gradient=False)
+    assert hard.measures == result.evaluation
+    assert np.array_equal(hard.final_mass, result.masses["final"])
+
+
+def test_adam_h_rolls_out_in_the_hard_model(tmp_path: Path, finished: RunResult) -> None:
+    result = run(make_config(tmp_path, "method=adam_h"))
+    assert result.evaluation["loss"] == pytest.approx(result.best_loss, rel=1e-12)
+    assert finished.evaluation["loss"] != pytest.approx(finished.best_loss, rel=1e-12)
+
+
+def test_gd_runs(tmp_path: Path) -> None:
+    assert len(run(make_config(tmp_path, "method=gd")).iterations) == ITERATIONS
+
+
+def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monkeypatch, capsys) -> None:
+    cfg = make_config(Path(finished.config["results_dir"]))
+    before = finished.path.stat().st_mtime_ns
+    monkeypatch.setattr(trajectory, "Problem", None)
+    assert run_config(cfg) == finished.evaluation["score"]
+    assert finished.path.stat().st_mtime_ns == before
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    assert str(finished.path) in out and f"{finished.evaluation['score']:.4f}" in out
+
+
+def test_force_repeats_with_the_same_numbers(tmp_path: Path, finished: RunResult) -> None:
+    cfg = make_config(tmp_path)
+    result_path(cfg).parent.mkdir(parents=True)
+    result_path(cfg).write_bytes(finished.path.read_bytes())
+    before = result_path(cfg).stat().st_mtime_ns
+    assert_same_numbers(run(replace(cfg, force=True)), finished)
+    assert result_path(cfg).stat().st_mtime_ns > before
+
+
+# ---------------------------------------------------------------- interruptions, failures
+
+
+def break_rollout(monkeypatch: pytest.MonkeyPatch, at: int, what) -> None:
+    """Let the rollouts from number ``at`` on go through ``what``."""
+    intact, calls = Problem.rollout, iter(range(1_000))
+
+    def rollout(self, actions, *, gradient):
+        result = intact(self, actions, gradient=gradient)
+        return what(result) if next(calls) >= at else result
+
+    monkeypatch.setattr(Problem, "rollout", rollout)
+
+
+def _raise(error: BaseException):
+    raise error
+
+
+@pytest.mark.parametrize("at", [1, 3, ITERATIONS], ids=["early", "late", "evaluation"])
+def test_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, finished, monkeypatch, at: int) -> None:
+    cfg = make_config(tmp_path)
+    with monkeypatch.context() as patch:
+        break_rollout(patch, at, lambda _: _raise(OSError("gone")))
+        with pytest.raises(OSError, match="gone"):
+            run_config(cfg)
+    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", at)
+    resumed = run(cfg)
+    assert_same_numbers(resumed, finished)
+    assert resumed.provenance["resumed"] == 1
+    assert not result_path(cfg).with_suffix(".partial.h5").exists()
+
+
+def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, monkeypatch) -> None:
+    cfg = make_config(tmp_path)
+    with monkeypatch.context() as patch:
+        break_rollout(patch, 2, lambda _: _raise(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            run_config(cfg)
+    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    assert (left.status, len(left.iterations)) == ("stopped", 2)
+    assert_same_numbers(run(cfg), finished)
+
+
+def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
+    cfg = make_config(tmp_path)
+    partial = result_path(cfg).with_suffix(".partial.h5")
+    command = [sys.executable, "-m", "plab.run", *COARSE, f"results_dir={tmp_path}"]
+    process = subprocess.Popen(command)
+    try:
+        while not partial.exists() and process.poll() is None:
+            time.sleep(0.001)
+        # Somewhere in the iterations that follow the first.
+        time.sleep(np.random.default_rng().uniform(0.0, finished.iterations["seconds"][1:].sum()))
+    finally:
+        process.kill()
+        process.wait()
+    subprocess.run(command, check=True)
+    assert_same_numbers(read(result_path(cfg)), finished)
+
+
+def _spoil_gradient(result):
+    gradient = result.gradient.copy()
+    gradient[0, 0, 1] = np.nan
+    return replace(result, gradient=gradient)
+
+
+def _spoil_loss(result):
+    terms = result.step_terms.copy()
+    terms[0, 1, 0] = np.inf
+    return replace(result, step_terms=terms)
+
+
+def _spoil_state(result):
+    raise trajectory.SimulationError("environment 0, step 2: position is nan")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_spoil_gradient, "iteration 2: gradient is nan"),
+        (_spoil_loss, "iteration 2: loss is inf at environment step 2"),
+        (_spoil_state, "iteration 2: environment 0, step 2: position is nan"),
+    ],
+)
+def test_numbers_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch, spoil, message: str) -> None:
+    cfg = make_config(tmp_path)
+    intact, calls = trajectory.Simulator.rollout, iter(range(1_000))
+
+    def rollout(self, actions, **options):
+        result = intact(self, actions, **options)
+        return spoil(result) if next(calls) == 2 else result
+
+    monkeypatch.setattr(trajectory.Simulator, "rollout", rollout)
+    with pytest.raises(RunError) as caught:
+        run_config(cfg)
+    assert str(caught.value) == message
+    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    assert (left.status, left.message, len(left.iterations)) == ("failed", message, 2)
+    assert left.best_actions is not None
+
+
+def test_progress_is_plain_lines_without_a_terminal(tmp_path: Path, capsys) -> None:
+    run_config(replace(make_config(tmp_path), progress=True))
+    # Taichi has lines of its own to say.
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Rope-v1")]
+    assert len(lines) == 2
+    assert lines[1].startswith(f"Rope-v1 adam seed 0 {ITERATIONS}/{ITERATIONS}, 0:00:00 left, loss ")
