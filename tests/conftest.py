@@ -1,10 +1,18 @@
-"""What all tests share: those marked ``gpu`` are skipped where there is no CUDA device."""
+"""Fixtures shared by all tests; those marked ``gpu`` are skipped where there is no CUDA device."""
 
 from __future__ import annotations
+
+import os
 
 import pytest
 
 from plab.run import cuda_is_usable
+
+
+@pytest.fixture(scope="session")
+def device() -> str:
+    """Device on which the simulator's tests run: ``PLAB_TEST_DEVICE``, cpu unless set."""
+    return os.environ.get("PLAB_TEST_DEVICE", "cpu")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -102,7 +103,7 @@ def test_target_differs_from_a_shifted_copy_of_the_scene(rope):
 def test_every_recipe_is_a_dataclass_with_documented_fields():
     for recipe in RECIPES.values():
         for field in recipe.__dataclass_fields__:
-            assert f"        {field}: " in recipe.__doc__
+            assert re.search(rf"^\s*{field}: ", recipe.__doc__, re.MULTILINE)
 
 
 @pytest.mark.parametrize(

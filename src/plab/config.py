@@ -17,6 +17,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -359,12 +360,17 @@ def load_config(overrides: Sequence[str] = ()) -> Config:
     Raises:
         ConfigError: If an override does not fit.
     """
+    surrounding = GlobalHydra.instance().hydra
     try:
         check_overrides(overrides)
+        # Composing must work inside a Hydra application, too, and leave it as it was.
+        GlobalHydra.instance().clear()
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             composed = compose("config", overrides=list(overrides))
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(explain(error)) from None
+    finally:
+        GlobalHydra.instance().hydra = surrounding
     return finish(composed, overrides)
 
 
@@ -410,6 +416,8 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
     try:
         _reject_unknown(composed, "")
         _reject_undone(composed, overrides)
+        # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
+        OmegaConf.set_struct(composed, None)
         composed.task = _merge_variant(composed.task, composed.variant)
         cfg = OmegaConf.to_object(composed)
     except OmegaConfBaseException as error:
@@ -496,8 +504,6 @@ def _merge_variant(task: DictConfig, variant: int) -> DictConfig:
         raise ConfigError(
             f"variant {variant} of task {task.name} must be a part of the task's structure, not {changes}"
         )
-    # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
-    OmegaConf.set_struct(task, None)
     try:
         merged = OmegaConf.merge(task, changes)
     except OmegaConfBaseException as error:

@@ -20,7 +20,7 @@ __all__ = ["explain", "pick"]
 
 def pick(name: str, names: Sequence[str]) -> str:
     """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
-    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.6)
+    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
     guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
     return f"{guess}choose from: {', '.join(names)}"
 

@@ -87,6 +87,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         cpu_max_num_threads=wanted,
         # Square roots in float64 on CUDA lose digits under fast_math; on the CPU it is what lets LLVM use FMA.
         fast_math=device == "cpu" or precision == "float32",
+        # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of them asserts.
+        advanced_optimization=False,
         offline_cache=True,
         log_level=ti.WARN,
     )

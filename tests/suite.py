@@ -1,0 +1,85 @@
+"""Small scenes for the tests: one body and all seven manipulators, one of them near it, in every environment.
+
+All environments of a batch share one compiled simulator, so that one compilation serves every manipulator.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+
+KINDS = tuple(MANIPULATOR_SHAPES)
+CENTER = np.array([0.5, 0.3, 0.5])
+WIDTH = 0.2
+TILT = (math.cos(0.2), 0.6 * math.sin(0.2), 0.0, 0.8 * math.sin(0.2))
+
+NEAR = {
+    "Sphere": (0.385, 0.31, 0.49),
+    "Capsule": (0.39, 0.29, 0.52),
+    "RollingPin": (0.51, 0.412, 0.49),
+    "Chopsticks": (0.51, 0.42, 0.5),
+    "Torus": (0.49, 0.412, 0.51),
+    "Cylinder": (0.5, 0.3, 0.31),
+    "Box": (0.62, 0.31, 0.51),
+}
+FAR = {kind: (0.12 + 0.12 * i, 0.85, 0.15) for i, kind in enumerate(KINDS)}
+SIZES = {
+    "Sphere": (0.03,),
+    "Capsule": (0.06, 0.03),
+    "RollingPin": (0.15, 0.03),
+    "Chopsticks": (0.1, 0.02),
+    "Torus": (0.05, 0.025),
+    "Cylinder": (0.1, 0.2),
+    "Box": (0.03, 0.05, 0.04),
+}
+SCALES = {
+    "Sphere": (0.01,) * 3,
+    "Capsule": (0.01,) * 3,
+    "RollingPin": (0.6, 0.06, 0.004),
+    "Chopsticks": (0.01, 0.01, 0.01, 0.04, 0.04, 0.04, 0.02),
+    "Torus": (0.01,) * 3,
+    "Cylinder": (),
+    "Box": (0.01, 0.01, 0.01, 0.04, 0.04, 0.04),
+}
+ROTATIONS = {"RollingPin": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0), "Torus": TILT, "Box": TILT, "Chopsticks": TILT}
+
+
+def manipulator(kind: str, near: bool) -> Manipulator:
+    """One manipulator touching the body, or out of its way."""
+    return Manipulator(
+        kind,
+        SIZES[kind],
+        NEAR[kind] if near else FAR[kind],
+        rotation=ROTATIONS.get(kind, (1.0, 0.0, 0.0, 0.0)),
+        scale=SCALES[kind],
+        gap=0.08,
+        friction=0.5,
+    )
+
+
+def scene(near: tuple[str, ...], *, particles: int = 200, floor: bool = False, **changes: float) -> Scene:
+    """A box of plasticine with the manipulators named in ``near`` touching it.
+
+    Args:
+        near: Shapes of the manipulators that touch the body; the others are far away.
+        particles: Number of particles.
+        floor: Put the body onto the floor instead of into the air.
+        **changes: Fields of the scene.
+    """
+    center = (0.5, 0.5 * WIDTH, 0.5) if floor else tuple(CENTER)
+    body = Body("box", center, (WIDTH,) * 3, particles)
+    values = {"yield_stress": 60.0, "grid_size": 32, "substeps": 19, **changes}
+    return Scene("test", (body,), tuple(manipulator(kind, kind in near) for kind in KINDS), **values)
+
+
+def batch() -> list[Scene]:
+    """One environment per manipulator, one with all of them, one on a rough floor, one stiff and one soft."""
+    scenes = [scene((kind,)) for kind in KINDS]
+    scenes.append(scene(KINDS))
+    scenes.append(scene((), floor=True, floor_friction=0.4))
+    scenes.append(scene(("Sphere", "Box"), yield_stress=5.0, poisson_ratio=0.05))
+    scenes.append(scene(("Torus", "Chopsticks"), yield_stress=math.inf, poisson_ratio=0.4))
+    return scenes

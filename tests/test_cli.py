@@ -1,0 +1,233 @@
+"""The command line: help, one line and exit code 2 for every mistake, sweeps, Ctrl-C, traces on disk."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from plab.config import Config, choices
+from plab.results import ResultsError
+from plab.run import cuda_is_usable, main
+from plab.runners import RunError
+
+COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def refused(capsys) -> Callable[..., str]:
+    """Run a command line that must fail with exit code 2 and one line on stderr; return the line."""
+
+    def run(*argv: str) -> str:
+        assert main(argv) == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.startswith("plab: ") and err.count("\n") == 1
+        return err.strip()
+
+    return run
+
+
+@pytest.fixture
+def seen(monkeypatch) -> list[Config]:
+    """Collect the configurations that reach the runners, instead of running them."""
+    configs: list[Config] = []
+
+    def collect(cfg: Config) -> float:
+        configs.append(cfg)
+        return 0.5
+
+    monkeypatch.setattr("plab.runners.run_config", collect)
+    return configs
+
+
+def plab(*argv: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "plab.run", *argv], cwd=cwd, capture_output=True, text=True, check=False
+    )
+
+
+REFUSED = [
+    (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Move, Rope"),
+    (["method=ppo"], "choose from: adam, adam_h, gd"),
+    (["sim=slow"], "choose from: fast, reference"),
+    (["tsk=Move"], "unknown key 'tsk'; did you mean task?"),
+    (["seed=abc"], "could not be converted to Integer"),
+    (["seed=-1"], "seed must be at least 0, not -1"),
+    (["variant=6"], "variant 6 of task Rope does not exist; choose from: 1, 2, 3, 4, 5"),
+    (["seed=0,1"], "add -m"),
+    (["Rope"], "cannot read 'Rope': write key=value"),
+    (["~seed"], "keys cannot be removed"),
+    (["method.lr=0"], "method.lr must be positive"),
+    (["sim.dt=1e-3"], "dt 0.001 is above the stability limit 0.00021"),
+    (["task.bodies.rope.center=[0.5,0.5,0.99]"], "outside the domain"),
+    (["task.target.radius=0.6"], "the target reaches outside the domain"),
+    (["--mutlirun"], "unknown flag --mutlirun; did you mean --multirun?"),
+    (["--cfg"], "argument --cfg/-c: expected one argument"),
+    (["--cfg", "job", "-m"], "Only one of --run, --multirun, --cfg"),
+    (["--cfg", "job", "task=Ropee"], "did you mean Rope?"),
+    (["--config-name", "other"], "other"),
+    (["--config-dir", "nowhere"], "nowhere"),
+    (["-m", "variant=1,2", "task=Ropee"], "did you mean Rope?"),
+    (["hydra/launcher=cluster"], "hydra/launcher 'cluster' does not exist"),
+    (["hydra.run.dri=x"], "unknown key 'hydra.run.dri'"),
+]
+
+
+@pytest.mark.parametrize(("argv", "message"), REFUSED, ids=[" ".join(argv) for argv, _ in REFUSED])
+def test_a_mistake_is_one_line_and_exit_code_2(refused, argv, message):
+    assert message in refused(*argv)
+
+
+@pytest.mark.skipif(cuda_is_usable(), reason="there is a CUDA device")
+def test_cuda_without_a_device(refused):
+    assert "no usable CUDA device; choose sim.device=cpu" in refused("sim.device=cuda")
+
+
+@pytest.mark.parametrize("flags", [(), ("-m",)])
+def test_a_results_folder_that_cannot_be_written(capsys, flags):
+    Path("file").touch()
+    assert main(["results_dir=file/results", *flags]) == 2
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("plab: "))
+    assert "cannot write" in line and "file" in line
+
+
+def test_a_mistake_in_a_fresh_process(tmp_path):
+    done = plab("sim.precison=float64", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "plab: unknown key 'sim.precison'; did you mean precision? choose from: "
+        "precision, device, memory_mb, grid_size, dt, substeps, horizon, particles_scale\n"
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+# ----------------------------------------------------------------------------------------------- help, --cfg
+
+
+def test_help_names_everything(capsys):
+    assert main(["--help"]) == main(["-h", "task=nonsense"]) == 0
+    text, _ = capsys.readouterr()
+    for group in ("task", "method", "sim"):
+        assert all(f"{group}={name}" in text for name in choices(group))
+    for key in ("variant=1", "seed=0", "results_dir=results", "force=false", "progress=true"):
+        assert key in text
+    for key in (
+        "sim.precision=float32",
+        "method.lr=0.1",
+        "method.loss_weights.sdf=10.0",
+        "task.target.radius=0.135",
+    ):
+        assert key in text
+    assert "python -m plab.run task=Rope method=adam seed=0" in text
+    assert "hydra.run" not in text and "${" not in text
+
+
+def test_help_is_quick_and_imports_neither_torch_nor_taichi(tmp_path):
+    code = (
+        "import sys; from plab.run import main; main(['--help']); "
+        "print(sorted({'torch', 'taichi', 'pandas', 'scipy.ndimage'} & set(sys.modules)))"
+    )
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    # It takes about half a second where nothing else runs.
+    assert time.perf_counter() - start < 5
+    assert done.stdout.endswith("\n[]\n")
+
+
+def test_cfg_job_prints_the_configuration(capsys, tmp_path):
+    assert main(["--cfg", "job", "seed=3"]) == 0
+    out, err = capsys.readouterr()
+    assert "seed: 3\n" in out and "precision: float32\n" in out and err == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------ runs, sweeps
+
+
+def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_path):
+    assert main(["task=Move", "variant=2", "method=gd", "seed=7", "method.lr=0.05"]) == 0
+    (cfg,) = seen
+    assert (cfg.task.name, cfg.variant, cfg.method.name, cfg.seed, cfg.method.lr) == (
+        "Move",
+        2,
+        "gd",
+        7,
+        0.05,
+    )
+    assert Path.cwd() == tmp_path
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_flags_and_overrides_come_in_any_order(seen):
+    assert main(["seed=0,1", "-m", "variant=1,2"]) == 0
+    assert [(cfg.seed, cfg.variant) for cfg in seen] == [(0, 1), (0, 2), (1, 1), (1, 2)]
+    assert sorted(path.name for path in Path.cwd().rglob("*")) == ["multirun.yaml", "results"]
+
+
+def test_a_sweep_goes_on_after_a_refused_job(seen, capsys):
+    assert main(["-m", "variant=1,9,2"]) == 2
+    assert [cfg.variant for cfg in seen] == [1, 2]
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(ResultsError("the disk is full"), 2), (RunError("iteration 3: the loss is not finite"), 1)],
+)
+def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code):
+    def fail(cfg: Config) -> float:
+        raise error
+
+    monkeypatch.setattr("plab.runners.run_config", fail)
+    assert main([]) == code
+    assert capsys.readouterr().err == f"plab: {error}\n"
+
+
+def test_ctrl_c(monkeypatch, capsys):
+    def interrupt(cfg: Config) -> float:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("plab.runners.run_config", interrupt)
+    assert main([]) == 130
+    assert capsys.readouterr().err == "plab: stopped: run the same command again to resume\n"
+
+
+@pytest.mark.parametrize("error", [RuntimeError, ValueError, OSError, KeyError])
+def test_a_bug_keeps_its_traceback(monkeypatch, error):
+    def fail(cfg: Config) -> float:
+        raise error("a bug")
+
+    monkeypatch.setattr("plab.runners.run_config", fail)
+    with pytest.raises(error, match="a bug"):
+        main([])
+
+
+def test_the_process_is_left_as_it_was(seen, monkeypatch):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    argv = list(sys.argv)
+    assert main(["seed=1"]) == 0
+    assert main(["seed=-1"]) == 2
+    assert sys.argv == argv and "HYDRA_FULL_ERROR" not in os.environ
+
+
+@pytest.mark.slow
+def test_a_real_run_and_the_same_command_again(tmp_path):
+    command = ("task=Rope", "method=adam", *COARSE, "method.iterations=2")
+    first, again = (plab(*command, cwd=tmp_path) for _ in range(2))
+    assert (first.returncode, first.stderr) == (0, "")
+    assert again.returncode == 0 and "finished before" in again.stdout
+    (result,) = (path for path in tmp_path.rglob("*") if path.is_file())
+    assert result.parent == tmp_path / "results" / "Rope-v1" / "adam" and result.suffix == ".h5"

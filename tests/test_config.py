@@ -1,0 +1,353 @@
+"""The configuration: YAML against dataclasses, variants, checks, and the scenes that come out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from plab.config import (
+    BodyConfig,
+    Config,
+    ConfigError,
+    ManipulatorConfig,
+    SimConfig,
+    TaskConfig,
+    TrajectoryConfig,
+    build_scene,
+    choices,
+    config_dir,
+    load_config,
+    variant_task,
+)
+from plab.objective import LossWeights
+from plab.scene import Scene, SceneError
+
+YAML_FILES = sorted(config_dir().rglob("*.yaml"))
+KEY_LINE = re.compile(r'^ *["\w]+: ?')
+VARIANTS = [(task, variant) for task in choices("task") for variant in range(1, 6)]
+OPTIONAL = {"gap", "minimal_gap"}
+"""Fields that only chopsticks have."""
+
+
+def names(kind: type) -> set[str]:
+    return {field.name for field in dataclasses.fields(kind)}
+
+
+def keys(node: Any) -> set[str]:
+    return set(node) - {"defaults", "hydra"}
+
+
+def paths(node: Any, prefix: str = "") -> set[str]:
+    """Dotted paths of the leaves of nested mappings."""
+    if not isinstance(node, dict):
+        return {prefix}
+    return set().union(*(paths(value, f"{prefix}.{key}") for key, value in node.items()))
+
+
+def raw(path: str) -> Any:
+    return OmegaConf.to_container(OmegaConf.load(config_dir() / path))
+
+
+# ------------------------------------------------------------------------------ YAML and dataclasses
+
+
+@pytest.mark.parametrize("path", YAML_FILES, ids=lambda path: path.relative_to(config_dir()).as_posix())
+def test_every_key_has_a_comment(path: Path):
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines[0].startswith("# "), "the first line says what the file is; --help prints it"
+    bare = [
+        line for line in lines if KEY_LINE.match(line) and "# " not in line and line.strip() != "defaults:"
+    ]
+    assert bare == []
+
+
+def test_root_keys_are_the_fields():
+    assert keys(raw("config.yaml")) | {"task", "method", "sim"} == names(Config)
+
+
+def test_sim_keys_are_the_fields():
+    assert keys(raw("sim/fast.yaml")) == names(SimConfig)
+
+
+def test_trajectory_keys_are_the_fields():
+    method = raw("method/adam.yaml")
+    assert keys(method) == names(TrajectoryConfig)
+    assert keys(method["loss_weights"]) == names(LossWeights)
+
+
+@pytest.mark.parametrize("task", choices("task"))
+def test_task_keys_are_the_fields(task):
+    content = raw(f"task/{task}.yaml")
+    assert content["name"] == task
+    assert keys(content) == names(TaskConfig)
+    for body in content["bodies"].values():
+        assert keys(body) == names(BodyConfig)
+    for manipulator in content["manipulators"].values():
+        assert keys(manipulator) - OPTIONAL == names(ManipulatorConfig) - OPTIONAL
+
+
+def test_dataclasses_have_no_defaults_of_their_own():
+    kinds = (Config, TaskConfig, BodyConfig, ManipulatorConfig, TrajectoryConfig, SimConfig, LossWeights)
+    given = {
+        field.name
+        for kind in kinds
+        for field in dataclasses.fields(kind)
+        if field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
+    }
+    assert given == OPTIONAL
+
+
+@pytest.mark.parametrize(
+    "kind", [Config, TaskConfig, BodyConfig, ManipulatorConfig, TrajectoryConfig, SimConfig]
+)
+def test_every_field_is_documented(kind):
+    documented = "\n".join(base.__doc__ for base in kind.__mro__ if dataclasses.is_dataclass(base))
+    assert all(re.search(rf"^\s*{name}: ", documented, re.MULTILINE) for name in names(kind))
+
+
+@pytest.mark.parametrize("method", choices("method"))
+@pytest.mark.parametrize("sim", choices("sim"))
+def test_every_method_and_sim_composes(method, sim):
+    cfg = load_config([f"method={method}", f"sim={sim}"])
+    assert cfg.method.name == method
+    assert isinstance(cfg, Config) and isinstance(cfg.method, TrajectoryConfig)
+
+
+def test_methods_differ_only_where_their_files_say():
+    adam, gd, adam_h = (
+        dataclasses.asdict(load_config([f"method={m}"]).method) for m in ("adam", "gd", "adam_h")
+    )
+    assert gd == adam | {"name": "gd", "optimizer": "gd"}
+    assert adam_h == adam | {"name": "adam_h", "contact": "hard"}
+
+
+def test_reference_is_fast_in_float64():
+    fast, reference = (dataclasses.asdict(load_config([f"sim={s}"]).sim) for s in ("fast", "reference"))
+    assert reference == fast | {"precision": "float64"}
+
+
+# ------------------------------------------------------------------------------ scenes and variants
+
+
+@pytest.mark.parametrize(("task", "variant"), VARIANTS)
+def test_every_variant_is_a_valid_scene(task, variant):
+    scene = build_scene(load_config([f"task={task}", f"variant={variant}"]))
+    assert scene.name == task
+    assert scene.yield_stress == 200
+    assert (scene.youngs_modulus, scene.poisson_ratio, scene.gravity) == (5000, 0.2, (0, -30, 0))
+    assert (scene.grid_size, scene.dt, scene.substeps, scene.horizon) == (64, 1e-4, 19, 50)
+    assert (scene.particle_count, scene.action_dim) == (10000, 6)
+
+
+@pytest.mark.parametrize("task", choices("task"))
+def test_variants_of_a_task_set_the_same_keys(task):
+    first, *others = (paths(variant) for variant in raw(f"task/{task}.yaml")["variants"].values())
+    assert all(other == first for other in others)
+
+
+@pytest.mark.parametrize("variant", range(1, 6))
+def test_move_starts_with_the_spheres_on_either_side_of_the_ball(variant):
+    scene = build_scene(load_config(["task=Move", f"variant={variant}"]))
+    x, y, z = scene.bodies[0].center
+    left, right = scene.manipulators
+    assert left.position == pytest.approx((x - 0.1, y, z))
+    assert right.position == pytest.approx((x + 0.1, y, z))
+    assert (scene.floor_friction, left.size, left.friction) == (1.5, (0.03,), 0.9)
+
+
+def test_rope_scene():
+    scene = build_scene(load_config(["task=Rope", "variant=4"]))
+    left, right, pillar = scene.manipulators
+    assert [m.shape for m in scene.manipulators] == ["Sphere", "Sphere", "Cylinder"]
+    assert (left.position, right.position) == ((0.22, 0.015, 0.82), (0.78, 0.015, 0.82))
+    assert (pillar.position, pillar.size, pillar.scale) == ((0.4697, 0, 0.3868), (0.1, 0.2), ())
+    assert left.scale == right.scale == (0.01, 0.01, 0.01)
+    assert scene.bodies[0].size == (0.6, 0.06, 0.06)
+    assert scene.floor_friction == 0.3
+    assert left.rotation == (1, 0, 0, 0)
+
+
+def test_a_loaded_configuration_is_plain_and_holds_its_own_variant_only():
+    cfg = load_config(["task=Move", "variant=3"])
+    assert cfg.task.bodies["ball"].size == [0.10759]
+    assert list(cfg.task.variants) == ["3"]
+    assert json.loads(json.dumps(dataclasses.asdict(cfg))) == dataclasses.asdict(cfg)
+    # Merging the variant again changes nothing.
+    assert variant_task(cfg) == cfg.task
+    cfg.variant = 4
+    with pytest.raises(ConfigError, match="variant 4 of task Move does not exist; choose from: 3"):
+        build_scene(cfg)
+
+
+def test_a_variant_may_change_anything_and_add_bodies():
+    box = "{shape: box, center: [0.5, 0.3, 0.2], size: [0.1, 0.1, 0.1], particles: 10}"
+    cfg = load_config(
+        [
+            f"+task.variants.1.bodies={{second: {box}}}",
+            "+task.variants.1.yield_stress=7",
+            "+task.variants.1.bodies.rope.particles=20",
+        ]
+    )
+    scene = build_scene(cfg)
+    assert scene.yield_stress == 7
+    assert [body.particles for body in scene.bodies] == [20, 10]
+
+
+def test_particles_scale():
+    def count(scale: float) -> int:
+        return build_scene(load_config([f"sim.particles_scale={scale}"])).particle_count
+
+    assert (count(0.1), count(1), count(2.5), count(1e-9)) == (1000, 10000, 25000, 1)
+
+
+def test_scalar_overrides_reach_the_scene():
+    cfg = load_config(
+        ["task.yield_stress=inf", "task.gravity=[0,-5,0]", "sim.dt=2e-4", "task.manipulators.left.friction=0"]
+    )
+    scene = build_scene(cfg)
+    assert scene.yield_stress == float("inf")
+    assert scene.gravity == (0, -5, 0)
+    assert scene.dt == 2e-4
+    assert scene.manipulators[0].friction == 0
+    assert scene.manipulators[1].friction == 0.9
+
+
+def test_a_new_task_is_one_file(tmp_path, monkeypatch):
+    """Chopsticks have everything that the suite's other manipulators lack."""
+    for path in YAML_FILES:
+        copy = tmp_path / path.relative_to(config_dir())
+        copy.parent.mkdir(exist_ok=True)
+        text = path.read_text(encoding="utf-8")
+        copy.write_text(text, encoding="utf-8")
+    task = raw("task/Rope.yaml") | {"name": "Chopsticks", "variants": {"1": {}}}
+    task["manipulators"] = {
+        "sticks": task["manipulators"]["left"]
+        | {"shape": "Chopsticks", "size": [0.2, 0.02], "position": [0.5, 0.25, 0.5]}
+        | {"scale": [0.02] * 3 + [0.04] * 3 + [0.02], "gap": 0.08, "minimal_gap": 0.06, "friction": 10.0}
+    }
+    task["target"]["around"] = 0
+    OmegaConf.save(OmegaConf.create(task), tmp_path / "task" / "Chopsticks.yaml")
+    monkeypatch.setattr("plab.config.config_dir", lambda: tmp_path)
+    scene: Scene = build_scene(load_config(["task=Chopsticks"]))
+    assert (scene.action_dim, scene.manipulators[0].gap, scene.manipulators[0].friction) == (7, 0.08, 10)
+    with pytest.raises(ConfigError, match="choose from: Chopsticks, Move, Rope"):
+        load_config(["task=Chopstick"])
+
+
+def test_load_config_leaves_a_surrounding_hydra_alone():
+    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+        load_config(["seed=1"])
+        assert compose("config", overrides=["seed=2"]).seed == 2
+
+
+# ------------------------------------------------------------------------------ refusals
+
+REFUSED = [
+    ("task=Ropee", "task 'Ropee' does not exist; did you mean Rope? choose from: Move, Rope"),
+    ("method=adm", "method 'adm' does not exist; did you mean adam? choose from: adam, adam_h, gd"),
+    ("sim=slow", "sim 'slow' does not exist; choose from: fast, reference"),
+    ("method=", "method '' does not exist; choose from: adam, adam_h, gd"),
+    ("task=null", "name one task; choose from: Move, Rope"),
+    ("task=[Rope,Move]", "name one task; choose from: Move, Rope"),
+    ("+sim=reference", "write sim=reference"),
+    ("tsk=Move", "unknown key 'tsk'; did you mean task? choose from: task, method, sim, variant, seed"),
+    ("lr=0.1", "unknown key 'lr'; did you mean method.lr?"),
+    (
+        "sim.presicion=float64",
+        "unknown key 'sim.presicion'; did you mean precision? choose from: precision, device",
+    ),
+    ("task.bodies.rop.particles=1", "unknown key 'task.bodies.rop'; did you mean rope?"),
+    ("+sed=1", "unknown key 'sed'; did you mean seed?"),
+    ("+method.foo=1", "unknown key 'method.foo'; choose from: name, family"),
+    (
+        "+task.bodies.rope.colour=red",
+        "unknown key 'task.bodies.rope.colour'; choose from: shape, center, size",
+    ),
+    ("~seed", "keys cannot be removed"),
+    ("seed", "cannot read 'seed': write key=value"),
+    ("seed='", "cannot read"),
+    ("seed=0,1", "'seed=0,1' gives several values: add -m"),
+    ("seed=abc", "seed: Value 'abc' of type 'str' could not be converted to Integer"),
+    ("seed=1.5", "seed: Value '1.5' of type 'float' could not be converted to Integer"),
+    ("seed=null", "seed: field 'seed' is not Optional"),
+    ("seed=-1", "seed must be at least 0, not -1"),
+    ("seed=4294967296", "seed must be below 2^32"),
+    ("force=maybe", "force: Value 'maybe' is not a valid bool"),
+    ("results_dir=", "results_dir is empty"),
+    ("variant=0", "variant 0 of task Rope does not exist; choose from: 1, 2, 3, 4, 5"),
+    ("variant=9", "variant 9 of task Rope does not exist; choose from: 1, 2, 3, 4, 5"),
+    ("task.variants.1=7", "variant 1 of task Rope must be a part of the task's structure, not 7"),
+    ("+task.variants.1.foo=1", "variant 1 of task Rope: unknown key 'task.foo'; choose from: name"),
+    ("task.manipulators.pillar.position=[0,0,0]", "override task.variants.1.manipulators.pillar.position"),
+    (
+        "task.variants.1.manipulators.pillar.position=[0,0]",
+        "pillar.position must be 3 finite numbers, not [0.0, 0.0]",
+    ),
+    ("task.manipulators.left.position=[0.2,-1,0.8]", "left.position: y = -1 is outside its bounds 0 .. 1"),
+    ("task.manipulators.left.scale=[1,nan,1]", "left.scale must be 3 finite numbers"),
+    ("task.bodies.rope.particles=0", "task.bodies.rope.particles must be at least 1, not 0"),
+    ("task.youngs_modulus=0", "task.youngs_modulus must be positive and finite, not 0"),
+    ("task.yield_stress=-1", "task.yield_stress must be at least 0, not -1"),
+    ("task.floor_friction=nan", "task.floor_friction must be at least 0, not nan"),
+    ("task.gravity=[0,0]", "task.gravity must be 3 finite numbers, not [0.0, 0.0]"),
+    ("task.name=a/b", "task.name 'a/b' must be letters, digits, - and _"),
+    ("task.target.recipe=rings", "task.target.recipe 'rings' does not exist; choose from: bodies, ring"),
+    ("task.target.radius=wide", "task.target.radius: Value 'wide'"),
+    ("method.contact=firm", "method.contact 'firm' does not exist; choose from: soft, hard"),
+    ("method.optimizer=sgd", "method.optimizer 'sgd' does not exist; did you mean gd? choose from: adam, gd"),
+    ("method.softness=0", "method.softness must be positive and finite, not 0"),
+    ("method.loss_weights.sdf=-1", "method.loss_weights.sdf must be at least 0 and finite, not -1"),
+    ("method.loss_weights={density: 0, sdf: 0, contact: 0}", "method.loss_weights are all 0"),
+    ("method.lr=nan", "method.lr must be positive and finite, not nan"),
+    ("method.lr=inf", "method.lr must be positive and finite, not inf"),
+    ("method.betas=[0.9]", "method.betas must be 2 finite numbers, not [0.9]"),
+    ("method.betas=[0.9,1]", "method.betas must be in [0, 1), not 1"),
+    ("method.betas=0.9", "method.betas: Invalid value assigned"),
+    ("method.momentum=1", "method.momentum must be in [0, 1), not 1"),
+    ("method.eps=0", "method.eps must be positive"),
+    ("method.iterations=0", "method.iterations must be at least 1, not 0"),
+    ("method.action_init=2", "method.action_init must be in [0, 1], not 2"),
+    ("method.name=", "method.name '' must be"),
+    ("sim.precision=float16", "sim.precision 'float16' does not exist; did you mean float64?"),
+    ("sim.device=gpu", "sim.device 'gpu' does not exist; choose from: cpu, cuda"),
+    ("sim.memory_mb=0", "sim.memory_mb must be positive"),
+    ("sim.grid_size=4", "sim.grid_size must be at least 8, not 4"),
+    ("sim.substeps=0", "sim.substeps must be at least 1, not 0"),
+    ("sim.horizon=0", "sim.horizon must be at least 1, not 0"),
+    ("sim.particles_scale=0", "sim.particles_scale must be positive"),
+    ("sim.dt=-1", "sim.dt must be positive"),
+]
+
+
+@pytest.mark.parametrize(("override", "message"), REFUSED, ids=[override for override, _ in REFUSED])
+def test_refused(override, message):
+    with pytest.raises(ConfigError) as info:
+        load_config([override])
+    assert message in str(info.value)
+    assert "\n" not in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sim.dt=1e-3", "dt 0.001 is above the stability limit 0.00021"),
+        ("task.poisson_ratio=0.5", "poisson_ratio 0.5 is outside [0, 0.5)"),
+        ("task.bodies.rope.shape=cone", "shape 'cone' is not one of sphere, box"),
+        ("task.bodies.rope.size=[0.6]", "a box needs 3 size(s), not 1"),
+        ("task.bodies.rope.center=[0.5,0.5,0.99]", "outside the domain"),
+        ("task.manipulators.left.shape=Ball", "shape 'Ball' is not one of Sphere, Capsule"),
+        ("task.manipulators.left.rotation=[1,1,0,0]", "give a unit quaternion"),
+        ("task.manipulators.left.friction=-1", "friction -1 must not be negative"),
+    ],
+)
+def test_scenes_that_cannot_be_simulated(override, message):
+    with pytest.raises(SceneError) as info:
+        build_scene(load_config([override]))
+    assert message in str(info.value)
