@@ -33,8 +33,8 @@ COARSE = (
     f"method.iterations={ITERATIONS}",
     "progress=false",
 )
-"""300 particles, 15 substeps. The left sphere, of almost a cell's radius, sits on a node in the rope: the nodes around
-it are within reach of the soft contact model, but not of the hard one."""
+"""300 particles, 15 substeps. The left sphere, of almost a cell's radius, sits on a node in the rope: the
+nodes around it are within reach of the soft contact model, but not of the hard one."""
 
 TIMES = ["seconds"]
 """Columns that differ from run to run."""
@@ -234,6 +234,7 @@ def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, 
     assert_same_numbers(run(cfg), finished)
 
 
+@pytest.mark.slow
 def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
     cfg = make_config(tmp_path)
     partial = result_path(cfg).with_suffix(".partial.h5")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from plab.sim import DeviceError, SimulationError, Simulator
 from plab.targets import build_target
 
 if TYPE_CHECKING:
-    from plab.config import Config, TrajectoryConfig
+    from plab.config import Config, SimConfig, TrajectoryConfig
+    from plab.scene import Scene
 
 __all__ = ["OPTIMIZERS", "ActionSequence", "Problem", "run_trajectory"]
 
@@ -80,13 +82,7 @@ class Problem:
         self.horizon, self.action_dim = scene.horizon, scene.action_dim
         self._weights = cfg.method.loss_weights
         self.target_mass = build_target(scene, variant_task(cfg).target)
-        sim = cfg.sim
-        try:
-            self._simulator = Simulator(
-                [scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
-            )
-        except DeviceError as error:
-            raise RunError(str(error)) from error
+        self._simulator = _simulator(scene, cfg.sim)
         self._simulator.set_target(self.target_mass[None], target_sdf(self.target_mass)[None])
         self._simulator.set_loss_weights(self._weights.density, self._weights.sdf, self._weights.contact)
         self._simulator.reset()
@@ -136,6 +132,27 @@ class Problem:
             "iou_initial": judged.iou_initial,
             "iou_target_self": judged.iou_target_self,
         }
+
+
+def _simulator(scene: Scene, sim: SimConfig) -> Simulator:
+    """Return this process's simulator of a scene; a sweep over seeds or methods compiles it once."""
+    wanted = scene, sim.precision, sim.device, sim.memory_mb
+    try:
+        simulator = _build_simulator(*wanted)
+        try:
+            simulator.reset()
+        except RuntimeError:
+            # Somebody else restarted Taichi with another precision or device, and the memory is gone.
+            _build_simulator.cache_clear()
+            simulator = _build_simulator(*wanted)
+    except DeviceError as error:
+        raise RunError(str(error)) from error
+    return simulator
+
+
+@lru_cache(maxsize=1)
+def _build_simulator(scene: Scene, precision: str, device: str, memory_mb: float) -> Simulator:
+    return Simulator([scene], precision=precision, device=device, memory_mb=memory_mb)
 
 
 def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:

@@ -5,13 +5,18 @@ between phases (a launch costs a hundred microseconds of waking threads, a barri
 than threads every thread has environments of its own. On CUDA each phase of a substep is one launch over all environments.
 """
 
+import time
+from collections.abc import Callable, Sequence
+
 import taichi as ti
 
+from plab.scene import Scene
 from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.pose_phases import PosePhases
-from plab.sim.storage import BLOCK, STATE
+from plab.sim.runtime import Runtime
+from plab.sim.storage import BLOCK, STAGE, STATE, WORK
 from plab.sim.transfer import spline
 
 __all__ = ["CpuEngine"]
@@ -24,6 +29,48 @@ SPLIT = 512
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
 
+PROBE = 50
+"""Every so many launches the team that is not the best so far is tried again."""
+
+
+class TeamChoice:
+    """Chooses between the largest team of threads and none for a kernel's launches, by what they take.
+
+    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins. Results do
+    not depend on the choice.
+    """
+
+    def __init__(self, largest: int) -> None:
+        """Start with the largest team.
+
+        Args:
+            largest: Threads that can work on one environment.
+        """
+        self._sizes = (largest, 1) if largest > 1 else (1,)
+        self._seconds: dict[int, float] = {}
+        self._launches = 0
+
+    def run(self, kernel: Callable, args: tuple) -> None:
+        """Launch a kernel with a team's size before its other arguments."""
+        self._launches += 1
+        size = self._next()
+        start = time.perf_counter()
+        kernel(size, *args)
+        seconds = time.perf_counter() - start
+        # The first launch compiles.
+        if self._launches > 1:
+            old = self._seconds.get(size, seconds)
+            self._seconds[size] = 0.7 * old + 0.3 * seconds
+
+    def _next(self) -> int:
+        untried = [size for size in self._sizes if size not in self._seconds]
+        if untried:
+            return untried[0]
+        best = min(self._sizes, key=self._seconds.__getitem__)
+        if self._launches % PROBE == 0:
+            return next((size for size in self._sizes if size != best), best)
+        return best
+
 
 class Phases(ParticlePhases, GridPhases, PosePhases, LossPhases):
     """All phases."""
@@ -31,16 +78,37 @@ class Phases(ParticlePhases, GridPhases, PosePhases, LossPhases):
 
 @ti.data_oriented
 class CpuEngine(Phases):
-    """Kernels for the CPU."""
+    """Kernels for the CPU.
+
+    The public methods are :meth:`step`, :meth:`losses`, :meth:`step_adjoint`, :meth:`place`, :meth:`export_mass` and
+    :meth:`copy_slot`; :class:`plab.sim.cuda_engine.CudaEngine` has the same.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
+        """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
+        super().__init__(scenes, runtime)
+        self._teams = {name: TeamChoice(self.team_size) for name in ("step", "losses", "step_adjoint")}
+
+    def step(self, *args: object) -> None:
+        """One environment step; arguments as for :meth:`step_kernel` after the team's size."""
+        self._teams["step"].run(self.step_kernel, args)
+
+    def losses(self, *args: object) -> None:
+        """Loss terms; arguments as for :meth:`losses_kernel` after the team's size."""
+        self._teams["losses"].run(self.losses_kernel, args)
+
+    def step_adjoint(self, *args: object) -> None:
+        """Adjoint of one environment step; arguments as for :meth:`step_adjoint_kernel` after the team's size."""
+        self._teams["step_adjoint"].run(self.step_adjoint_kernel, args)
 
     # -- threads ---------------------------------------------------------------------------------------------------
 
     @ti.func
-    def barrier(self, team):
+    def barrier(self, team, size):
         """Wait until every thread of the team is here."""
-        if ti.static(self.team_size > 1):
+        if size > 1:
             ticket = ti.atomic_add(self.arrivals[team * PADDING], 1)
-            goal = (ticket // self.team_size + 1) * self.team_size
+            goal = (ticket // size + 1) * size
             # An atomic that changes nothing: a plain load could be hoisted out of the loop.
             while ti.atomic_or(self.arrivals[team * PADDING], 0) < goal:
                 pass
@@ -69,7 +137,7 @@ class CpuEngine(Phases):
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             entry9 = (e * self.tiles + tile) * 9
-            self.material_tile(state, source, self.tile_entry(after, e, tile), entry9, e, True)
+            self.material_tile(state, source, self.tile_entry(after, e, tile), entry9, e, grid_index * STAGE, True)
             for lane in range(self.lanes_of(tile)):
                 base, fx = self.stencil(self.vector(state, source, lane))
                 self.mark(grid_index, base, stamp)
@@ -107,7 +175,7 @@ class CpuEngine(Phases):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             for lane in range(self.lanes_of(tile)):
-                self.gather_particle(state, source, target, lane, e, time)
+                self.gather_particle(state, source, target, lane, e, time, (e * self.chunks + c) * WORK)
 
     @ti.func
     def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
@@ -118,7 +186,7 @@ class CpuEngine(Phases):
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
             entry9 = (e * self.tiles + tile) * 9
-            self.material_tile(state, source, target, entry9, e, False)
+            self.material_tile(state, source, target, entry9, e, grid_index * STAGE, False)
             for lane in range(self.lanes_of(tile)):
                 x = self.vector(state, source, lane)
                 base, fx = self.stencil(x)
@@ -154,8 +222,10 @@ class CpuEngine(Phases):
             entry = self.tile_entry(0, e, tile)
             entry9 = (e * self.tiles + tile) * 9
             for lane in range(self.lanes_of(tile)):
-                self.gather_particle_adjoint(state, source, target, bar, entry, entry9, lane, e)
-            self.material_tile_adjoint(state, source, bar, entry, entry9, e)
+                self.gather_particle_adjoint(
+                    state, source, target, bar, entry, entry9, lane, e, (e * self.chunks + c) * WORK
+                )
+            self.material_tile_adjoint(state, source, bar, entry, entry9, e, (e * self.chunks + c) * STAGE)
 
     # -- losses of one chunk ---------------------------------------------------------------------------------------
 
@@ -216,25 +286,25 @@ class CpuEngine(Phases):
         terms[at + 2] = self.contact_term(e)
 
     @ti.func
-    def losses_of_team(self, state: ti.template(), slot, e, team, rank, stamp, terms: ti.template(), at):
+    def losses_of_team(self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at):
         """Loss terms of one environment."""
-        for r in range(self.rounds(rank)):
-            self.scatter_mass_chunk(state, slot, e, rank + r * self.team_size, stamp)
-        self.barrier(team)
+        for r in range(self.rounds(rank, size)):
+            self.scatter_mass_chunk(state, slot, e, rank + r * size, stamp)
+        self.barrier(team, size)
         if rank == 0:
             self.collect_blocks(e, stamp)
-        self.barrier(team)
-        for r in range(self.rounds(rank)):
-            self.grid_loss_chunk(e, rank + r * self.team_size)
-        self.barrier(team)
+        self.barrier(team, size)
+        for r in range(self.rounds(rank, size)):
+            self.grid_loss_chunk(e, rank + r * size)
+        self.barrier(team, size)
         if rank == 0:
             self.join_losses(e, terms, at)
-        self.barrier(team)
+        self.barrier(team, size)
 
     @ti.func
-    def rounds(self, rank):
+    def rounds(self, rank, size):
         """Chunks that a thread of a team works on."""
-        return (self.chunks - rank + self.team_size - 1) // self.team_size
+        return (self.chunks - rank + size - 1) // size
 
     @ti.func
     def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
@@ -267,8 +337,9 @@ class CpuEngine(Phases):
     # -- kernels ---------------------------------------------------------------------------------------------------
 
     @ti.kernel
-    def step(
+    def step_kernel(
         self,
+        size: ti.i32,
         state: ti.types.ndarray(ndim=1),
         poses: ti.types.ndarray(ndim=1),
         actions: ti.types.ndarray(ndim=1),
@@ -280,50 +351,61 @@ class CpuEngine(Phases):
         stamp: ti.i32,
     ):
         """One environment step from time slot ``slot``; each substep moves on by ``stride`` slots (0: in place)."""
-        for team in range(self.teams):
+        teams = ti.min(self.batch, self.threads // size)
+        for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
         for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
-                team = q // SPLIT // self.team_size
-                rank = q // SPLIT % self.team_size
-                for turn in range((self.batch - team + self.teams - 1) // self.teams):
-                    e = team + turn * self.teams
+            if q % SPLIT == 0 and q // SPLIT < teams * size:
+                team = q // SPLIT // size
+                rank = q // SPLIT % size
+                for turn in range((self.batch - team + teams - 1) // teams):
+                    e = team + turn * teams
                     if rank == 0:
                         self.advance_manipulators(e, actions, poses, t, pose_before, pose_after)
                     for s in range(self.substeps):
                         before = slot + s * stride
-                        for r in range(self.rounds(rank)):
+                        for r in range(self.rounds(rank, size)):
                             self.scatter_chunk(
-                                state, before, before + stride, e, rank + r * self.team_size, stamp + s
+                                state, before, before + stride, e, rank + r * size, stamp + s
                             )
-                        self.barrier(team)
+                        self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, stamp + s)
-                        self.barrier(team)
-                        for r in range(self.rounds(rank)):
-                            self.grid_chunk(e, rank + r * self.team_size, s)
-                        self.barrier(team)
-                        for r in range(self.rounds(rank)):
+                        self.barrier(team, size)
+                        for r in range(self.rounds(rank, size)):
+                            self.grid_chunk(e, rank + r * size, s)
+                        self.barrier(team, size)
+                        for r in range(self.rounds(rank, size)):
                             self.gather_chunk(
-                                state, before, before + stride, e, rank + r * self.team_size, t * self.substeps + s
+                                state, before, before + stride, e, rank + r * size, t * self.substeps + s
                             )
 
     @ti.kernel
-    def losses(self, state: ti.types.ndarray(ndim=1), slot: ti.i32, terms: ti.types.ndarray(ndim=1), at: ti.i32, stamp: ti.i32):
+    def losses_kernel(
+        self,
+        size: ti.i32,
+        state: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        terms: ti.types.ndarray(ndim=1),
+        at: ti.i32,
+        stamp: ti.i32,
+    ):
         """Unweighted loss terms of all environments, written to ``terms`` from entry ``at``."""
-        for team in range(self.teams):
+        teams = ti.min(self.batch, self.threads // size)
+        for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
         for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
-                team = q // SPLIT // self.team_size
-                rank = q // SPLIT % self.team_size
-                for turn in range((self.batch - team + self.teams - 1) // self.teams):
-                    e = team + turn * self.teams
-                    self.losses_of_team(state, slot, e, team, rank, stamp, terms, at + 3 * e)
+            if q % SPLIT == 0 and q // SPLIT < teams * size:
+                team = q // SPLIT // size
+                rank = q // SPLIT % size
+                for turn in range((self.batch - team + teams - 1) // teams):
+                    e = team + turn * teams
+                    self.losses_of_team(state, slot, e, team, rank, size, stamp, terms, at + 3 * e)
 
     @ti.kernel
-    def step_adjoint(
+    def step_adjoint_kernel(
         self,
+        size: ti.i32,
         state: ti.types.ndarray(ndim=1),
         bar: ti.types.ndarray(ndim=1),
         poses: ti.types.ndarray(ndim=1),
@@ -338,46 +420,47 @@ class CpuEngine(Phases):
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar`` likewise.
         """
-        for team in range(self.teams):
+        teams = ti.min(self.batch, self.threads // size)
+        for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
         for q in range(self.threads * SPLIT):
-            if q % SPLIT == 0 and q // SPLIT < self.teams * self.team_size:
-                team = q // SPLIT // self.team_size
-                rank = q // SPLIT % self.team_size
-                for turn in range((self.batch - team + self.teams - 1) // self.teams):
-                    e = team + turn * self.teams
+            if q % SPLIT == 0 and q // SPLIT < teams * size:
+                team = q // SPLIT // size
+                rank = q // SPLIT % size
+                for turn in range((self.batch - team + teams - 1) // teams):
+                    e = team + turn * teams
                     end = slot + self.substeps
                     if rank == 0:
                         self.advance_manipulators(e, actions, poses, t, t, t + 1)
-                    self.barrier(team)
-                    self.losses_of_team(state, end, e, team, rank, stamp, terms, 3 * e)
-                    for r in range(self.rounds(rank)):
-                        self.loss_gradient_chunk(state, end, bar, e, rank + r * self.team_size)
-                    self.barrier(team)
+                    self.barrier(team, size)
+                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, 3 * e)
+                    for r in range(self.rounds(rank, size)):
+                        self.loss_gradient_chunk(state, end, bar, e, rank + r * size)
+                    self.barrier(team, size)
                     if rank == 0:
                         self.contact_gradient(state, end, bar, e)
-                    self.barrier(team)
+                    self.barrier(team, size)
                     for back in range(self.substeps):
                         s = self.substeps - 1 - back
                         now = stamp + 1 + back
-                        for r in range(self.rounds(rank)):
+                        for r in range(self.rounds(rank, size)):
                             self.scatter_chunk_adjoint(
-                                state, slot + s, slot + s + 1, bar, e, rank + r * self.team_size, now
+                                state, slot + s, slot + s + 1, bar, e, rank + r * size, now
                             )
-                        self.barrier(team)
+                        self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, now)
-                        self.barrier(team)
-                        for r in range(self.rounds(rank)):
-                            self.grid_chunk_adjoint(e, rank + r * self.team_size, s)
-                        self.barrier(team)
+                        self.barrier(team, size)
+                        for r in range(self.rounds(rank, size)):
+                            self.grid_chunk_adjoint(e, rank + r * size, s)
+                        self.barrier(team, size)
                         if rank == 0:
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
-                        for r in range(self.rounds(rank)):
+                        for r in range(self.rounds(rank, size)):
                             self.gather_chunk_adjoint(
-                                state, slot + s, slot + s + 1, bar, e, rank + r * self.team_size
+                                state, slot + s, slot + s + 1, bar, e, rank + r * size
                             )
-                        self.barrier(team)
+                        self.barrier(team, size)
 
     @ti.kernel
     def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):

@@ -13,7 +13,10 @@ by Cayley-Hamilton as polynomials of degree two in the matrix with scalar recurr
 * ``exp``: d is traceless, so ``d^3 = q d + D I`` with ``q = tr(d^2) / 2`` and ``D = det d``.
 
 Their adjoints are those of the scalar recurrences. Where ``|Z|`` or J leave the range in which the series are exact to
-rounding, :mod:`plab.sim.spectral` takes over with an SVD. Components are scalars or lanes, see :mod:`plab.sim.linalg`.
+rounding, :mod:`plab.sim.spectral` takes over with an SVD.
+
+The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed, and so that each
+part is small enough for LLVM to vectorise. Components are scalars or lanes, see :mod:`plab.sim.linalg`.
 """
 
 import math
@@ -39,7 +42,19 @@ from plab.sim.linalg import (
     sym_product_twice,
 )
 
-__all__ = ["NORM_SHIFT", "Series", "return_map", "return_map_adjoint"]
+__all__ = [
+    "NORM_SHIFT",
+    "Series",
+    "flow",
+    "flow_adjoint",
+    "hencky_strain",
+    "log_adjoint",
+    "strain_adjoint",
+    "stress",
+    "stress_adjoint",
+    "trial_gradient",
+    "yield_factor",
+]
 
 NORM_SHIFT = 1e-8
 """Added to |d|^2 under the square root, as in the PlasticineLab release."""
@@ -207,10 +222,15 @@ def trial_gradient(c: ti.template(), f: ti.template(), dt):
 
 @ti.func
 def hencky_strain(g: ti.template(), j, series: ti.template()):
-    """Deviatoric Hencky strain and what led to it.
+    """Deviatoric Hencky strain of G, and what its adjoint needs.
+
+    Args:
+        g: Trial deformation gradient G, 9 components.
+        j: det G.
+        series: :class:`Series`.
 
     Returns:
-        c2 = J^(-2/3); B = G G^T; W = (b + I)^-1; Z; Z^2; the invariants i1, i2, i3 of Z; a1, a2; d.
+        c2 = J^(-2/3), W = (b + I)^-1 (6), Z (6), |Z|^2, the coefficients a1, a2 of Z and Z^2 in d, and d (6).
     """
     c = inverse_cbrt(j, series.cbrt_steps)
     c2 = c * c
@@ -222,9 +242,7 @@ def hencky_strain(g: ti.template(), j, series: ti.template()):
     y = square_sym(z)
     i1 = z[0] + z[1] + z[2]
     tr_y = y[0] + y[1] + y[2]
-    i2 = 0.5 * (i1 * i1 - tr_y)
-    i3 = det_sym(z)
-    a1, a2 = log_coefficients(i1, i2, i3, series.log_terms)
+    a1, a2 = log_coefficients(i1, 0.5 * (i1 * i1 - tr_y), det_sym(z), series.log_terms)
     mean = (a1 * i1 + a2 * tr_y) * (1.0 / 3.0)
     d = (
         a1 * z[0] + a2 * y[0] - mean,
@@ -234,7 +252,7 @@ def hencky_strain(g: ti.template(), j, series: ti.template()):
         a1 * z[4] + a2 * y[4],
         a1 * z[5] + a2 * y[5],
     )
-    return c2, b, w, z, y, i1, i2, i3, a1, a2, d
+    return c2, w, z, tr_y, a1, a2, d
 
 
 @ti.func
@@ -251,38 +269,9 @@ def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
 
 
 @ti.func
-def in_series_range(z_squared, j, series: ti.template()):
-    """Whether the series serve all lanes; False for NaN as well."""
-    ok = z_squared <= series.z_squared_max and j >= series.j_min and j <= series.j_max
-    return ok
-
-
-@ti.func
-def return_map(c: ti.template(), f: ti.template(), dt, mu, lam, yield_strain, series: ti.template()):
-    """Trial step, return mapping and stress by series.
-
-    Args:
-        c: APIC matrix C [1/s], 9 components.
-        f: Deformation gradient F, 9 components.
-        dt: Time step [s].
-        mu: Shear modulus.
-        lam: Lame's lambda.
-        yield_strain: Yield stress / (2 mu).
-        series: :class:`Series`.
-
-    Returns:
-        New F (9 components), Kirchhoff stress tau (6), |Z|^2 and J, by which the caller sees whether the series served.
-    """
-    g = trial_gradient(c, f, dt)
-    j = det(g)
-    c2, _b, _w, _z, y, _i1, _i2, _i3, _a1, _a2, d = hencky_strain(g, j, series)
-    d2 = square_sym(d)
-    q = 0.5 * (d2[0] + d2[1] + d2[2])
-    det_d = det_sym(d)
-    k = ti.min(yield_strain / ti.sqrt(2.0 * q + NORM_SHIFT), 1.0)
-    s = k - 1.0
-    m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
-    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, d2)
+def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()):
+    """Kirchhoff stress (6 components) after return mapping; arguments as for :func:`stress_adjoint`."""
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     qk = k * k * q
     dk = k * k * k * det_d
     e0, e1, e2 = exp_coefficients(qk, dk, series.exp_terms)
@@ -292,165 +281,166 @@ def return_map(c: ti.template(), f: ti.template(), dt, mu, lam, yield_strain, se
     t0 = v2 * (e0 * e0 + 2.0 * e1 * e2 * dk) - v1 * e0 + lam * j * (j - 1.0)
     t1 = v2 * (2.0 * e0 * e1 + 2.0 * e1 * e2 * qk + e2 * e2 * dk) - v1 * e1
     t2 = v2 * (e1 * e1 + 2.0 * e0 * e2 + e2 * e2 * qk) - v1 * e2
-    tau = polynomial_sym(t0, t1 * k, t2 * k * k, d, d2)
-    return mul_sym_mat(m, g), tau, y[0] + y[1] + y[2], j
+    return polynomial_sym(t0, t1 * k, t2 * k * k, d, square_sym(d))
 
 
 @ti.func
-def return_map_adjoint(
-    c: ti.template(),
-    f: ti.template(),
-    f_new_bar: ti.template(),
-    tau_bar: ti.template(),
-    dt,
-    mu,
-    lam,
-    yield_strain,
-    series: ti.template(),
-):
-    """Adjoint of :func:`return_map`.
+def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()):
+    """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    s = k - 1.0
+    m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
+    return mul_sym_mat(polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d)), g)
+
+
+@ti.func
+def yield_factor(d: ti.template(), yield_strain):
+    """q = tr(d^2) / 2, det d, the regularised norm of d and the factor k of return mapping."""
+    q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
+    norm = ti.sqrt(2.0 * q + NORM_SHIFT)
+    return q, det_sym(d), norm, ti.min(yield_strain / norm, 1.0)
+
+
+@ti.func
+def scaled_sum(a, x: ti.template(), b, y: ti.template()):
+    """a X + b Y of symmetric matrices."""
+    return (
+        a * x[0] + b * y[0],
+        a * x[1] + b * y[1],
+        a * x[2] + b * y[2],
+        a * x[3] + b * y[3],
+        a * x[4] + b * y[4],
+        a * x[5] + b * y[5],
+    )
+
+
+@ti.func
+def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_bar):
+    """Adjoint of d from a polynomial's coefficients p1, p2 of d, d^2, the polynomial's adjoint, and those of q and det d."""
+    quad = sym_product_twice(bar, d)
+    cof = cofactor_sym(d)
+    first = scaled_sum(p1, bar, p2, quad)
+    second = scaled_sum(q_bar, d, det_bar, cof)
+    return scaled_sum(1.0, first, 1.0, second)
+
+
+@ti.func
+def stress_adjoint(d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yield_strain, series: ti.template()):
+    """Adjoint of the stress: the first part of the adjoint of return mapping.
 
     Args:
-        c: APIC matrix C, 9 components.
-        f: Deformation gradient F, 9 components.
-        f_new_bar: Adjoint of the new F, 9 components.
+        d: Deviatoric Hencky strain, 6 components.
+        j: J.
+        c2: J^(-2/3).
         tau_bar: Symmetric part of the adjoint of tau, 6 components.
-        dt: Time step [s].
         mu: Shear modulus.
         lam: Lame's lambda.
         yield_strain: Yield stress / (2 mu).
         series: :class:`Series`.
 
     Returns:
-        Adjoints of C and F (9 components each), |Z|^2 and J.
+        Adjoints of d (6) at fixed k, of k, of c2 and of J.
     """
-    g = trial_gradient(c, f, dt)
-    j = det(g)
-    c2, b, w, z, y, i1, i2, i3, a1, a2, d = hencky_strain(g, j, series)
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     d2 = square_sym(d)
-    q = 0.5 * (d2[0] + d2[1] + d2[2])
-    det_d = det_sym(d)
-    norm = ti.sqrt(2.0 * q + NORM_SHIFT)
-    k = ti.min(yield_strain / norm, 1.0)
-    s = k - 1.0
-    m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
-    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, d2)
     qk = k * k * q
     dk = k * k * k * det_d
     e0, e1, e2 = exp_coefficients(qk, dk, series.exp_terms)
     j3 = j * c2
-    w2 = e0 * e0 + 2.0 * e1 * e2 * dk, 2.0 * (e0 * e1 + e1 * e2 * qk) + e2 * e2 * dk, e1 * e1 + 2.0 * e0 * e2 + e2 * e2 * qk
     v2 = 2.0 * mu * j3 * j3
     v1 = 2.0 * mu * j3
-    t1 = v2 * w2[1] - v1 * e1
-    t2 = v2 * w2[2] - v1 * e2
-
-    # F' = M G with M = m0 I + m1 s d + m2 s^2 d^2.
-    m_bar = sym_of_product(f_new_bar, g)
-    mm0_bar = m_bar[0] + m_bar[1] + m_bar[2]
-    mm1_bar = dot_sym(m_bar, d)
-    mm2_bar = dot_sym(m_bar, d2)
+    w0 = e0 * e0 + 2.0 * e1 * e2 * dk
+    w1 = 2.0 * (e0 * e1 + e1 * e2 * qk) + e2 * e2 * dk
+    w2 = e1 * e1 + 2.0 * e0 * e2 + e2 * e2 * qk
+    t1 = v2 * w1 - v1 * e1
+    t2 = v2 * w2 - v1 * e2
     # tau = t0 I + t1 k d + t2 k^2 d^2.
     t0_bar = tau_bar[0] + tau_bar[1] + tau_bar[2]
     tau_d = dot_sym(tau_bar, d)
     tau_d2 = dot_sym(tau_bar, d2)
     t1_bar = k * tau_d
     t2_bar = k * k * tau_d2
-    k_bar = t1 * tau_d + 2.0 * k * t2 * tau_d2
-    s_bar = m1 * mm1_bar + 2.0 * s * m2 * mm2_bar
-    # d enters both polynomials: linearly with p1, quadratically with p2.
-    p1 = (
-        t1 * k * tau_bar[0] + m1 * s * m_bar[0],
-        t1 * k * tau_bar[1] + m1 * s * m_bar[1],
-        t1 * k * tau_bar[2] + m1 * s * m_bar[2],
-        t1 * k * tau_bar[3] + m1 * s * m_bar[3],
-        t1 * k * tau_bar[4] + m1 * s * m_bar[4],
-        t1 * k * tau_bar[5] + m1 * s * m_bar[5],
-    )
-    p2 = (
-        t2 * k * k * tau_bar[0] + m2 * s * s * m_bar[0],
-        t2 * k * k * tau_bar[1] + m2 * s * s * m_bar[1],
-        t2 * k * k * tau_bar[2] + m2 * s * s * m_bar[2],
-        t2 * k * k * tau_bar[3] + m2 * s * s * m_bar[3],
-        t2 * k * k * tau_bar[4] + m2 * s * s * m_bar[4],
-        t2 * k * k * tau_bar[5] + m2 * s * s * m_bar[5],
-    )
-    # Stress coefficients back to J, e0..e2, qk and dk.
-    v2_bar = t0_bar * w2[0] + t1_bar * w2[1] + t2_bar * w2[2]
+    v2_bar = t0_bar * w0 + t1_bar * w1 + t2_bar * w2
     v1_bar = -(t0_bar * e0 + t1_bar * e1 + t2_bar * e2)
     j3_bar = 2.0 * mu * (2.0 * j3 * v2_bar + v1_bar)
     e0_bar = 2.0 * v2 * (t0_bar * e0 + t1_bar * e1 + t2_bar * e2) - v1 * t0_bar
     e1_bar = 2.0 * v2 * (t0_bar * e2 * dk + t1_bar * (e0 + e2 * qk) + t2_bar * e1) - v1 * t1_bar
     e2_bar = 2.0 * v2 * (t0_bar * e1 * dk + t1_bar * (e1 * qk + e2 * dk) + t2_bar * (e0 + e2 * qk)) - v1 * t2_bar
-    qk_direct, dk_direct = exp_coefficients_adjoint(qk, dk, e0_bar, e1_bar, e2_bar, series.exp_terms)
-    qk_bar = qk_direct + v2 * (2.0 * t1_bar * e1 * e2 + t2_bar * e2 * e2)
-    dk_bar = dk_direct + v2 * (2.0 * t0_bar * e1 * e2 + t1_bar * e2 * e2)
-    qs_bar, ds_bar = exp_coefficients_adjoint(
-        s * s * q, s * s * s * det_d, mm0_bar, s * mm1_bar, s * s * mm2_bar, series.exp_terms
-    )
-    q_bar = k * k * qk_bar + s * s * qs_bar
-    det_bar = k * k * k * dk_bar + s * s * s * ds_bar
-    k_bar += 2.0 * k * q * qk_bar + 3.0 * k * k * det_d * dk_bar
-    k_bar += s_bar + 2.0 * s * q * qs_bar + 3.0 * s * s * det_d * ds_bar
-    # k = yield_strain / norm where it yields, else constant.
-    q_bar -= ti.select(s < 0.0, k * k_bar / (norm * norm), 0.0 * k)
-    d_quad = sym_product_twice(p2, d)
-    cof_d = cofactor_sym(d)
-    d_bar = (
-        p1[0] + d_quad[0] + q_bar * d[0] + det_bar * cof_d[0],
-        p1[1] + d_quad[1] + q_bar * d[1] + det_bar * cof_d[1],
-        p1[2] + d_quad[2] + q_bar * d[2] + det_bar * cof_d[2],
-        p1[3] + d_quad[3] + q_bar * d[3] + det_bar * cof_d[3],
-        p1[4] + d_quad[4] + q_bar * d[4] + det_bar * cof_d[4],
-        p1[5] + d_quad[5] + q_bar * d[5] + det_bar * cof_d[5],
-    )
-    b_bar, c2_bar = hencky_strain_adjoint(d_bar, c2, b, w, z, y, i1, i2, i3, a1, a2, series)
-    j_bar = lam * t0_bar * (2.0 * j - 1.0) + c2 * j3_bar
-    c2_bar += j * j3_bar
-    j_bar -= (2.0 / 3.0) * c2 / j * c2_bar
-    g_b = mul_sym_mat(b_bar, g)
-    g_m = mul_sym_mat(m, f_new_bar)
-    cof = cofactor(g)
-    g_bar = (
-        2.0 * g_b[0] + g_m[0] + j_bar * cof[0],
-        2.0 * g_b[1] + g_m[1] + j_bar * cof[1],
-        2.0 * g_b[2] + g_m[2] + j_bar * cof[2],
-        2.0 * g_b[3] + g_m[3] + j_bar * cof[3],
-        2.0 * g_b[4] + g_m[4] + j_bar * cof[4],
-        2.0 * g_b[5] + g_m[5] + j_bar * cof[5],
-        2.0 * g_b[6] + g_m[6] + j_bar * cof[6],
-        2.0 * g_b[7] + g_m[7] + j_bar * cof[7],
-        2.0 * g_b[8] + g_m[8] + j_bar * cof[8],
-    )
-    c_bar, f_bar = trial_gradient_adjoint(c, f, g_bar, dt)
-    return c_bar, f_bar, y[0] + y[1] + y[2], j
+    qk_bar, dk_bar = exp_coefficients_adjoint(qk, dk, e0_bar, e1_bar, e2_bar, series.exp_terms)
+    qk_bar += v2 * (2.0 * t1_bar * e1 * e2 + t2_bar * e2 * e2)
+    dk_bar += v2 * (2.0 * t0_bar * e1 * e2 + t1_bar * e2 * e2)
+    k_bar = t1 * tau_d + 2.0 * k * (t2 * tau_d2 + q * qk_bar) + 3.0 * k * k * det_d * dk_bar
+    d_bar = polynomial_adjoint(d, tau_bar, t1 * k, t2 * k * k, k * k * qk_bar, k * k * k * dk_bar)
+    return d_bar, k_bar, j * j3_bar, lam * t0_bar * (2.0 * j - 1.0) + c2 * j3_bar
 
 
 @ti.func
-def hencky_strain_adjoint(
-    d_bar: ti.template(),
-    c2,
-    b: ti.template(),
-    w: ti.template(),
-    z: ti.template(),
-    y: ti.template(),
-    i1,
-    i2,
-    i3,
-    a1,
-    a2,
-    series: ti.template(),
-):
-    """Adjoints of B = G G^T and of c2 = J^(-2/3) under :func:`hencky_strain`."""
-    mean = (d_bar[0] + d_bar[1] + d_bar[2]) * (1.0 / 3.0)
-    dev = (d_bar[0] - mean, d_bar[1] - mean, d_bar[2] - mean, d_bar[3], d_bar[4], d_bar[5])
+def flow_adjoint(d: ti.template(), g: ti.template(), f_new_bar: ti.template(), yield_strain, series: ti.template()):
+    """Adjoint of plastic flow F' = exp((k - 1) d) G: the second part of the adjoint of return mapping.
+
+    Where nothing yields, the flow is the identity and this part is not needed.
+
+    Args:
+        d: Deviatoric Hencky strain, 6 components.
+        g: Trial deformation gradient G, 9 components.
+        f_new_bar: Adjoint of the new F, 9 components.
+        yield_strain: Yield stress / (2 mu).
+        series: :class:`Series`.
+
+    Returns:
+        Adjoints of d (6) at fixed k, of k, and of G (9) at fixed d.
+    """
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    s = k - 1.0
+    qs = s * s * q
+    ds = s * s * s * det_d
+    m0, m1, m2 = exp_coefficients(qs, ds, series.exp_terms)
+    d2 = square_sym(d)
+    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, d2)
+    m_bar = sym_of_product(f_new_bar, g)
+    m1_bar = dot_sym(m_bar, d)
+    m2_bar = dot_sym(m_bar, d2)
+    qs_bar, ds_bar = exp_coefficients_adjoint(
+        qs, ds, m_bar[0] + m_bar[1] + m_bar[2], s * m1_bar, s * s * m2_bar, series.exp_terms
+    )
+    k_bar = m1 * m1_bar + 2.0 * s * (m2 * m2_bar + q * qs_bar) + 3.0 * s * s * det_d * ds_bar
+    d_bar = polynomial_adjoint(d, m_bar, m1 * s, m2 * s * s, s * s * qs_bar, s * s * s * ds_bar)
+    return d_bar, k_bar, mul_sym_mat(m, f_new_bar)
+
+
+@ti.func
+def log_adjoint(z: ti.template(), a1, a2, d: ti.template(), d_bar: ti.template(), k_bar, yield_strain, series: ti.template()):
+    """Adjoint of Z under d = log(b) / 2: the third part of the adjoint of return mapping.
+
+    Args:
+        z: Z, 6 components.
+        a1: Coefficient of Z in d.
+        a2: Coefficient of Z^2 in d.
+        d: Deviatoric Hencky strain, 6 components.
+        d_bar: Adjoint of d at fixed k.
+        k_bar: Adjoint of k.
+        yield_strain: Yield stress / (2 mu).
+        series: :class:`Series`.
+
+    Returns:
+        Adjoint of Z, 6 components.
+    """
+    _q, _det, norm, k = yield_factor(d, yield_strain)
+    # k = yield_strain / norm where it yields, else constant.
+    q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
+    full = scaled_sum(1.0, d_bar, -q_bar, d)
+    mean = (full[0] + full[1] + full[2]) * (1.0 / 3.0)
+    dev = (full[0] - mean, full[1] - mean, full[2] - mean, full[3], full[4], full[5])
+    y = square_sym(z)
+    i1 = z[0] + z[1] + z[2]
+    i2 = 0.5 * (i1 * i1 - (y[0] + y[1] + y[2]))
     i1_bar, i2_bar, i3_bar = log_coefficients_adjoint(
-        i1, i2, i3, dot_sym(dev, z), dot_sym(dev, y), series.log_terms
+        i1, i2, det_sym(z), dot_sym(dev, z), dot_sym(dev, y), series.log_terms
     )
     quad = sym_product_twice(dev, z)
     cof = cofactor_sym(z)
     diag = i1_bar + i2_bar * i1
-    z_bar = (
+    return (
         a1 * dev[0] + a2 * quad[0] + diag - i2_bar * z[0] + i3_bar * cof[0],
         a1 * dev[1] + a2 * quad[1] + diag - i2_bar * z[1] + i3_bar * cof[1],
         a1 * dev[2] + a2 * quad[2] + diag - i2_bar * z[2] + i3_bar * cof[2],
@@ -458,37 +448,46 @@ def hencky_strain_adjoint(
         a1 * dev[4] + a2 * quad[4] - i2_bar * z[4] + i3_bar * cof[4],
         a1 * dev[5] + a2 * quad[5] - i2_bar * z[5] + i3_bar * cof[5],
     )
-    p = sandwich_sym(w, z_bar)
-    scale = 2.0 * c2
-    b_bar = (scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5])
-    return b_bar, 2.0 * dot_sym(p, b)
 
 
 @ti.func
-def trial_gradient_adjoint(c: ti.template(), f: ti.template(), g_bar: ti.template(), dt):
-    """Adjoints of C and F under :func:`trial_gradient`."""
-    cg = mul_tn(c, g_bar)
-    gf = mul_nt(g_bar, f)
-    f_bar = (
-        g_bar[0] + dt * cg[0],
-        g_bar[1] + dt * cg[1],
-        g_bar[2] + dt * cg[2],
-        g_bar[3] + dt * cg[3],
-        g_bar[4] + dt * cg[4],
-        g_bar[5] + dt * cg[5],
-        g_bar[6] + dt * cg[6],
-        g_bar[7] + dt * cg[7],
-        g_bar[8] + dt * cg[8],
-    )
-    c_bar = (
-        dt * gf[0],
-        dt * gf[1],
-        dt * gf[2],
-        dt * gf[3],
-        dt * gf[4],
-        dt * gf[5],
-        dt * gf[6],
-        dt * gf[7],
-        dt * gf[8],
-    )
-    return c_bar, f_bar
+def strain_adjoint(
+    c: ti.template(),
+    f: ti.template(),
+    g: ti.template(),
+    j,
+    c2,
+    w: ti.template(),
+    z_bar: ti.template(),
+    c2_bar,
+    j_bar,
+    g_bar: ti.template(),
+    dt,
+):
+    """Adjoint of the strain measure Z(G): the last part of the adjoint of return mapping.
+
+    Args:
+        c: APIC matrix C, 9 components.
+        f: Deformation gradient F, 9 components.
+        g: Trial deformation gradient G, 9 components.
+        j: J.
+        c2: J^(-2/3).
+        w: (b + I)^-1, 6 components.
+        z_bar: Adjoint of Z, 6 components.
+        c2_bar: Adjoint of c2 from the stress.
+        j_bar: Adjoint of J from the stress.
+        g_bar: Adjoint of G from the flow, 9 components.
+        dt: Time step [s].
+
+    Returns:
+        Adjoints of C and F, 9 components each.
+    """
+    p = sandwich_sym(w, z_bar)
+    scale = 4.0 * c2
+    g_b = mul_sym_mat((scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5]), g)
+    j_all = j_bar - (2.0 / 3.0) * c2 / j * (c2_bar + 2.0 * dot_sym(p, outer_sym(g)))
+    cof = cofactor(g)
+    total = [g_b[i] + g_bar[i] + j_all * cof[i] for i in range(9)]
+    cg = mul_tn(c, total)
+    gf = mul_nt(total, f)
+    return [dt * gf[i] for i in range(9)], [total[i] + dt * cg[i] for i in range(9)]

@@ -2,12 +2,32 @@
 
 import taichi as ti
 
-from plab.sim.material import return_map, return_map_adjoint
+from plab.sim.linalg import det
+from plab.sim.material import (
+    flow,
+    flow_adjoint,
+    hencky_strain,
+    log_adjoint,
+    strain_adjoint,
+    stress,
+    stress_adjoint,
+    trial_gradient,
+    yield_factor,
+)
 from plab.sim.spectral import spectral_return_map, spectral_return_map_adjoint
-from plab.sim.storage import BLOCK, STATE, Storage
+from plab.sim.storage import BLOCK, BLOCK_BITS, STATE, Storage
 from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
 
 __all__ = ["ParticlePhases"]
+
+# Entries of a tile's intermediate results in ``stage``; G comes first.
+STAGE_D = 9
+STAGE_W = 15
+STAGE_Z = 21
+STAGE_SCALARS = 27
+STAGE_D_BAR = 31
+STAGE_BARS = 37
+STAGE_G_BAR = 40
 
 REACHING = tuple(sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8))
 """For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
@@ -82,7 +102,7 @@ class ParticlePhases(Storage):
         return [self.stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + self.mass * c[i] for i in range(9)]
 
     @ti.func
-    def stress_adjoint(self, a_bar: ti.template()):
+    def stress_symmetric(self, a_bar: ti.template()):
         """Symmetric part of the adjoint of tau (6) from that of A (9)."""
         half = 0.5 * self.stress_scale
         return (
@@ -95,7 +115,7 @@ class ParticlePhases(Storage):
         )
 
     @ti.func
-    def material_tile(self, state: ti.template(), source, target, entry9, e, update: ti.template()):
+    def material_tile(self, state: ti.template(), source, target, entry9, e, at, update: ti.template()):
         """Return mapping and A = stress_scale tau + mass C for a tile on the CPU.
 
         Args:
@@ -104,18 +124,36 @@ class ParticlePhases(Storage):
             target: Entry of the tile after it.
             entry9: Entry of the tile in ``affine``.
             e: Environment.
+            at: First entry of the thread's share of ``stage``.
             update: Whether the new F is stored.
         """
         p = self.material[e]
         c = [state[source + 6 + i] for i in range(9)]
-        f = [state[source + 15 + i] for i in range(9)]
-        f_new, tau, z2, j = return_map(c, f, self.dt, p[0], p[1], p[2], self.series)
+        g = trial_gradient(c, [state[source + 15 + i] for i in range(9)], self.dt)
+        j = det(g)
+        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
+        for i in ti.static(range(9)):
+            self.stage[at + i] = g[i]
+        for i in ti.static(range(6)):
+            self.stage[at + 9 + i] = d[i]
+        _q, _det, _norm, k = yield_factor(d, p[2])
         if self.all_served(z2, j):
-            a = self.stress_and_momentum(tau, c)
+            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
             for i in ti.static(range(9)):
-                if ti.static(update):
-                    state[target + 15 + i] = f_new[i]
                 self.affine[entry9 + i] = a[i]
+            if ti.static(update):
+                if k.min() < 1.0:
+                    f_new = flow(
+                        [self.stage[at + 9 + i] for i in range(6)],
+                        [self.stage[at + i] for i in range(9)],
+                        p[2],
+                        self.series,
+                    )
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i] = f_new[i]
+                else:
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i] = self.stage[at + i]
         else:
             for lane in range(self.lanes):
                 self.spectral_material(state, source, target, entry9, lane, e, update)
@@ -137,34 +175,132 @@ class ParticlePhases(Storage):
         """:meth:`material_tile` for one particle on CUDA."""
         p = self.material[e]
         c = self.load(state, source + 6, lane, 9)
-        f = self.load(state, source + 15, lane, 9)
-        f_new, tau, z2, j = return_map(c, f, self.dt, p[0], p[1], p[2], self.series)
+        g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
+        j = det(g)
+        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
+        _q, _det, _norm, k = yield_factor(d, p[2])
         if self.served(z2, j):
-            a = self.stress_and_momentum(tau, c)
+            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
             for i in ti.static(range(9)):
-                if ti.static(update):
-                    state[target + 15 + i][lane] = f_new[i]
                 self.affine[entry9 + i][lane] = a[i]
+            if ti.static(update):
+                if k < 1.0:
+                    f_new = flow(d, g, p[2], self.series)
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i][lane] = f_new[i]
+                else:
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i][lane] = g[i]
         else:
             self.spectral_material(state, source, target, entry9, lane, e, update)
 
     @ti.func
-    def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e):
-        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``), on the CPU."""
+    def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
+        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``), on the CPU.
+
+        Each part ends in stores to ``stage`` and stands in a basic block of its own: LLVM gives up on larger ones.
+        """
         p = self.material[e]
-        c = [state[source + 6 + i] for i in range(9)]
-        f = [state[source + 15 + i] for i in range(9)]
-        f_bar = [bar[target + 15 + i] for i in range(9)]
-        a_bar = [self.affine[entry9 + i] for i in range(9)]
-        tau_bar = self.stress_adjoint(a_bar)
-        c_out, f_out, z2, j = return_map_adjoint(c, f, f_bar, tau_bar, self.dt, p[0], p[1], p[2], self.series)
-        if self.all_served(z2, j):
-            for i in ti.static(range(9)):
-                bar[target + 6 + i] = c_out[i] + self.mass * a_bar[i]
-                bar[target + 15 + i] = f_out[i]
+        served = self.strain_tile(state, source, at)
+        if served:
+            yields = self.stress_tile_adjoint(entry9, p[0], p[1], p[2], at)
+            if yields:
+                self.flow_tile_adjoint(bar, target, p[2], at)
+            else:
+                for i in ti.static(range(9)):
+                    self.stage[at + STAGE_G_BAR + i] = bar[target + 15 + i]
+            self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
         else:
             for lane in range(self.lanes):
                 self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
+
+    @ti.func
+    def strain_tile(self, state: ti.template(), source, at):
+        """Strain of a tile into ``stage``; whether the series served."""
+        c = [state[source + 6 + i] for i in range(9)]
+        g = trial_gradient(c, [state[source + 15 + i] for i in range(9)], self.dt)
+        j = det(g)
+        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
+        for i in ti.static(range(9)):
+            self.stage[at + i] = g[i]
+        for i in ti.static(range(6)):
+            self.stage[at + STAGE_D + i] = d[i]
+            self.stage[at + STAGE_W + i] = w[i]
+            self.stage[at + STAGE_Z + i] = z[i]
+        self.stage[at + STAGE_SCALARS] = j
+        self.stage[at + STAGE_SCALARS + 1] = c2
+        self.stage[at + STAGE_SCALARS + 2] = a1
+        self.stage[at + STAGE_SCALARS + 3] = a2
+        return self.all_served(z2, j)
+
+    @ti.func
+    def stress_tile_adjoint(self, entry9, mu, lam, yield_strain, at):
+        """Adjoint of a tile's stress, from ``stage`` to ``stage``; whether any of its particles yields."""
+        d = [self.stage[at + STAGE_D + i] for i in range(6)]
+        tau_bar = self.stress_symmetric([self.affine[entry9 + i] for i in range(9)])
+        d_bar, k_bar, c2_bar, j_bar = stress_adjoint(
+            d, self.stage[at + STAGE_SCALARS], self.stage[at + STAGE_SCALARS + 1], tau_bar, mu, lam, yield_strain, self.series
+        )
+        _q, _det, _norm, k = yield_factor(d, yield_strain)
+        for i in ti.static(range(6)):
+            self.stage[at + STAGE_D_BAR + i] = d_bar[i]
+        self.stage[at + STAGE_BARS] = k_bar
+        self.stage[at + STAGE_BARS + 1] = c2_bar
+        self.stage[at + STAGE_BARS + 2] = j_bar
+        return k.min() < 1.0
+
+    @ti.func
+    def flow_tile_adjoint(self, bar: ti.template(), target, yield_strain, at):
+        """Adjoint of a tile's plastic flow, from ``stage`` to ``stage``."""
+        d_bar, k_bar, g_bar = flow_adjoint(
+            [self.stage[at + STAGE_D + i] for i in range(6)],
+            [self.stage[at + i] for i in range(9)],
+            [bar[target + 15 + i] for i in range(9)],
+            yield_strain,
+            self.series,
+        )
+        for i in ti.static(range(6)):
+            self.stage[at + STAGE_D_BAR + i] = self.stage[at + STAGE_D_BAR + i] + d_bar[i]
+        self.stage[at + STAGE_BARS] = self.stage[at + STAGE_BARS] + k_bar
+        for i in ti.static(range(9)):
+            self.stage[at + STAGE_G_BAR + i] = g_bar[i]
+
+    @ti.func
+    def strain_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at):
+        """Adjoint of a tile's strain, from ``stage`` to C and F in ``bar``."""
+        # A loop of one round, which LLVM cannot know: it keeps the two parts in blocks of their own.
+        for _ in range(self.once[None]):
+            z_bar = log_adjoint(
+                [self.stage[at + STAGE_Z + i] for i in range(6)],
+                self.stage[at + STAGE_SCALARS + 2],
+                self.stage[at + STAGE_SCALARS + 3],
+                [self.stage[at + STAGE_D + i] for i in range(6)],
+                [self.stage[at + STAGE_D_BAR + i] for i in range(6)],
+                self.stage[at + STAGE_BARS],
+                yield_strain,
+                self.series,
+            )
+            for i in ti.static(range(6)):
+                self.stage[at + STAGE_Z + i] = z_bar[i]
+        for _ in range(self.once[None]):
+            c = [state[source + 6 + i] for i in range(9)]
+            f = [state[source + 15 + i] for i in range(9)]
+            g = [self.stage[at + i] for i in range(9)]
+            w = [self.stage[at + STAGE_W + i] for i in range(6)]
+            z_bar = [self.stage[at + STAGE_Z + i] for i in range(6)]
+            g_bar = [self.stage[at + STAGE_G_BAR + i] for i in range(9)]
+            j = self.stage[at + STAGE_SCALARS]
+            c2 = self.stage[at + STAGE_SCALARS + 1]
+            c2_bar = self.stage[at + STAGE_BARS + 1]
+            j_bar = self.stage[at + STAGE_BARS + 2]
+            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
+            for i in ti.static(range(9)):
+                self.stage[at + i] = c_out[i]
+                self.stage[at + 9 + i] = f_out[i]
+        for i in ti.static(range(9)):
+            bar[target + 6 + i] = self.stage[at + i] + self.mass * self.affine[entry9 + i]
+        for i in ti.static(range(9)):
+            bar[target + 15 + i] = self.stage[at + 9 + i]
 
     @ti.func
     def spectral_material_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e):
@@ -189,11 +325,24 @@ class ParticlePhases(Storage):
         p = self.material[e]
         c = self.load(state, source + 6, lane, 9)
         f = self.load(state, source + 15, lane, 9)
-        f_bar = self.load(bar, target + 15, lane, 9)
+        g_bar = self.load(bar, target + 15, lane, 9)
         a_bar = self.load(self.affine, entry9, lane, 9)
-        tau_bar = self.stress_adjoint(a_bar)
-        c_out, f_out, z2, j = return_map_adjoint(c, f, f_bar, tau_bar, self.dt, p[0], p[1], p[2], self.series)
+        g = trial_gradient(c, f, self.dt)
+        j = det(g)
+        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
         if self.served(z2, j):
+            tau_bar = self.stress_symmetric(a_bar)
+            d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
+            _q, _det, _norm, k = yield_factor(d, p[2])
+            if k < 1.0:
+                d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
+                k_bar += k_flow
+                for i in ti.static(range(6)):
+                    d_bar[i] += d_flow[i]
+                for i in ti.static(range(9)):
+                    g_bar[i] = g_flow[i]
+            z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
+            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
             for i in ti.static(range(9)):
                 bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
                 bar[target + 15 + i][lane] = f_out[i]
@@ -219,8 +368,11 @@ class ParticlePhases(Storage):
                 qj = qi + float(j) * q[2]
                 wij = w[i][0] * w[j][1]
                 row = node + (i * self.axis + j) * self.axis
-                for k in ti.static(range(3)):
-                    self.add(grid, row + k, (wij * w[k][2]) * (qj + float(k) * q[3]))
+                r = wij * qj
+                z = wij * q[3]
+                self.add(grid, row, w[0][2] * r)
+                self.add(grid, row + 1, w[1][2] * r + w[1][2] * z)
+                self.add(grid, row + 2, w[2][2] * r + (2.0 * w[2][2]) * z)
 
     @ti.func
     def affine_field(self, value, last, a: ti.template(), fx, scale):
@@ -247,73 +399,84 @@ class ParticlePhases(Storage):
         return self.affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx * self.inv_dx)
 
     @ti.func
-    def gather_particle(self, state: ti.template(), source, target, lane, e, time):
-        """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
+    def gather_particle(self, state: ti.template(), source, target, lane, e, time, at):
+        """Grid to particle: v, C and x after the substep.
+
+        Args:
+            state: Particle state.
+            source: Entry of the tile before the substep.
+            target: Entry of the tile after it.
+            lane: Particle of the tile.
+            e: Environment.
+            time: Substep, noted where the speed is not sane.
+            at: First entry of the thread's share of ``work``.
+        """
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        m0, mx, my, mz = gather(
-            self.velocity, e * self.nodes + self.node_index(base), self.axis * self.axis, self.axis, spline(fx)
-        )
-        cx = 4.0 * self.inv_dx * (mx - fx[0] * m0)
-        cy = 4.0 * self.inv_dx * (my - fx[1] * m0)
-        cz = 4.0 * self.inv_dx * (mz - fx[2] * m0)
+        node = e * self.nodes + self.node_index(base)
+        gather(self.velocity, node, self.axis * self.axis, self.axis, spline(fx), self.work, at)
+        scale = 4.0 * self.inv_dx
+        speed = 0.0 * fx[0]
         for i in ti.static(range(3)):
-            state[target + 3 + i][lane] = m0[i]
-            state[target + 6 + 3 * i][lane] = cx[i]
-            state[target + 7 + 3 * i][lane] = cy[i]
-            state[target + 8 + 3 * i][lane] = cz[i]
-            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * m0[i], 0.0), self.x_max)
-        speed = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
+            v = self.work[at][i]
+            state[target + 3 + i][lane] = v
+            state[target + 6 + 3 * i][lane] = scale * (self.work[at + 1][i] - fx[0] * v)
+            state[target + 7 + 3 * i][lane] = scale * (self.work[at + 2][i] - fx[1] * v)
+            state[target + 8 + 3 * i][lane] = scale * (self.work[at + 3][i] - fx[2] * v)
+            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v, 0.0), self.x_max)
+            speed += v * v
         # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
         if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
             self.fault[e] = time + 1
 
     @ti.func
-    def gather_particle_adjoint(self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e):
+    def gather_particle_adjoint(
+        self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e, at
+    ):
         """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)
-        v = self.vector(state, source + 3, lane)
         v_after = self.vector(state, after + 3, lane)
-        q = self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
+        q = self.affine_field(self.mass * self.vector(state, source + 3, lane), self.mass, a, fx, 1.0)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
-        m0, mx, my, mz, gx, gy, gz = gather_adjoint(
+        for i in ti.static(range(4)):
+            self.work[at + 7 + i] = q[i]
+            self.work[at + 11 + i] = h[i]
+        node = e * self.nodes + self.node_index(base)
+        gather_adjoint(
             self.velocity,
             self.momentum_bar,
-            e * self.nodes + self.node_index(base),
+            node,
             self.axis * self.axis,
             self.axis,
             spline(fx),
             spline_slope(fx),
-            q,
-            h,
+            self.work,
+            at,
         )
-        slope = ti.Vector([gx.sum(), gy.sum(), gz.sum()])
         c_bar = self.load(bar, target + 6, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
-        ax = self.dx * (mx - fx[0] * m0)
-        ay = self.dx * (my - fx[1] * m0)
-        az = self.dx * (mz - fx[2] * m0)
+        m0 = ti.Vector([self.work[at][0], self.work[at][1], self.work[at][2]])
         for i in ti.static(range(3)):
+            slope = self.work[at + 4 + i].sum()
             # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from the scatter.
             offsets = scale * (c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]) + (
                 a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2]
             )
-            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
+            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope - offsets
             bar[target + 3 + i][lane] = self.mass * m0[i]
-            self.affine[entry9 + 3 * i][lane] = ax[i]
-            self.affine[entry9 + 3 * i + 1][lane] = ay[i]
-            self.affine[entry9 + 3 * i + 2][lane] = az[i]
+            for j in ti.static(range(3)):
+                self.affine[entry9 + 3 * i + j][lane] = self.dx * (self.work[at + 1 + j][i] - fx[j] * m0[i])
 
     # -- which blocks hold mass ------------------------------------------------------------------------------------
 
     @ti.func
     def block_of(self, base):
         """Linear index of the block of a base node, and which axes its stencil crosses into the next block (3 bits)."""
-        b = base // BLOCK
-        r = base - b * BLOCK
+        b = base >> BLOCK_BITS
+        r = base & (BLOCK - 1)
         crossing = (
             ti.select(r[0] >= BLOCK - 2, 1, 0) + ti.select(r[1] >= BLOCK - 2, 2, 0) + ti.select(r[2] >= BLOCK - 2, 4, 0)
         )

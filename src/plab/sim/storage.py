@@ -21,12 +21,13 @@ from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
 from plab.sim.runtime import Runtime
 
-__all__ = ["BLOCK", "CHUNKS", "FRAME_ADJOINT", "STATE", "Storage"]
+__all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "STATE", "WORK", "Storage"]
 
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9)."""
 
-BLOCK = 4
+BLOCK_BITS = 2
+BLOCK = 1 << BLOCK_BITS
 """Edge of a block of grid nodes."""
 
 CHUNKS = 8
@@ -34,6 +35,12 @@ CHUNKS = 8
 
 FRAME_ADJOINT = 25
 """Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap (1)."""
+
+WORK = 16
+"""4-vectors per thread of work for the transfers of one particle."""
+
+STAGE = 49
+"""Lane vectors per thread for the intermediate results of one tile's material update."""
 
 LANES = {"cpu": 8, "cuda": 32}
 
@@ -81,7 +88,6 @@ class Storage:
         self.threads = threads
         # Threads beyond one per environment team up on its chunks.
         self.team_size = min(self.chunks, max(1, threads // self.batch))
-        self.teams = min(self.batch, threads // self.team_size)
 
     def _set_manipulators(self, scenes: Sequence[Scene]) -> None:
         manipulators = scenes[0].manipulators
@@ -125,6 +131,9 @@ class Storage:
         self.frame_gap = ti.field(real, shape=(b, self.substeps, m))
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
+        self.work = ti.Vector.field(4, real, shape=(b * self.particles if self.cuda else grids) * WORK)
+        # Intermediate results of the material update of one tile per chunk.
+        self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
         self.velocity = ti.Vector.field(4, real, shape=b * self.nodes)
         self._allocate_blocks(grids)
@@ -134,6 +143,8 @@ class Storage:
         self.loss_part = ti.Vector.field(2, ti.f64, shape=(b, self.chunks))
         self.contact_part = ti.field(real, shape=(b, self.chunks, m))
         self.contact_particle = ti.field(ti.i32, shape=(b, self.chunks, m))
+        self.once = ti.field(ti.i32, shape=())
+        self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
 
     def _allocate_blocks(self, grids: int) -> None:
@@ -149,7 +160,7 @@ class Storage:
         self.mark_code = ti.field(ti.i32, shape=private * self.blocks)
         self.mark_list = ti.field(ti.i32, shape=private * self.blocks)
         self.mark_count = ti.field(ti.i32, shape=private)
-        self.arrivals = ti.field(ti.i32, shape=32 * max(1, self.teams))
+        self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
 
     def allocate_adjoint(self) -> None:
         """Allocate what only gradients need, once."""

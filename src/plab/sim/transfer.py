@@ -42,7 +42,7 @@ def column(a: ti.template(), j: ti.template(), scale):
 
 
 @ti.func
-def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template()):
+def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work: ti.template(), at):
     """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil.
 
     Args:
@@ -51,34 +51,35 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template()):
         stride_x: Index distance of neighbours along x.
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
-
-    Returns:
-        Sum of w g, and of w g times the node's offset (0, 1, 2) along x, y and z.
+        work: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only that.
+        at: First entry of the result: sum of w g, then of w g times the node's offset (0, 1, 2) along x, y and z.
     """
-    m0 = grid[node] * 0.0
-    mx = m0
-    my = m0
-    mz = m0
     for i in ti.static(range(3)):
-        r0 = m0 * 0.0
-        ry = m0 * 0.0
-        rz = m0 * 0.0
+        r0 = grid[node] * 0.0
+        ry = r0
+        rz = r0
         for j in ti.static(range(3)):
             row = node + i * stride_x + j * stride_y
-            g0 = w[0][2] * grid[row]
             g1 = w[1][2] * grid[row + 1]
             g2 = w[2][2] * grid[row + 2]
-            s0 = w[j][1] * (g0 + g1 + g2)
-            r0 += s0
+            s0 = w[0][2] * grid[row] + g1 + g2
+            r0 += w[j][1] * s0
             rz += w[j][1] * (g1 + 2.0 * g2)
             if ti.static(j > 0):
-                ry += float(j) * s0
-        m0 += w[i][0] * r0
-        my += w[i][0] * ry
-        mz += w[i][0] * rz
-        if ti.static(i > 0):
-            mx += (float(i) * w[i][0]) * r0
-    return m0, mx, my, mz
+                ry += (float(j) * w[j][1]) * s0
+        if ti.static(i == 0):
+            work[at] = w[i][0] * r0
+            work[at + 2] = w[i][0] * ry
+            work[at + 3] = w[i][0] * rz
+        else:
+            r = w[i][0] * r0
+            work[at] = work[at] + r
+            if ti.static(i == 1):
+                work[at + 1] = r
+            else:
+                work[at + 1] = work[at + 1] + 2.0 * r
+            work[at + 2] = work[at + 2] + w[i][0] * ry
+            work[at + 3] = work[at + 3] + w[i][0] * rz
 
 
 @ti.func
@@ -90,8 +91,8 @@ def gather_adjoint(
     stride_y,
     w: ti.template(),
     dw: ti.template(),
-    q: ti.template(),
-    h: ti.template(),
+    work: ti.template(),
+    at,
 ):
     """What a particle's adjoint needs of the grid, in one pass over its stencil.
 
@@ -103,40 +104,31 @@ def gather_adjoint(
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
         dw: :func:`spline_slope`.
-        q: The scattered affine field: value at the base node and increments along x, y, z, with the mass at the end.
-        h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
-
-    Returns:
-        Moments of momentum_bar as in :func:`gather`, and the sum over nodes of grad_f w (momentum_bar . q + velocity . h)
-        as three 4-vectors, still to be summed over their entries.
+        work: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at the base node and
+            increments along x, y, z, with the mass at the end) and that of the velocity's adjoint h, likewise, with 0
+            at the end. On return, from ``at``: moments of momentum_bar as in :func:`gather`, then the sum over nodes of
+            grad_f w (momentum_bar . q + velocity . h) as three 4-vectors, still to be summed over their entries.
+        at: First entry in ``work``.
     """
-    m0 = velocity[node] * 0.0
-    mx = m0
-    my = m0
-    mz = m0
-    gx = m0
-    gy = m0
-    gz = m0
     for i in ti.static(range(3)):
-        r0 = m0 * 0.0
-        ry = m0 * 0.0
-        rz = m0 * 0.0
-        c0 = m0 * 0.0
-        cy = m0 * 0.0
-        cz = m0 * 0.0
-        qi = q[0] + float(i) * q[1]
-        hi = h[0] + float(i) * h[1]
+        zero = velocity[node] * 0.0
+        r0 = zero
+        ry = zero
+        rz = zero
+        c0 = zero
+        cy = zero
+        cz = zero
         for j in ti.static(range(3)):
             row = node + i * stride_x + j * stride_y
-            qj = qi + float(j) * q[2]
-            hj = hi + float(j) * h[2]
-            s0 = m0 * 0.0
-            s1 = m0 * 0.0
-            t0 = m0 * 0.0
-            t1 = m0 * 0.0
+            qj = work[at + 7] + float(i) * work[at + 8] + float(j) * work[at + 9]
+            hj = work[at + 11] + float(i) * work[at + 12] + float(j) * work[at + 13]
+            s0 = zero
+            s1 = zero
+            t0 = zero
+            t1 = zero
             for k in ti.static(range(3)):
                 p = momentum_bar[row + k]
-                chi = p * (qj + float(k) * q[3]) + velocity[row + k] * (hj + float(k) * h[3])
+                chi = p * (qj + float(k) * work[at + 10]) + velocity[row + k] * (hj + float(k) * work[at + 14])
                 t0 += w[k][2] * chi
                 t1 += dw[k][2] * chi
                 wp = w[k][2] * p
@@ -150,12 +142,19 @@ def gather_adjoint(
             rz += w[j][1] * s1
             if ti.static(j > 0):
                 ry += (float(j) * w[j][1]) * s0
-        m0 += w[i][0] * r0
-        my += w[i][0] * ry
-        mz += w[i][0] * rz
-        gx += dw[i][0] * c0
-        gy += w[i][0] * cy
-        gz += w[i][0] * cz
-        if ti.static(i > 0):
-            mx += (float(i) * w[i][0]) * r0
-    return m0, mx, my, mz, gx, gy, gz
+        if ti.static(i == 0):
+            work[at] = w[i][0] * r0
+            work[at + 1] = zero
+            work[at + 2] = w[i][0] * ry
+            work[at + 3] = w[i][0] * rz
+            work[at + 4] = dw[i][0] * c0
+            work[at + 5] = w[i][0] * cy
+            work[at + 6] = w[i][0] * cz
+        else:
+            work[at] = work[at] + w[i][0] * r0
+            work[at + 1] = work[at + 1] + (float(i) * w[i][0]) * r0
+            work[at + 2] = work[at + 2] + w[i][0] * ry
+            work[at + 3] = work[at + 3] + w[i][0] * rz
+            work[at + 4] = work[at + 4] + dw[i][0] * c0
+            work[at + 5] = work[at + 5] + w[i][0] * cy
+            work[at + 6] = work[at + 6] + w[i][0] * cz
