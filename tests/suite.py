@@ -60,7 +60,7 @@ def manipulator(kind: str, near: bool) -> Manipulator:
     )
 
 
-def scene(near: tuple[str, ...], *, particles: int = 200, floor: bool = False, **changes: float) -> Scene:
+def scene(near: tuple[str, ...], *, particles: int = 150, floor: bool = False, **changes: float) -> Scene:
     """A box of plasticine with the manipulators named in ``near`` touching it.
 
     Args:
@@ -71,7 +71,7 @@ def scene(near: tuple[str, ...], *, particles: int = 200, floor: bool = False, *
     """
     center = (0.5, 0.5 * WIDTH, 0.5) if floor else tuple(CENTER)
     body = Body("box", center, (WIDTH,) * 3, particles)
-    values = {"yield_stress": 60.0, "grid_size": 32, "substeps": 19, **changes}
+    values = {"yield_stress": 60.0, "grid_size": 32, "substeps": 7, **changes}
     return Scene("test", (body,), tuple(manipulator(kind, kind in near) for kind in KINDS), **values)
 
 

@@ -67,11 +67,20 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 
 def _plain(title: str, start: int, total: int) -> Report:
-    begin = time.monotonic()
+    first: list[tuple[float, int]] = []
+
+    def left(done: int) -> str:
+        # The first step compiles the simulator: it says nothing about the pace.
+        now = time.monotonic()
+        if not first:
+            first.append((now, done))
+            return "compiled"
+        begin, before = first[0]
+        return f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
 
     def report(done: int, text: str) -> None:
+        remaining = left(done)
         if done - start == 1 or done % PLAIN_EVERY == 0 or done == total:
-            seconds = (time.monotonic() - begin) / max(done - start, 1) * (total - done)
-            print(f"{title} {done}/{total}, {timedelta(seconds=round(seconds))} left, {text}", flush=True)
+            print(f"{title} {done}/{total}, {remaining}, {text}", flush=True)
 
     return report

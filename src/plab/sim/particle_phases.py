@@ -443,6 +443,12 @@ class ParticlePhases(Storage):
         for i in ti.static(range(4)):
             self.work[at + 7 + i] = q[i]
             self.work[at + 11 + i] = h[i]
+        w = spline(fx)
+        dw = spline_slope(fx)
+        for i in ti.static(range(3)):
+            self.work[at + 15][i] = w[i][0]
+            self.work[at + 16][i] = dw[i][0]
+            self.work[at + 17][i] = float(i)
         node = e * self.nodes + self.node_index(base)
         gather_adjoint(
             self.velocity,
@@ -450,8 +456,8 @@ class ParticlePhases(Storage):
             node,
             self.axis * self.axis,
             self.axis,
-            spline(fx),
-            spline_slope(fx),
+            w,
+            dw,
             self.work,
             at,
         )

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import weakref
 from dataclasses import dataclass
+
+# Taichi prints a banner on standard output unless told so before it is imported.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import taichi as ti
 
@@ -44,6 +49,7 @@ class Runtime:
 
 
 _current: Runtime | None = None
+_users: weakref.WeakSet = weakref.WeakSet()
 
 
 def available_threads() -> int:
@@ -77,8 +83,12 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     if precision not in PRECISIONS:
         raise ValueError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     wanted = 1 if device == "cuda" else max(1, threads or available_threads())
-    if _current is not None and (_current.device, _current.precision, _current.threads) == (device, precision, wanted):
+    same = _current is not None and (_current.device, _current.precision, _current.threads) == (device, precision, wanted)
+    # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so that the
+    # next one starts from a fresh count when nothing is left of those before.
+    if same and len(_users) > 0:
         return _current
+    _users.clear()
     if device == "cuda" and not cuda_available():
         raise DeviceError("no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi")
     ti.init(
@@ -92,6 +102,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         offline_cache=True,
         log_level=ti.WARN,
     )
+    remember_source_positions()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
 
@@ -99,6 +110,36 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
 def cuda_available() -> bool:
     """Whether Taichi can open a CUDA device."""
     return bool(ti._lib.core.with_cuda())
+
+
+def remember_source_positions() -> None:
+    """Let Taichi format the source excerpt of an AST node once, not at every inlining.
+
+    The excerpts are for its error messages; formatting them is half of what compiling from a warm cache takes. Where a
+    future Taichi has no such method, nothing is changed.
+    """
+    from taichi.lang.ast import ast_transformer_utils
+
+    context = ast_transformer_utils.ASTTransformerContext
+    original = getattr(context, "get_pos_info", None)
+    if original is None or hasattr(original, "remembers"):
+        return
+    texts: dict[tuple, str] = {}
+
+    def get_pos_info(self: object, node: ast.AST) -> str:
+        place = (node.lineno, node.end_lineno, node.col_offset, node.end_col_offset, type(node))
+        key = (self.file, self.lineno_offset, self.func.func.__name__, *place)
+        if key not in texts:
+            texts[key] = original(self, node)
+        return texts[key]
+
+    get_pos_info.remembers = True
+    context.get_pos_info = get_pos_info
+
+
+def register_user(user: object) -> None:
+    """Note that an object holds memory of the runtime, for as long as it lives."""
+    _users.add(user)
 
 
 def is_current(runtime: Runtime) -> bool:

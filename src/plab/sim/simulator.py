@@ -10,7 +10,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
-from plab.sim.runtime import SimulationError, is_current, start_runtime
+from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import STATE
 
 __all__ = ["CONTACT_MODELS", "Rollout", "Simulator", "State"]
@@ -95,6 +95,7 @@ class Simulator:
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
         self._engine = _engine_class(device)(self.scenes, self._runtime)
+        register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
         self._history: ti.Ndarray | None = None
@@ -469,6 +470,10 @@ class Simulator:
 
 
 def _engine_class(device: str) -> type:
+    if device == "cuda":
+        from plab.sim.cuda_engine import CudaEngine
+
+        return CudaEngine
     return CpuEngine
 
 

@@ -36,7 +36,7 @@ CHUNKS = 8
 FRAME_ADJOINT = 25
 """Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap (1)."""
 
-WORK = 16
+WORK = 20
 """4-vectors per thread of work for the transfers of one particle."""
 
 STAGE = 49

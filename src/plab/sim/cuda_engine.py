@@ -1,0 +1,339 @@
+"""Kernels for CUDA: one thread per particle, per node of an active block, per pose.
+
+A substep is one launch from Python of a kernel with several parallel loops, because a launch costs 13 to 17
+microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device: how
+many blocks are active is known on the device only, so loops over nodes have a fixed number of threads, which
+share the nodes evenly.
+
+Sums over particles at a node are atomic, in whatever order the device runs them: results differ from run to run
+by rounding.
+"""
+
+import taichi as ti
+
+from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
+from plab.sim.grid_phases import MASS_MIN
+from plab.sim.storage import BLOCK, BLOCK_BITS, STATE
+from plab.sim.transfer import spline
+
+__all__ = ["CudaEngine"]
+
+NODE_BITS = 3 * BLOCK_BITS
+NODE_MASK = (1 << NODE_BITS) - 1
+
+THREADS_MAX = 1 << 17
+"""Threads of a loop over nodes: about as many as the largest devices hold at a time."""
+
+
+@ti.data_oriented
+class CudaEngine(CudaPhases):
+    """Kernels for CUDA; public methods as those of :class:`plab.sim.engine.CpuEngine`.
+
+    ``block_list`` is one list of ``environment * blocks + block`` for all environments, ``block_count[0]`` its
+    length, which must be 0 before every scatter: whatever runs before a scatter sees to that.
+    """
+
+    def __init__(self, *args: object) -> None:
+        """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
+        super().__init__(*args)
+        self.particle_threads = self.batch * self.tiles * self.lanes
+        self.pose_threads = self.batch * max(1, self.manipulators)
+        self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
+
+    # -- threads ---------------------------------------------------------------------------------------------
+
+    @ti.func
+    def particle_of(self, q):
+        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
+        e = q // (self.tiles * self.lanes)
+        return e, q - e * (self.tiles * self.lanes)
+
+    @ti.func
+    def turns_of(self, w, total):
+        """How many of ``total`` items thread w of a loop over nodes works on."""
+        return (total - w + self.node_threads - 1) // self.node_threads
+
+    @ti.func
+    def node_of(self, q):
+        """Environment and array index (3) of node q of the active blocks."""
+        entry = self.block_list[q >> NODE_BITS]
+        e = entry // self.blocks
+        return e, self.node_of_block(entry - e * self.blocks, q & NODE_MASK)
+
+    # -- public methods --------------------------------------------------------------------------------------
+
+    def step(
+        self,
+        state: ti.Ndarray,
+        poses: ti.Ndarray,
+        actions: ti.Ndarray,
+        slot: int,
+        stride: int,
+        t: int,
+        pose_before: int,
+        pose_after: int,
+        stamp: int,
+    ) -> None:
+        """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
+        self.advance_kernel(poses, actions, t, pose_before, pose_after)
+        for s in range(self.substeps):
+            before = slot + s * stride
+            self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp + s)
+
+    def losses(self, state: ti.Ndarray, slot: int, terms: ti.Ndarray, at: int, stamp: int) -> None:
+        """Unweighted loss terms of all environments, written to ``terms`` from entry ``at``."""
+        self.losses_kernel(state, slot, terms, at, stamp)
+
+    def step_adjoint(
+        self,
+        state: ti.Ndarray,
+        bar: ti.Ndarray,
+        poses: ti.Ndarray,
+        actions: ti.Ndarray,
+        actions_bar: ti.Ndarray,
+        terms: ti.Ndarray,
+        slot: int,
+        t: int,
+        stamp: int,
+    ) -> None:
+        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and its loss.
+
+        ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
+        likewise.
+        """
+        end = slot + self.substeps
+        self.advance_kernel(poses, actions, t, t, t + 1)
+        self.losses_kernel(state, end, terms, 0, stamp)
+        self.loss_gradient_kernel(state, end, bar)
+        for back in range(self.substeps):
+            s = self.substeps - 1 - back
+            self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1 + back)
+        self.retreat_kernel(actions, actions_bar, t)
+
+    # -- kernels ---------------------------------------------------------------------------------------------
+
+    @ti.kernel
+    def advance_kernel(
+        self,
+        poses: ti.types.ndarray(ndim=1),
+        actions: ti.types.ndarray(ndim=1),
+        t: ti.i32,
+        before: ti.i32,
+        after: ti.i32,
+    ):
+        """Poses and frames of all substeps of environment step t."""
+        self.block_count[0] = 0
+        for q in range(self.pose_threads):
+            # Neighbouring threads take the same manipulator of different environments, hence the same path.
+            for m in ti.static(range(self.manipulators)):
+                if q // self.batch == m:
+                    self.advance_manipulator(q % self.batch, m, actions, poses, t, before, after)
+        for q in range(self.pose_threads * self.substeps):
+            s = q // self.pose_threads
+            r = q % self.pose_threads
+            for m in ti.static(range(self.manipulators)):
+                if r // self.batch == m:
+                    self.set_frame(r % self.batch, s, m)
+
+    @ti.kernel
+    def substep_kernel(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        before: ti.i32,
+        after: ti.i32,
+        s: ti.i32,
+        time: ti.i32,
+        stamp: ti.i32,
+    ):
+        """Substep s of all environments, from time slot ``before`` to ``after``."""
+        for q in range(self.particle_threads):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile = particle // self.lanes
+                lane = particle % self.lanes
+                source = self.tile_entry(before, e, tile)
+                entry9 = (e * self.tiles + tile) * 9
+                base, fx = self.stencil(self.vector(state, source, lane))
+                self.mark_shared(e, base, stamp)
+                self.material_particle(state, source, self.tile_entry(after, e, tile), entry9, lane, e, True)
+                self.scatter_particle(state, source, entry9, lane, e, base, fx)
+        for w in range(self.node_threads):
+            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+                e, i = self.node_of(w + turn * self.node_threads)
+                node = e * self.nodes + self.linear(i)
+                total = self.take(self.momentum, node)
+                # A test of which manipulators are near would cost a thread as much as contact with them.
+                v = self.update_node(e, s, i, ti.static((1 << self.manipulators) - 1), total)
+                self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+        for q in range(self.particle_threads):
+            if q == 0:
+                self.block_count[0] = 0
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile = particle // self.lanes
+                source = self.tile_entry(before, e, tile)
+                self.gather_particle(
+                    state, source, self.tile_entry(after, e, tile), particle % self.lanes, e, time
+                )
+
+    @ti.kernel
+    def losses_kernel(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        terms: ti.types.ndarray(ndim=1),
+        at: ti.i32,
+        stamp: ti.i32,
+    ):
+        """Unweighted loss terms; leaves mass and the loss's slope at the nodes of active blocks."""
+        self.block_count[0] = 0
+        for e in range(self.batch):
+            self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 2)
+        for q in range(self.particle_threads):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                x = self.vector(
+                    state, self.tile_entry(slot, e, particle // self.lanes), particle % self.lanes
+                )
+                base, fx = self.stencil(x)
+                self.mark_shared(e, base, stamp)
+                self.scatter_mass(e, base, fx)
+                self.note_distances(e, particle, x)
+        # A row of nodes per thread makes a quarter of the atomics.
+        for w in range(self.node_threads):
+            for turn in range(self.turns_of(w, (self.block_count[0] << NODE_BITS) // BLOCK)):
+                e, first = self.node_of((w + turn * self.node_threads) * BLOCK)
+                part = ti.Vector.zero(ti.f64, 2)
+                for r in range(BLOCK):
+                    i = ti.Vector([first[0], first[1], first[2] + r])
+                    node = e * self.nodes + self.linear(i)
+                    mass = self.take(self.momentum, node)[3]
+                    density, sdf, slope = self.node_loss(e, i, mass)
+                    part += ti.Vector([ti.cast(density, ti.f64), ti.cast(sdf, ti.f64)])
+                    self.velocity[node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
+                if part[0] != 0.0 or part[1] != 0.0:
+                    ti.atomic_add(self.loss_part[e, 0], part)
+        for q in range(self.pose_threads * NEAREST_GROUPS):
+            for m in ti.static(range(self.manipulators)):
+                if ti.static(self.motions[m] != "static"):
+                    if q // NEAREST_GROUPS % max(1, self.manipulators) == m:
+                        self.scan_group(q // (NEAREST_GROUPS * self.manipulators), m, q % NEAREST_GROUPS)
+        for e in range(self.batch):
+            self.join_losses(e, terms, at + 3 * e)
+
+    @ti.kernel
+    def loss_gradient_kernel(
+        self, state: ti.types.ndarray(ndim=1), slot: ti.i32, bar: ti.types.ndarray(ndim=1)
+    ):
+        """Add the gradient of the losses just computed to the adjoints of particles and poses."""
+        self.block_count[0] = 0
+        for q in range(self.particle_threads):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile = particle // self.lanes
+                lane = particle % self.lanes
+                entry = self.tile_entry(0, e, tile)
+                base, fx = self.stencil(self.vector(state, self.tile_entry(slot, e, tile), lane))
+                slope = self.mass_slope(self.velocity, e, base, fx)
+                for i in ti.static(range(3)):
+                    bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
+        for e in range(self.batch):
+            self.contact_gradient(state, slot, bar, e)
+
+    @ti.kernel
+    def substep_adjoint_kernel(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        bar: ti.types.ndarray(ndim=1),
+        before: ti.i32,
+        after: ti.i32,
+        s: ti.i32,
+        stamp: ti.i32,
+    ):
+        """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
+        for q in range(self.particle_threads):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile = particle // self.lanes
+                lane = particle % self.lanes
+                source = self.tile_entry(before, e, tile)
+                target = self.tile_entry(after, e, tile)
+                entry = self.tile_entry(0, e, tile)
+                entry9 = (e * self.tiles + tile) * 9
+                x = self.vector(state, source, lane)
+                base, fx = self.stencil(x)
+                self.mark_shared(e, base, stamp)
+                self.material_particle(state, source, target, entry9, lane, e, False)
+                self.scatter_particle(state, source, entry9, lane, e, base, fx)
+                h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
+                self.scatter(self.velocity_bar, e * self.nodes + self.node_index(base), spline(fx), h)
+        for w in range(self.node_threads):
+            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+                e, i = self.node_of(w + turn * self.node_threads)
+                node = e * self.nodes + self.linear(i)
+                total = self.take(self.momentum, node)
+                bar4 = self.take(self.velocity_bar, node)
+                near = 0
+                if total[3] > MASS_MIN:
+                    near = self.touching(e, s, self.position(i))
+                v, total_bar = self.update_node_adjoint(
+                    e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
+                )
+                self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+                self.momentum_bar[node] = total_bar
+        for q in range(self.particle_threads):
+            if q == 0:
+                self.block_count[0] = 0
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile = particle // self.lanes
+                lane = particle % self.lanes
+                source = self.tile_entry(before, e, tile)
+                entry = self.tile_entry(0, e, tile)
+                entry9 = (e * self.tiles + tile) * 9
+                self.gather_particle_adjoint(
+                    state, source, self.tile_entry(after, e, tile), bar, entry, entry9, lane, e
+                )
+                self.material_particle_adjoint(state, source, bar, entry, entry9, lane, e)
+
+    @ti.kernel
+    def retreat_kernel(
+        self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1), t: ti.i32
+    ):
+        """Adjoint of all manipulators' motion in environment step t, from its frames' adjoints."""
+        for q in range(self.pose_threads):
+            for m in ti.static(range(self.manipulators)):
+                if q // self.batch == m:
+                    self.retreat_through(q % self.batch, m, actions, actions_bar, t)
+
+    @ti.kernel
+    def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):
+        """Place all manipulators at slot ``slot`` of the pose history."""
+        for e in range(self.batch):
+            self.place_manipulators(e, poses, slot)
+
+    @ti.kernel
+    def export_mass(self, out: ti.types.ndarray(ndim=1)):
+        """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
+        for w in range(self.node_threads):
+            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+                e, i = self.node_of(w + turn * self.node_threads)
+                index = self.tensor_index(e, i)
+                if index >= 0:
+                    out[index] = self.velocity[e * self.nodes + self.linear(i)][0]
+
+    @ti.kernel
+    def copy_slot(
+        self,
+        source: ti.types.ndarray(ndim=1),
+        source_slot: ti.i32,
+        target: ti.types.ndarray(ndim=1),
+        target_slot: ti.i32,
+    ):
+        """Copy the particle state of all environments between time slots."""
+        size = self.batch * self.tiles * STATE
+        for i in range(size * self.lanes):
+            entry = i // self.lanes
+            target[target_slot * size + entry][i % self.lanes] = source[source_slot * size + entry][
+                i % self.lanes
+            ]
