@@ -1,12 +1,12 @@
 """Kernels for CUDA: one thread per particle, per node of an active block, per pose.
 
 A substep is one launch from Python of a kernel with several parallel loops, because a launch costs 13 to 17
-microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device: how
-many blocks are active is known on the device only, so loops over nodes have a fixed number of threads, which
-share the nodes evenly.
+microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device:
+how many blocks are active is known on the device only, so loops over nodes have a fixed number of threads,
+which share the nodes evenly.
 
-Sums over particles at a node are atomic, in whatever order the device runs them: results differ from run to run
-by rounding.
+Sums over particles at a node are atomic, in whatever order the device runs them: results differ between
+runs by rounding.
 """
 
 import taichi as ti
@@ -29,8 +29,8 @@ THREADS_MAX = 1 << 17
 class CudaEngine(CudaPhases):
     """Kernels for CUDA; public methods as those of :class:`plab.sim.engine.CpuEngine`.
 
-    ``block_list`` is one list of ``environment * blocks + block`` for all environments, ``block_count[0]`` its
-    length, which must be 0 before every scatter: whatever runs before a scatter sees to that.
+    ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
+    its length, which must be 0 before every scatter: whatever runs before a scatter sees to that.
     """
 
     def __init__(self, *args: object) -> None:

@@ -1,8 +1,9 @@
 """Phases as CUDA runs them, where its many threads and their registers ask for something else than the CPU.
 
 Transfers keep their sums in registers, where the CPU's keep them in memory for LLVM to vectorise; poses are
-advanced by one thread per manipulator; frame adjoints are kept per substep, so that the poses' adjoints are one
-launch per environment step; the nearest particles are found without atomics, so that ties never depend on timing.
+advanced by one thread per manipulator; frame adjoints are kept per substep, so that the poses' adjoints
+take one launch per environment step; the nearest particles are found without atomics, so ties never depend
+on timing.
 """
 
 import taichi as ti
@@ -75,7 +76,7 @@ def moments_adjoint(
         axis: Nodes along an axis of the grid.
         w: Spline weights.
         dw: Their derivatives.
-        q: The scattered affine field: value at the base node and increments along x, y, z, with the mass last.
+        q: The scattered affine field: value at the base node and increments along x, y, z, mass last.
         h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
 
     Returns:

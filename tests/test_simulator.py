@@ -1,0 +1,153 @@
+"""What users of the simulator rely on beyond its physics: reproducibility, memory budget, refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plab.scene import Body, Manipulator, Scene, SceneError
+from plab.sim import SimulationError, Simulator
+
+STEPS = 4
+
+
+def ball(*, center: tuple[float, float, float] = (0.5, 0.4, 0.5), friction: float = 0.9) -> Scene:
+    """A ball of plasticine between two spheres on a coarse grid."""
+    tools = tuple(
+        Manipulator("Sphere", (0.06,), (center[0] + dx, *center[1:]), scale=(0.02,) * 3, friction=friction)
+        for dx in (-0.15, 0.15)
+    )
+    return Scene("ball", (Body("sphere", center, (0.1,), 300),), tools, grid_size=16, substeps=5, dt=2e-4)
+
+
+SCENES = (ball(), ball(center=(0.4, 0.3, 0.6)), ball(friction=0.1))
+
+
+def actions(batch: int = len(SCENES)) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-0.3, 0.3, size=(len(SCENES), STEPS, 6))
+    u[:, :, 0] += 0.6
+    u[:, :, 3] -= 0.6
+    return u[:batch]
+
+
+def simulator(scenes: tuple[Scene, ...], device: str, **settings: float) -> Simulator:
+    """A simulator whose targets are the scenes' own volume, moved."""
+    sim = Simulator(scenes, device=device, **settings)
+    n = sim.grid_size
+    grid = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
+    distance = np.linalg.norm(grid - 0.6, axis=-1)
+    mass = np.where(distance < 0.12, 3.0 * scenes[0].particle_mass, 0.0)
+    sim.set_target(np.stack([mass] * len(scenes)), np.stack([np.maximum(distance - 0.12, 0.0)] * len(scenes)))
+    return sim
+
+
+def test_results_do_not_depend_on_threads_batch_or_checkpoints(device: str) -> None:
+    """Bit for bit on the CPU: a thread, a batch or a memory budget more or less changes nothing."""
+    if device != "cpu":
+        pytest.skip("bits are promised on the CPU only")
+    u = actions()
+    base = simulator(SCENES, device, threads=2)
+    want = base.rollout(u)
+    final = base.state()
+    slot_mb = base._slot_bytes() / 1e6
+    for settings, batch in (({"threads": 1}, 3), ({"threads": 2}, 1), ({"threads": 2, "memory_mb": 13 * slot_mb}, 3)):
+        sim = simulator(SCENES[:batch], device, **settings)
+        got = sim.rollout(u[:batch])
+        np.testing.assert_array_equal(got.step_terms, want.step_terms[:batch], err_msg=str(settings))
+        np.testing.assert_array_equal(got.gradient, want.gradient[:batch], err_msg=str(settings))
+        np.testing.assert_array_equal(sim.state().x, final.x[:batch], err_msg=str(settings))
+
+
+@pytest.fixture(scope="module")
+def sim(device: str) -> Simulator:
+    return simulator(SCENES, device)
+
+
+def test_gradient_descends(sim: Simulator) -> None:
+    u = actions()
+    sim.set_contact("soft")
+    first = sim.rollout(u)
+    weights = np.array([10.0, 10.0, 1.0])
+    step = 1e-3 * first.gradient / np.abs(first.gradient).max()
+    second = sim.rollout(u - step, gradient=False)
+    before = (first.step_terms @ weights).sum(axis=1)
+    after = (second.step_terms @ weights).sum(axis=1)
+    predicted = (first.gradient * step).sum(axis=(1, 2))
+    np.testing.assert_allclose(before - after, predicted, rtol=0.05)
+
+
+def test_gradient_rollout_equals_stepping(sim: Simulator) -> None:
+    u = actions()
+    result = sim.rollout(u)
+    end = sim.state()
+    sim.reset()
+    for t in range(STEPS):
+        sim.step(u[:, t])
+        np.testing.assert_allclose(sim.losses(), result.step_terms[:, t], rtol=1e-5)
+    np.testing.assert_allclose(sim.state().x, end.x, atol=1e-6)
+    np.testing.assert_allclose(sim.state().poses, end.poses, atol=1e-12)
+
+
+def test_mass_is_conserved_and_state_round_trips(sim: Simulator) -> None:
+    sim.reset()
+    start = sim.state()
+    sim.step(actions()[:, 0])
+    moved = sim.state()
+    np.testing.assert_allclose(sim.mass_tensor().sum(axis=(1, 2, 3)), 300 * SCENES[0].particle_mass, rtol=1e-5)
+    assert np.abs(moved.x - start.x).max() > 1e-5
+    sim.set_state(start)
+    sim.step(actions()[:, 0])
+    np.testing.assert_allclose(sim.state().x, moved.x, atol=1e-6)
+
+
+def test_actions_are_clipped(sim: Simulator) -> None:
+    u = np.full((len(SCENES), 6), 3.0)
+    sim.reset()
+    sim.step(u)
+    far = sim.state().poses
+    sim.reset()
+    sim.step(np.clip(u, -1, 1))
+    np.testing.assert_array_equal(sim.state().poses, far)
+
+
+def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
+    sim.reset()
+    with pytest.raises(ValueError, match=r"actions have shape \(3, 1, 5\), not \(3, 1, 6\)"):
+        sim.step(np.zeros((3, 5)))
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        sim.step(np.full((3, 6), math.nan))
+    with pytest.raises(ValueError, match="target mass has shape"):
+        sim.set_target(np.zeros((1, 2, 2, 2)), np.zeros((1, 2, 2, 2)))
+    state = sim.state()
+    state.v[1, 7, 0] = math.nan
+    sim.set_state(state)
+    with pytest.raises(SimulationError, match="environment 1, environment step 1, substep 1"):
+        sim.step(np.zeros((3, 6)))
+    sim.reset()
+    start = sim.state()
+    state.v[1, 7, 0] = math.nan
+    sim.set_initial_state(state)
+    with pytest.raises(SimulationError, match="environment 1"):
+        sim.rollout(actions())
+    sim.set_initial_state(start)
+    assert np.isfinite(sim.rollout(actions()).gradient).all()
+
+
+def test_memory_budget_is_named(sim: Simulator) -> None:
+    sim.memory_mb, before = 1e-3, sim.memory_mb
+    with pytest.raises(MemoryError, match=r"set sim.memory_mb=\d+ or more"):
+        sim.rollout(actions())
+    sim.memory_mb = before
+
+
+def test_bad_physics_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"stability limit .* use dt <= .* with substeps >= "):
+        replace(ball(), dt=0.1).validate()
+    with pytest.raises(SceneError, match="outside the domain"):
+        ball(center=(0.5, 0.95, 0.5)).validate()
+    with pytest.raises(SceneError, match="same manipulators"):
+        Simulator([ball(), replace(ball(), manipulators=())])
