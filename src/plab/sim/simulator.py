@@ -308,7 +308,13 @@ class Simulator:
             segments = -(-steps // length)
             return (length * self.substeps + 2 + (segments if segments > 1 else 0)) * self._slot_bytes()
 
-        fitting = [length for length in range(1, steps + 1) if cost(length) <= budget]
+        # Taichi counts the entries of an array in 32 bits.
+        slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
+        fitting = [
+            length
+            for length in range(1, steps + 1)
+            if cost(length) <= budget and max(length * self.substeps + 1, -(-steps // length)) <= slots
+        ]
         if not fitting:
             need = min(cost(length) for length in range(1, steps + 1)) / 1e6
             raise MemoryError(

@@ -131,7 +131,7 @@ class Storage:
         self.frame_gap = ti.field(real, shape=(b, self.substeps, m))
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
-        self.work = ti.Vector.field(4, real, shape=(b * self.particles if self.cuda else grids) * WORK)
+        self.work = ti.Vector.field(4, real, shape=1 if self.cuda else grids * WORK)
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
