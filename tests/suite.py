@@ -44,7 +44,12 @@ SCALES = {
     "Cylinder": (),
     "Box": (0.01, 0.01, 0.01, 0.04, 0.04, 0.04),
 }
-ROTATIONS = {"RollingPin": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0), "Torus": TILT, "Box": TILT, "Chopsticks": TILT}
+ROTATIONS = {
+    "RollingPin": (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
+    "Torus": TILT,
+    "Box": TILT,
+    "Chopsticks": TILT,
+}
 
 
 def manipulator(kind: str, near: bool) -> Manipulator:

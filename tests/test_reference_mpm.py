@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 import pytest
-import reference_mpm as ref
 import torch
 from torch import Tensor
 
+import reference_mpm as ref
 from plab.scene import Body, Manipulator, Scene
 
 torch.set_num_threads(1)

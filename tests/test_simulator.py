@@ -54,7 +54,11 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(device: str) -> N
     want = base.rollout(u)
     final = base.state()
     slot_mb = base._slot_bytes() / 1e6
-    for settings, batch in (({"threads": 1}, 3), ({"threads": 2}, 1), ({"threads": 2, "memory_mb": 13 * slot_mb}, 3)):
+    for settings, batch in (
+        ({"threads": 1}, 3),
+        ({"threads": 2}, 1),
+        ({"threads": 2, "memory_mb": 13 * slot_mb}, 3),
+    ):
         sim = simulator(SCENES[:batch], device, **settings)
         got = sim.rollout(u[:batch])
         np.testing.assert_array_equal(got.step_terms, want.step_terms[:batch], err_msg=str(settings))
@@ -97,7 +101,9 @@ def test_mass_is_conserved_and_state_round_trips(sim: Simulator) -> None:
     start = sim.state()
     sim.step(actions()[:, 0])
     moved = sim.state()
-    np.testing.assert_allclose(sim.mass_tensor().sum(axis=(1, 2, 3)), 300 * SCENES[0].particle_mass, rtol=1e-5)
+    np.testing.assert_allclose(
+        sim.mass_tensor().sum(axis=(1, 2, 3)), 300 * SCENES[0].particle_mass, rtol=1e-5
+    )
     assert np.abs(moved.x - start.x).max() > 1e-5
     sim.set_state(start)
     sim.step(actions()[:, 0])

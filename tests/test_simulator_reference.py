@@ -6,12 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-import reference_mpm as reference
 import torch
-from suite import batch
 
+import reference_mpm as reference
 from plab.scene import sample_particles
 from plab.sim import Simulator, State
+from suite import batch
 
 SCENES = batch()
 STEPS = 1
@@ -48,7 +48,8 @@ def rest_state(simulator: Simulator) -> State:
 def disturbed_state(simulator: Simulator, strain: float = 0.02) -> State:
     """A moving, strained start at which no two singular values are equal.
 
-    Strains of a few percent are the material's series; those of tens of percent its singular value decomposition.
+    Strains of a few percent are the material's series; those of tens of percent its singular value
+    decomposition.
     """
     rest = rest_state(simulator)
     rng = np.random.default_rng(11)
@@ -70,13 +71,21 @@ START = {
 
 
 def reference_state(state: State, e: int) -> reference.State:
-    return reference.State(*(torch.tensor(np.asarray(a[e])) for a in (state.x, state.v, state.C, state.F, state.poses)))
+    return reference.State(
+        *(torch.tensor(np.asarray(a[e])) for a in (state.x, state.v, state.C, state.F, state.poses))
+    )
 
 
 def reference_rollout(state: State, e: int, u: np.ndarray, alpha: float) -> tuple:
     mass, sdf = targets()
     return reference.rollout_loss(
-        SCENES[e], reference_state(state, e), torch.as_tensor(u), alpha, torch.tensor(mass[e]), torch.tensor(sdf[e]), WEIGHTS
+        SCENES[e],
+        reference_state(state, e),
+        torch.as_tensor(u),
+        alpha,
+        torch.tensor(mass[e]),
+        torch.tensor(sdf[e]),
+        WEIGHTS,
     )
 
 
@@ -114,7 +123,9 @@ def test_loss_terms_and_mass_agree(simulator: Simulator) -> None:
         np.testing.assert_allclose(tensors[e], reference.mass_tensor(scene, s.x).numpy(), atol=1e-15)
 
 
-@pytest.mark.parametrize(("contact", "start"), [("soft", "disturbed"), ("hard", "disturbed"), ("soft", "strained")])
+@pytest.mark.parametrize(
+    ("contact", "start"), [("soft", "disturbed"), ("hard", "disturbed"), ("soft", "strained")]
+)
 def test_gradients_agree_with_autograd(simulator: Simulator, contact: str, start: str) -> None:
     simulator.set_contact(contact)
     simulator.set_target(*targets())
@@ -153,7 +164,9 @@ def test_gradients_agree_with_central_differences(simulator: Simulator, contact:
     errors = []
     for h in (1e-3, 3e-4, 1e-4, 3e-5, 1e-5):
         near = weighted_losses(simulator, u + h * direction) - weighted_losses(simulator, u - h * direction)
-        far = weighted_losses(simulator, u + 2 * h * direction) - weighted_losses(simulator, u - 2 * h * direction)
+        far = weighted_losses(simulator, u + 2 * h * direction) - weighted_losses(
+            simulator, u - 2 * h * direction
+        )
         errors.append(np.abs((8 * near - far) / (12 * h) - slope) / np.abs(slope))
     best = np.min(errors, axis=0)
     assert best.max() < 1e-7, f"relative errors per environment: {best}"

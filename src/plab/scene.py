@@ -1,7 +1,7 @@
 """What is in a scene: bodies of plasticine, manipulators, material, floor.
 
-A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi, Hydra or
-Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start from it.
+A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi,
+Hydra or Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start from it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class ManipulatorShape:
 
     Attributes:
         size_names: Names of the entries of :attr:`Manipulator.size`, in order; all lengths [domain units].
-        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation) or ``static``.
+        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation) or
+            ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
     """
 
@@ -56,8 +57,9 @@ MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
     "Cylinder": ManipulatorShape(("radius", "half_height"), "static", ()),
     "Box": ManipulatorShape(("half_x", "half_y", "half_z"), "rigid", (*_XYZ, *_ROTATION)),
 }
-"""The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks (two parallel
-capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y), Box."""
+"""The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
+(two parallel capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y),
+Box."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ class Manipulator:
         size: Lengths named by ``MANIPULATOR_SHAPES[shape].size_names``.
         position: Position at t = 0.
         rotation: Unit quaternion (w, x, y, z) at t = 0.
-        scale: Motion over one environment step at action 1, one number per action component (lengths, or radians).
+        scale: Motion over one environment step at action 1, one number per action component (lengths, or
+            radians).
         friction: Coulomb friction coefficient with the plasticine.
         lower_bound: Lowest position, clamped after every substep.
         upper_bound: Highest position.
@@ -156,7 +159,8 @@ class Scene:
 
     @property
     def particle_volume(self) -> float:
-        """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab release.
+        """Volume per particle, (dx/2)^2: squared in three dimensions as well, as in the PlasticineLab
+        release.
 
         It cancels in the motion and only scales the mass tensor, hence the loss.
         """
@@ -224,7 +228,10 @@ class Scene:
         label = f"bodies[{number}]"
         _require(body.shape in ("sphere", "box"), f"{label}: shape '{body.shape}' is not one of sphere, box")
         entries = 1 if body.shape == "sphere" else 3
-        _require(len(body.size) == entries, f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}")
+        _require(
+            len(body.size) == entries,
+            f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}",
+        )
         _require(min(body.size) > 0, f"{label}: sizes must be positive, not {body.size}")
         _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
         top = 1.0 - 3.0 * self.dx
@@ -236,7 +243,8 @@ class Scene:
             half = body.half_extent()[axis]
             _require(
                 inside,
-                f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain 0 .. {top:.4g}: "
+                f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain "
+                f"0 .. {top:.4g}: "
                 f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
             )
 
@@ -253,11 +261,16 @@ class Scene:
         )
         _require(
             len(manipulator.scale) == manipulator.action_dim,
-            f"{label}: a {manipulator.shape} needs {manipulator.action_dim} scale(s), not {len(manipulator.scale)}",
+            f"{label}: a {manipulator.shape} needs {manipulator.action_dim} scale(s), "
+            f"not {len(manipulator.scale)}",
         )
         norm = math.sqrt(sum(c * c for c in manipulator.rotation))
-        _require(abs(norm - 1.0) < 1e-3, f"{label}: rotation has length {norm:.4g}, not 1: give a unit quaternion")
-        _require(manipulator.friction >= 0, f"{label}: friction {manipulator.friction:g} must not be negative")
+        _require(
+            abs(norm - 1.0) < 1e-3, f"{label}: rotation has length {norm:.4g}, not 1: give a unit quaternion"
+        )
+        _require(
+            manipulator.friction >= 0, f"{label}: friction {manipulator.friction:g} must not be negative"
+        )
 
 
 def _require(condition: bool, message: str) -> None:

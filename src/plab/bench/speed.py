@@ -2,7 +2,8 @@
 
     python -m plab.bench.speed task=Move sim.device=cuda --batch 1 64 --steps 10
 
-prints one row per batch size: first call (which compiles), and the median and spread of repeated calls after it.
+prints one row per batch size: first call (which compiles), and the median and spread of repeated calls after
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,18 @@ from plab.targets import build_target
 
 __all__ = ["main", "measure"]
 
-COLUMNS = ("task", "device", "precision", "batch", "what", "first_s", "median_ms", "min_ms", "max_ms", "steps_per_s")
+COLUMNS = (
+    "task",
+    "device",
+    "precision",
+    "batch",
+    "what",
+    "first_s",
+    "median_ms",
+    "min_ms",
+    "max_ms",
+    "steps_per_s",
+)
 
 
 def measure(call: Callable[[], object], repeats: int) -> tuple[float, np.ndarray]:
@@ -48,7 +60,8 @@ def rows(overrides: list[str], batch: int, steps: int, repeats: int) -> list[dic
         repeats: Timed rollouts after the first.
 
     Returns:
-        A row per kind of rollout; times are per environment step of the whole batch, results on the host included.
+        A row per kind of rollout; times are per environment step of the whole batch, results on the host
+        included.
     """
     cfg = load_config(overrides)
     scene = build_scene(cfg)
@@ -82,7 +95,9 @@ def rows(overrides: list[str], batch: int, steps: int, repeats: int) -> list[dic
 def main(argv: list[str] | None = None) -> None:
     """Parse the command line, measure, print, and write a CSV file if asked to."""
     parser = argparse.ArgumentParser(prog="plab.bench.speed", description=__doc__.splitlines()[0])
-    parser.add_argument("overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda")
+    parser.add_argument(
+        "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
+    )
     parser.add_argument("--batch", type=int, nargs="+", default=[1], help="numbers of environments")
     parser.add_argument("--steps", type=int, default=10, help="environment steps per rollout")
     parser.add_argument("--repeats", type=int, default=5, help="timed rollouts after the first")

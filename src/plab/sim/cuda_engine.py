@@ -40,7 +40,7 @@ class CudaEngine(CudaPhases):
         self.pose_threads = self.batch * max(1, self.manipulators)
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
 
-    # -- threads ---------------------------------------------------------------------------------------------
+    # -- threads ------------------------------------------------------------------------------------
 
     @ti.func
     def particle_of(self, q):
@@ -60,7 +60,7 @@ class CudaEngine(CudaPhases):
         e = entry // self.blocks
         return e, self.node_of_block(entry - e * self.blocks, q & NODE_MASK)
 
-    # -- public methods --------------------------------------------------------------------------------------
+    # -- public methods -----------------------------------------------------------------------------
 
     def step(
         self,
@@ -110,7 +110,7 @@ class CudaEngine(CudaPhases):
             self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1 + back)
         self.retreat_kernel(actions, actions_bar, t)
 
-    # -- kernels ---------------------------------------------------------------------------------------------
+    # -- kernels ------------------------------------------------------------------------------------
 
     @ti.kernel
     def advance_kernel(

@@ -139,7 +139,7 @@ class CudaPhases(Phases):
             ti.f64, shape=(self.batch * self.substeps, max(1, self.manipulators), FRAME_ADJOINT)
         )
 
-    # -- particles -------------------------------------------------------------------------------------------
+    # -- particles ----------------------------------------------------------------------------------
 
     @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, e, time):
@@ -197,7 +197,7 @@ class CudaPhases(Phases):
             self.affine[entry9 + 3 * i + 1][lane] = self.dx * (my[i] - fx[1] * m0[i])
             self.affine[entry9 + 3 * i + 2][lane] = self.dx * (mz[i] - fx[2] * m0[i])
 
-    # -- grid ------------------------------------------------------------------------------------------------
+    # -- grid ---------------------------------------------------------------------------------------
 
     @ti.func
     def take(self, grid: ti.template(), at):
@@ -223,7 +223,7 @@ class CudaPhases(Phases):
         """Add to a frame's adjoint; ``grid_index`` is the substep of an environment."""
         ti.atomic_add(self.frame_part[grid_index, m, entry], ti.cast(value, ti.f64))
 
-    # -- poses -----------------------------------------------------------------------------------------------
+    # -- poses --------------------------------------------------------------------------------------
 
     @ti.func
     def advance_manipulator(
@@ -255,7 +255,7 @@ class CudaPhases(Phases):
                 self.frame_part[e * self.substeps + s, m, i] = 0.0
             self.retreat_manipulator(e, m, s, actions, actions_bar, t)
 
-    # -- losses ----------------------------------------------------------------------------------------------
+    # -- losses -------------------------------------------------------------------------------------
 
     @ti.func
     def note_distances(self, e, particle, x):

@@ -1,8 +1,9 @@
 """Kernels: the phases of a substep put together for the CPU and for CUDA.
 
-On the CPU one launch does a whole environment step. A team of threads works on one environment, meeting at barriers
-between phases (a launch costs a hundred microseconds of waking threads, a barrier less than one); with more environments
-than threads every thread has environments of its own. On CUDA each phase of a substep is one launch over all environments.
+On the CPU one launch does a whole environment step. A team of threads works on one environment, meeting at
+barriers between phases (a launch costs a hundred microseconds of waking threads, a barrier less than one);
+with more environments than threads every thread has environments of its own. On CUDA each phase of a substep
+is one launch over all environments.
 """
 
 import time
@@ -24,7 +25,8 @@ __all__ = ["CpuEngine"]
 BLOCK_NODES = BLOCK**3
 
 SPLIT = 512
-"""Taichi hands out CPU loops in chunks of at least this many iterations; one iteration in each does a thread's work."""
+"""Taichi hands out CPU loops in chunks of at least this many iterations; one iteration in each does a
+thread's work."""
 
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
@@ -36,8 +38,8 @@ PROBE = 50
 class TeamChoice:
     """Chooses between the largest team of threads and none for a kernel's launches, by what they take.
 
-    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins. Results do
-    not depend on the choice.
+    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
+    Results do not depend on the choice.
     """
 
     def __init__(self, largest: int) -> None:
@@ -80,8 +82,8 @@ class Phases(ParticlePhases, GridPhases, PosePhases, LossPhases):
 class CpuEngine(Phases):
     """Kernels for the CPU.
 
-    The public methods are :meth:`step`, :meth:`losses`, :meth:`step_adjoint`, :meth:`place`, :meth:`export_mass` and
-    :meth:`copy_slot`; :class:`plab.sim.cuda_engine.CudaEngine` has the same.
+    The public methods are :meth:`step`, :meth:`losses`, :meth:`step_adjoint`, :meth:`place`,
+    :meth:`export_mass` and :meth:`copy_slot`; :class:`plab.sim.cuda_engine.CudaEngine` has the same.
     """
 
     def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
@@ -98,10 +100,11 @@ class CpuEngine(Phases):
         self._teams["losses"].run(self.losses_kernel, args)
 
     def step_adjoint(self, *args: object) -> None:
-        """Adjoint of one environment step; arguments as for :meth:`step_adjoint_kernel` after the team's size."""
+        """Adjoint of one environment step; arguments as for :meth:`step_adjoint_kernel` after the team's
+        size."""
         self._teams["step_adjoint"].run(self.step_adjoint_kernel, args)
 
-    # -- threads ---------------------------------------------------------------------------------------------------
+    # -- threads ------------------------------------------------------------------------------------
 
     @ti.func
     def barrier(self, team, size):
@@ -128,7 +131,7 @@ class CpuEngine(Phases):
         """First entry of a chunk's share of the environment's block list."""
         return e * self.blocks + c * self.block_count[e] // self.chunks
 
-    # -- phases of one chunk ---------------------------------------------------------------------------------------
+    # -- phases of one chunk ------------------------------------------------------------------------
 
     @ti.func
     def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
@@ -137,7 +140,9 @@ class CpuEngine(Phases):
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             entry9 = (e * self.tiles + tile) * 9
-            self.material_tile(state, source, self.tile_entry(after, e, tile), entry9, e, grid_index * STAGE, True)
+            self.material_tile(
+                state, source, self.tile_entry(after, e, tile), entry9, e, grid_index * STAGE, True
+            )
             for lane in range(self.lanes_of(tile)):
                 base, fx = self.stencil(self.vector(state, source, lane))
                 self.mark(grid_index, base, stamp)
@@ -145,7 +150,8 @@ class CpuEngine(Phases):
 
     @ti.func
     def grid_chunk(self, e, c, s):
-        """Grid update of a share of the environment's blocks; the private grids are cleared for the next substep."""
+        """Grid update of a share of the environment's blocks; the private grids are cleared for the next
+        substep."""
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
             holders = self.block_chunks[e * self.blocks + block]
@@ -193,7 +199,9 @@ class CpuEngine(Phases):
                 self.mark(grid_index, base, stamp)
                 self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
                 h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
-                self.scatter(self.velocity_bar, grid_index * self.nodes + self.node_index(base), spline(fx), h)
+                self.scatter(
+                    self.velocity_bar, grid_index * self.nodes + self.node_index(base), spline(fx), h
+                )
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
@@ -227,7 +235,7 @@ class CpuEngine(Phases):
                 )
             self.material_tile_adjoint(state, source, bar, entry, entry9, e, (e * self.chunks + c) * STAGE)
 
-    # -- losses of one chunk ---------------------------------------------------------------------------------------
+    # -- losses of one chunk ------------------------------------------------------------------------
 
     @ti.func
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
@@ -270,7 +278,8 @@ class CpuEngine(Phases):
 
     @ti.func
     def join_losses(self, e, terms: ti.template(), at):
-        """Sum the chunks' parts into three unweighted terms; the nearest particles go to chunk 0's entries."""
+        """Sum the chunks' parts into three unweighted terms; the nearest particles go to chunk 0's
+        entries."""
         part = ti.Vector.zero(ti.f64, 2)
         for c in range(self.chunks):
             part += self.loss_part[e, c]
@@ -286,7 +295,9 @@ class CpuEngine(Phases):
         terms[at + 2] = self.contact_term(e)
 
     @ti.func
-    def losses_of_team(self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at):
+    def losses_of_team(
+        self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at
+    ):
         """Loss terms of one environment."""
         for r in range(self.rounds(rank, size)):
             self.scatter_mass_chunk(state, slot, e, rank + r * size, stamp)
@@ -334,7 +345,7 @@ class CpuEngine(Phases):
                         for i in ti.static(range(3)):
                             bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
 
-    # -- kernels ---------------------------------------------------------------------------------------------------
+    # -- kernels ------------------------------------------------------------------------------------
 
     @ti.kernel
     def step_kernel(
@@ -350,7 +361,8 @@ class CpuEngine(Phases):
         pose_after: ti.i32,
         stamp: ti.i32,
     ):
-        """One environment step from time slot ``slot``; each substep moves on by ``stride`` slots (0: in place)."""
+        """One environment step from time slot ``slot``; each substep moves on by ``stride`` slots (0: in
+        place)."""
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
@@ -365,9 +377,7 @@ class CpuEngine(Phases):
                     for s in range(self.substeps):
                         before = slot + s * stride
                         for r in range(self.rounds(rank, size)):
-                            self.scatter_chunk(
-                                state, before, before + stride, e, rank + r * size, stamp + s
-                            )
+                            self.scatter_chunk(state, before, before + stride, e, rank + r * size, stamp + s)
                         self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, stamp + s)
@@ -416,9 +426,11 @@ class CpuEngine(Phases):
         t: ti.i32,
         stamp: ti.i32,
     ):
-        """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of its loss.
+        """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of
+        its loss.
 
-        ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar`` likewise.
+        ``bar`` goes from the adjoint of the state after the step to that of the state before it,
+        ``pose_bar`` likewise.
         """
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
@@ -457,9 +469,7 @@ class CpuEngine(Phases):
                         if rank == 0:
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
                         for r in range(self.rounds(rank, size)):
-                            self.gather_chunk_adjoint(
-                                state, slot + s, slot + s + 1, bar, e, rank + r * size
-                            )
+                            self.gather_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, rank + r * size)
                         self.barrier(team, size)
 
     @ti.kernel
@@ -480,7 +490,13 @@ class CpuEngine(Phases):
                         out[index] = self.velocity[e * self.nodes + self.linear(i)][0]
 
     @ti.kernel
-    def copy_slot(self, source: ti.types.ndarray(ndim=1), source_slot: ti.i32, target: ti.types.ndarray(ndim=1), target_slot: ti.i32):
+    def copy_slot(
+        self,
+        source: ti.types.ndarray(ndim=1),
+        source_slot: ti.i32,
+        target: ti.types.ndarray(ndim=1),
+        target_slot: ti.i32,
+    ):
         """Copy the particle state of all environments between time slots."""
         size = self.batch * self.tiles * STATE
         for i in range(size):

@@ -1,4 +1,5 @@
-"""Phases of a substep that run over grid nodes: gravity, contact with the manipulators, walls; and their adjoints."""
+"""Phases of a substep that run over grid nodes: gravity, contact with the manipulators, walls; and their
+adjoints."""
 
 import math
 
@@ -84,7 +85,7 @@ class GridPhases(Storage):
                     mask = mask | (1 << m)
         return mask
 
-    # -- contact ---------------------------------------------------------------------------------------------------
+    # -- contact ------------------------------------------------------------------------------------
 
     @ti.func
     def rigid_velocity(self, m_turns: ti.template(), e, s, m, p):
@@ -96,7 +97,8 @@ class GridPhases(Storage):
 
     @ti.func
     def slide(self, r, normal, friction):
-        """Relative velocity after full contact: no normal part, the tangential one reduced by Coulomb friction."""
+        """Relative velocity after full contact: no normal part, the tangential one reduced by Coulomb
+        friction."""
         rn = r.dot(normal)
         t = r - rn * normal
         length = t.norm()
@@ -158,7 +160,9 @@ class GridPhases(Storage):
                 d_bar = 0.0 * d
                 if d > 0.0:
                     d_bar = -self.alpha[None] * strength * bar.dot(t - r)
-                self.frame_adjoint(shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar)
+                self.frame_adjoint(
+                    shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar
+                )
                 out = r_bar
         return out
 
@@ -166,7 +170,8 @@ class GridPhases(Storage):
     def frame_adjoint(
         self, shape: ti.template(), grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, u_bar
     ):
-        """Accumulate the adjoint of manipulator m's frame from those of normal, distance and rigid velocity."""
+        """Accumulate the adjoint of manipulator m's frame from those of normal, distance and rigid
+        velocity."""
         if ti.static(shape != "Cylinder"):
             rotation = self.frame_rotation[e, s, m]
             size = self.size[e, m]
@@ -200,7 +205,7 @@ class GridPhases(Storage):
         else:
             self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
-    # -- walls -----------------------------------------------------------------------------------------------------
+    # -- walls --------------------------------------------------------------------------------------
 
     @ti.func
     def wall_free(self, i, v, axis: ti.template()):
@@ -278,14 +283,18 @@ class GridPhases(Storage):
             out = self.wall_free_adjoint(i, v1, out, 1)
         return self.wall_free_adjoint(i, v, out, 0)
 
-    # -- one node --------------------------------------------------------------------------------------------------
+    # -- one node -----------------------------------------------------------------------------------
 
     @ti.func
     def free_velocity(self, e, total):
         """Velocity of a node of positive mass after gravity, from its momentum and mass."""
         p = self.material[e]
         return ti.Vector(
-            [total[0] / total[3] + self.dt * p[4], total[1] / total[3] + self.dt * p[5], total[2] / total[3] + self.dt * p[6]]
+            [
+                total[0] / total[3] + self.dt * p[4],
+                total[1] / total[3] + self.dt * p[5],
+                total[2] / total[3] + self.dt * p[6],
+            ]
         )
 
     @ti.func

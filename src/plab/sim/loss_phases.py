@@ -1,7 +1,7 @@
 """Mass tensor and loss terms of a state, and their adjoint.
 
-The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to the layer
-below the domain counts at the face's node, so that the tensor holds all mass.
+The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to
+the layer below the domain counts at the face's node, so that the tensor holds all mass.
 """
 
 import taichi as ti
@@ -81,11 +81,15 @@ class LossPhases(Storage):
                     at = self.folded_node(base, i, j, k)
                     value = grid[e * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]][3]
                     out += value * ti.Vector(
-                        [dw[i][0] * w[j][1] * w[k][2], w[i][0] * dw[j][1] * w[k][2], w[i][0] * w[j][1] * dw[k][2]]
+                        [
+                            dw[i][0] * w[j][1] * w[k][2],
+                            w[i][0] * dw[j][1] * w[k][2],
+                            w[i][0] * w[j][1] * dw[k][2],
+                        ]
                     )
         return (self.mass * self.inv_dx) * out
 
-    # -- contact term ----------------------------------------------------------------------------------------------
+    # -- contact term -------------------------------------------------------------------------------
 
     @ti.func
     def pose_rotation(self, e, m):
@@ -119,7 +123,8 @@ class LossPhases(Storage):
 
     @ti.func
     def contact_adjoint_at(self, shape: ti.template(), e, m, x):
-        """Adjoint of the nearest particle's position under the weighted contact term; pose_bar is accumulated."""
+        """Adjoint of the nearest particle's position under the weighted contact term; pose_bar is
+        accumulated."""
         gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
         p = self.local_point(e, m, x)
         d, n = signed_distance(shape, p, self.size[e, m], gap)

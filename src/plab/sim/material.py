@@ -1,22 +1,26 @@
-"""Fixed-corotated elasticity with von Mises plasticity, and its adjoint, without a singular value decomposition.
+"""Fixed-corotated elasticity with von Mises plasticity, and its adjoint, without a singular value
+decomposition.
 
-With the trial deformation gradient ``G = (I + dt C) F``, ``J = det G`` and the unimodular left Cauchy-Green tensor
-``b = J^(-2/3) G G^T``, the deviatoric Hencky strain is ``d = log(b) / 2``. von Mises return mapping scales it by
-``k = min(1, (yield / 2 mu) / |d|)``; so ``F' = exp((k - 1) d) G`` and the Kirchhoff stress of the fixed-corotated model
-is ``tau = 2 mu (V^2 - V) + lambda J (J - 1) I`` with ``V = J^(1/3) exp(k d)``. That is what an SVD of G would give.
+With the trial deformation gradient ``G = (I + dt C) F``, ``J = det G`` and the unimodular left Cauchy-Green
+tensor ``b = J^(-2/3) G G^T``, the deviatoric Hencky strain is ``d = log(b) / 2``. von Mises return mapping
+scales it by ``k = min(1, (yield / 2 mu) / |d|)``; so ``F' = exp((k - 1) d) G`` and the Kirchhoff stress of
+the fixed-corotated model is ``tau = 2 mu (V^2 - V) + lambda J (J - 1) I`` with ``V = J^(1/3) exp(k d)``.
+That is what an SVD of G would give.
 
-Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to rounding, evaluated
-by Cayley-Hamilton as polynomials of degree two in the matrix with scalar recurrences for their coefficients:
+Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
+rounding, evaluated by Cayley-Hamilton as polynomials of degree two in the matrix with scalar recurrences for
+their coefficients:
 
-* ``log``: ``d = atanh(Z)`` with ``Z = I - 2 (b + I)^-1``, the odd series in Z. By Cayley-Hamilton, one factor of Z^2
-  maps the coefficients of (I, Z, Z^2) linearly; Horner's rule runs over these maps.
+* ``log``: ``d = atanh(Z)`` with ``Z = I - 2 (b + I)^-1``, the odd series in Z. By Cayley-Hamilton, one
+  factor of Z^2 maps the coefficients of (I, Z, Z^2) linearly; Horner's rule runs over these maps.
 * ``exp``: d is traceless, so ``d^3 = q d + D I`` with ``q = tr(d^2) / 2`` and ``D = det d``.
 
-Their adjoints are those of the scalar recurrences. Where ``|Z|`` or J leave the range in which the series are exact to
-rounding, :mod:`plab.sim.spectral` takes over with an SVD.
+Their adjoints are those of the scalar recurrences. Where ``|Z|`` or J leave the range in which the series
+are exact to rounding, :mod:`plab.sim.spectral` takes over with an SVD.
 
-The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed, and so that each
-part is small enough for LLVM to vectorise. Components are scalars or lanes, see :mod:`plab.sim.linalg`.
+The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed, and
+so that each part is small enough for LLVM to vectorise. Components are scalars or lanes, see
+:mod:`plab.sim.linalg`.
 """
 
 import math
@@ -27,7 +31,6 @@ import taichi as ti
 from plab.sim.linalg import (
     cofactor,
     cofactor_sym,
-    det,
     det_sym,
     dot_sym,
     inverse_sym,
@@ -82,7 +85,8 @@ class Series:
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
-        """The numbers of terms for ``float32`` or ``float64``: truncation errors below rounding at |Z| = 0.12."""
+        """The numbers of terms for ``float32`` or ``float64``: truncation errors below rounding at |Z| =
+        0.12."""
         return cls(4, 6, 3) if precision == "float32" else cls(9, 11, 4)
 
 
@@ -98,7 +102,8 @@ def inverse_cbrt(j, steps: ti.template()):
 
 @ti.func
 def log_horner(i1, i2, i3, terms: ti.template()):
-    """Horner states of the atanh series: coefficients of (I, Z, Z^2) after each of ``terms`` steps, lowest order first.
+    """Horner states of the atanh series: coefficients of (I, Z, Z^2) after each of ``terms`` steps, lowest
+    order first.
 
     Entry 3 k + c of the returned list is coefficient c of sum over j >= k of Z^(2 (j - k)) / (2 j + 1).
     """
@@ -235,9 +240,7 @@ def hencky_strain(g: ti.template(), j, series: ti.template()):
     c = inverse_cbrt(j, series.cbrt_steps)
     c2 = c * c
     b = outer_sym(g)
-    w = inverse_sym(
-        (c2 * b[0] + 1.0, c2 * b[1] + 1.0, c2 * b[2] + 1.0, c2 * b[3], c2 * b[4], c2 * b[5])
-    )
+    w = inverse_sym((c2 * b[0] + 1.0, c2 * b[1] + 1.0, c2 * b[2] + 1.0, c2 * b[3], c2 * b[4], c2 * b[5]))
     z = (1.0 - 2.0 * w[0], 1.0 - 2.0 * w[1], 1.0 - 2.0 * w[2], -2.0 * w[3], -2.0 * w[4], -2.0 * w[5])
     y = square_sym(z)
     i1 = z[0] + z[1] + z[2]
@@ -316,7 +319,8 @@ def scaled_sum(a, x: ti.template(), b, y: ti.template()):
 
 @ti.func
 def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_bar):
-    """Adjoint of d from a polynomial's coefficients p1, p2 of d, d^2, the polynomial's adjoint, and those of q and det d."""
+    """Adjoint of d from a polynomial's coefficients p1, p2 of d, d^2, the polynomial's adjoint, and those of
+    q and det d."""
     quad = sym_product_twice(bar, d)
     cof = cofactor_sym(d)
     first = scaled_sum(p1, bar, p2, quad)
@@ -325,7 +329,9 @@ def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_
 
 
 @ti.func
-def stress_adjoint(d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yield_strain, series: ti.template()):
+def stress_adjoint(
+    d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yield_strain, series: ti.template()
+):
     """Adjoint of the stress: the first part of the adjoint of return mapping.
 
     Args:
@@ -365,7 +371,9 @@ def stress_adjoint(d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yie
     j3_bar = 2.0 * mu * (2.0 * j3 * v2_bar + v1_bar)
     e0_bar = 2.0 * v2 * (t0_bar * e0 + t1_bar * e1 + t2_bar * e2) - v1 * t0_bar
     e1_bar = 2.0 * v2 * (t0_bar * e2 * dk + t1_bar * (e0 + e2 * qk) + t2_bar * e1) - v1 * t1_bar
-    e2_bar = 2.0 * v2 * (t0_bar * e1 * dk + t1_bar * (e1 * qk + e2 * dk) + t2_bar * (e0 + e2 * qk)) - v1 * t2_bar
+    e2_bar = (
+        2.0 * v2 * (t0_bar * e1 * dk + t1_bar * (e1 * qk + e2 * dk) + t2_bar * (e0 + e2 * qk)) - v1 * t2_bar
+    )
     qk_bar, dk_bar = exp_coefficients_adjoint(qk, dk, e0_bar, e1_bar, e2_bar, series.exp_terms)
     qk_bar += v2 * (2.0 * t1_bar * e1 * e2 + t2_bar * e2 * e2)
     dk_bar += v2 * (2.0 * t0_bar * e1 * e2 + t1_bar * e2 * e2)
@@ -375,7 +383,9 @@ def stress_adjoint(d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yie
 
 
 @ti.func
-def flow_adjoint(d: ti.template(), g: ti.template(), f_new_bar: ti.template(), yield_strain, series: ti.template()):
+def flow_adjoint(
+    d: ti.template(), g: ti.template(), f_new_bar: ti.template(), yield_strain, series: ti.template()
+):
     """Adjoint of plastic flow F' = exp((k - 1) d) G: the second part of the adjoint of return mapping.
 
     Where nothing yields, the flow is the identity and this part is not needed.
@@ -409,7 +419,16 @@ def flow_adjoint(d: ti.template(), g: ti.template(), f_new_bar: ti.template(), y
 
 
 @ti.func
-def log_adjoint(z: ti.template(), a1, a2, d: ti.template(), d_bar: ti.template(), k_bar, yield_strain, series: ti.template()):
+def log_adjoint(
+    z: ti.template(),
+    a1,
+    a2,
+    d: ti.template(),
+    d_bar: ti.template(),
+    k_bar,
+    yield_strain,
+    series: ti.template(),
+):
     """Adjoint of Z under d = log(b) / 2: the third part of the adjoint of return mapping.
 
     Args:

@@ -1,8 +1,8 @@
 """Rigid motion of the manipulators and its adjoint.
 
-A pose is 8 numbers: position (3), unit quaternion w, x, y, z (4), gap (1). One substep applies 1 / substeps of the
-motion that an environment step's action asks for. Adjoints are written by hand: they are a few quaternion products.
-Everything here is float64 in both precisions; a manipulator is 8 numbers.
+A pose is 8 numbers: position (3), unit quaternion w, x, y, z (4), gap (1). One substep applies 1 / substeps
+of the motion that an environment step's action asks for. Adjoints are written by hand: they are a few
+quaternion products. Everything here is float64 in both precisions; a manipulator is 8 numbers.
 """
 
 import taichi as ti
@@ -16,7 +16,8 @@ __all__ = [
 ]
 
 ROLL_RADIUS = 0.03
-"""Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab release."""
+"""Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
+release."""
 
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
@@ -80,9 +81,21 @@ def rotation_matrix(q):
     """Rotation matrix of a unit quaternion, 3x3."""
     return mat3(
         [
-            [1 - 2 * (q[2] * q[2] + q[3] * q[3]), 2 * (q[1] * q[2] - q[0] * q[3]), 2 * (q[1] * q[3] + q[0] * q[2])],
-            [2 * (q[1] * q[2] + q[0] * q[3]), 1 - 2 * (q[1] * q[1] + q[3] * q[3]), 2 * (q[2] * q[3] - q[0] * q[1])],
-            [2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1]), 1 - 2 * (q[1] * q[1] + q[2] * q[2])],
+            [
+                1 - 2 * (q[2] * q[2] + q[3] * q[3]),
+                2 * (q[1] * q[2] - q[0] * q[3]),
+                2 * (q[1] * q[3] + q[0] * q[2]),
+            ],
+            [
+                2 * (q[1] * q[2] + q[0] * q[3]),
+                1 - 2 * (q[1] * q[1] + q[3] * q[3]),
+                2 * (q[2] * q[3] - q[0] * q[1]),
+            ],
+            [
+                2 * (q[1] * q[3] - q[0] * q[2]),
+                2 * (q[2] * q[3] + q[0] * q[1]),
+                1 - 2 * (q[1] * q[1] + q[2] * q[2]),
+            ],
         ]
     )
 
@@ -161,7 +174,8 @@ def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
 
 @ti.func
 def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap, bar):
-    """Adjoints of pose (8-vector) and u (7-vector) under :func:`advance_pose`, given the adjoint of its result."""
+    """Adjoints of pose (8-vector) and u (7-vector) under :func:`advance_pose`, given the adjoint of its
+    result."""
     pose_bar = bar
     u_bar = vec7(0.0)
     if ti.static(motion != "static"):

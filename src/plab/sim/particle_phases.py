@@ -1,4 +1,5 @@
-"""Phases of a substep that run over particles: material and scatter before the grid, gather after it; and adjoints."""
+"""Phases of a substep that run over particles: material and scatter before the grid, gather after it; and
+adjoints."""
 
 import taichi as ti
 
@@ -29,7 +30,9 @@ STAGE_D_BAR = 31
 STAGE_BARS = 37
 STAGE_G_BAR = 40
 
-REACHING = tuple(sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8))
+REACHING = tuple(
+    sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8)
+)
 """For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
 
 
@@ -42,7 +45,7 @@ def as_matrix(a: ti.template()):
 class ParticlePhases(Storage):
     """Material update, particle-to-grid and grid-to-particle transfers and their adjoints."""
 
-    # -- access to the particle state ------------------------------------------------------------------------------
+    # -- access to the particle state ---------------------------------------------------------------
 
     @ti.func
     def tile_entry(self, slot, e, tile):
@@ -84,7 +87,7 @@ class ParticlePhases(Storage):
             out[i] = ti.select(y[i] < 0.0 or y[i] > self.x_max, 0.0, 1.0)
         return out
 
-    # -- material --------------------------------------------------------------------------------------------------
+    # -- material -----------------------------------------------------------------------------------
 
     @ti.func
     def served(self, z_squared, j):
@@ -168,7 +171,9 @@ class ParticlePhases(Storage):
         for i in ti.static(range(9)):
             if ti.static(update):
                 state[target + 15 + i][lane] = f_new[i // 3, i % 3]
-            self.affine[entry9 + i][lane] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
+            self.affine[entry9 + i][lane] = (
+                self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
+            )
 
     @ti.func
     def material_particle(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
@@ -196,9 +201,11 @@ class ParticlePhases(Storage):
 
     @ti.func
     def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
-        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``), on the CPU.
+        """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``), on
+        the CPU.
 
-        Each part ends in stores to ``stage`` and stands in a basic block of its own: LLVM gives up on larger ones.
+        Each part ends in stores to ``stage`` and stands in a basic block of its own: LLVM gives up on larger
+        ones.
         """
         p = self.material[e]
         served = self.strain_tile(state, source, at)
@@ -239,7 +246,14 @@ class ParticlePhases(Storage):
         d = [self.stage[at + STAGE_D + i] for i in range(6)]
         tau_bar = self.stress_symmetric([self.affine[entry9 + i] for i in range(9)])
         d_bar, k_bar, c2_bar, j_bar = stress_adjoint(
-            d, self.stage[at + STAGE_SCALARS], self.stage[at + STAGE_SCALARS + 1], tau_bar, mu, lam, yield_strain, self.series
+            d,
+            self.stage[at + STAGE_SCALARS],
+            self.stage[at + STAGE_SCALARS + 1],
+            tau_bar,
+            mu,
+            lam,
+            yield_strain,
+            self.series,
         )
         _q, _det, _norm, k = yield_factor(d, yield_strain)
         for i in ti.static(range(6)):
@@ -266,7 +280,9 @@ class ParticlePhases(Storage):
             self.stage[at + STAGE_G_BAR + i] = g_bar[i]
 
     @ti.func
-    def strain_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at):
+    def strain_tile_adjoint(
+        self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at
+    ):
         """Adjoint of a tile's strain, from ``stage`` to C and F in ``bar``."""
         # A loop of one round, which LLVM cannot know: it keeps the two parts in blocks of their own.
         for _ in range(self.once[None]):
@@ -303,7 +319,9 @@ class ParticlePhases(Storage):
             bar[target + 15 + i] = self.stage[at + 9 + i]
 
     @ti.func
-    def spectral_material_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e):
+    def spectral_material_adjoint(
+        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
+    ):
         """:meth:`material_tile_adjoint` for one particle, by singular values."""
         p = self.material[e]
         c = as_matrix(self.load(state, source + 6, lane, 9))
@@ -320,7 +338,9 @@ class ParticlePhases(Storage):
             bar[target + 15 + i][lane] = f_bar[i // 3, i % 3]
 
     @ti.func
-    def material_particle_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e):
+    def material_particle_adjoint(
+        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
+    ):
         """:meth:`material_tile_adjoint` for one particle on CUDA."""
         p = self.material[e]
         c = self.load(state, source + 6, lane, 9)
@@ -349,7 +369,7 @@ class ParticlePhases(Storage):
         else:
             self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
 
-    # -- transfers -------------------------------------------------------------------------------------------------
+    # -- transfers ----------------------------------------------------------------------------------
 
     @ti.func
     def add(self, grid: ti.template(), node, value):
@@ -361,7 +381,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def scatter(self, grid: ti.template(), node, w: ti.template(), q: ti.template()):
-        """Scatter an affine field of 4-vectors: value at the base node q[0] and increments q[1:4] along x, y, z."""
+        """Scatter an affine field of 4-vectors: value at the base node q[0] and increments q[1:4] along x,
+        y, z."""
         for i in ti.static(range(3)):
             qi = q[0] + float(i) * q[1]
             for j in ti.static(range(3)):
@@ -467,24 +488,28 @@ class ParticlePhases(Storage):
         m0 = ti.Vector([self.work[at][0], self.work[at][1], self.work[at][2]])
         for i in ti.static(range(3)):
             slope = self.work[at + 4 + i].sum()
-            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from the scatter.
-            offsets = scale * (c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]) + (
-                a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2]
-            )
+            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
+            # the scatter.
+            offsets = scale * (
+                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
+            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
             bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope - offsets
             bar[target + 3 + i][lane] = self.mass * m0[i]
             for j in ti.static(range(3)):
                 self.affine[entry9 + 3 * i + j][lane] = self.dx * (self.work[at + 1 + j][i] - fx[j] * m0[i])
 
-    # -- which blocks hold mass ------------------------------------------------------------------------------------
+    # -- which blocks hold mass ---------------------------------------------------------------------
 
     @ti.func
     def block_of(self, base):
-        """Linear index of the block of a base node, and which axes its stencil crosses into the next block (3 bits)."""
+        """Linear index of the block of a base node, and which axes its stencil crosses into the next block
+        (3 bits)."""
         b = base >> BLOCK_BITS
         r = base & (BLOCK - 1)
         crossing = (
-            ti.select(r[0] >= BLOCK - 2, 1, 0) + ti.select(r[1] >= BLOCK - 2, 2, 0) + ti.select(r[2] >= BLOCK - 2, 4, 0)
+            ti.select(r[0] >= BLOCK - 2, 1, 0)
+            + ti.select(r[1] >= BLOCK - 2, 2, 0)
+            + ti.select(r[2] >= BLOCK - 2, 4, 0)
         )
         return (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2], crossing
 
@@ -492,7 +517,9 @@ class ParticlePhases(Storage):
     def neighbour(self, block, corner: ti.template()):
         """Linear index of the block one further along the axes whose bits are set in ``corner``."""
         shift = ti.static(
-            (corner & 1) * self.blocks_per_axis**2 + ((corner >> 1) & 1) * self.blocks_per_axis + ((corner >> 2) & 1)
+            (corner & 1) * self.blocks_per_axis**2
+            + ((corner >> 1) & 1) * self.blocks_per_axis
+            + ((corner >> 2) & 1)
         )
         return block + shift
 
@@ -511,7 +538,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def collect_blocks(self, e, stamp):
-        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing else."""
+        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing
+        else."""
         count = 0
         for c in range(self.chunks):
             grid_index = e * self.chunks + c
@@ -532,7 +560,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def mark_shared(self, e, base, stamp):
-        """Note on CUDA, where there is one list for all environments, that a particle touches the blocks around a node."""
+        """Note on CUDA, where there is one list for all environments, that a particle touches the blocks
+        around a node."""
         block, crossing = self.block_of(base)
         for corner in ti.static(range(8)):
             if (crossing & corner) == corner:

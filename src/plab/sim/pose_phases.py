@@ -39,7 +39,8 @@ class PosePhases(Storage):
 
     @ti.func
     def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
-        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot ``after``."""
+        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
+        ``after``."""
         for m in ti.static(range(self.manipulators)):
             entry = (before * self.batch + e) * self.manipulators + m
             for i in ti.static(range(8)):
@@ -47,7 +48,12 @@ class PosePhases(Storage):
             u = self.substep_motion(e, m, actions, t)
             for s in range(self.substeps):
                 self.pose[e, s + 1, m] = advance_pose(
-                    self.motions[m], self.pose[e, s, m], u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+                    self.motions[m],
+                    self.pose[e, s, m],
+                    u,
+                    self.low[e, m],
+                    self.high[e, m],
+                    self.minimal_gap[e, m],
                 )
                 self.set_frame(e, s, m)
             entry = (after * self.batch + e) * self.manipulators + m
@@ -64,7 +70,8 @@ class PosePhases(Storage):
 
     @ti.func
     def set_frame(self, e, s, m: ti.template()):
-        """Centre, rotation and rates of a manipulator in substep s; the rates are differences taken in float64."""
+        """Centre, rotation and rates of a manipulator in substep s; the rates are differences taken in
+        float64."""
         start = self.pose[e, s, m]
         end = self.pose[e, s + 1, m]
         r0 = rotation_matrix(quaternion(start))
@@ -89,7 +96,9 @@ class PosePhases(Storage):
         return bar
 
     @ti.func
-    def retreat_manipulator(self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t):
+    def retreat_manipulator(
+        self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t
+    ):
         """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
         frame = self.collect_frame_adjoint(e, m)
         inv_dt = ti.cast(1.0, ti.f64) / self.dt

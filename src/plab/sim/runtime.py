@@ -43,7 +43,7 @@ class Runtime:
     generation: int
 
     @property
-    def real(self):  # noqa: ANN201 - Taichi's data types have no public class
+    def real(self):
         """Taichi's type of particle and grid data."""
         return ti.f32 if self.precision == "float32" else ti.f64
 
@@ -62,8 +62,8 @@ def available_threads() -> int:
 def start_runtime(device: str, precision: str, threads: int | None = None) -> Runtime:
     """Initialise Taichi, or reuse what is there if it is the same.
 
-    Taichi is initialised once per process; another device, precision or number of threads starts it anew, which
-    invalidates every simulator made before.
+    Taichi is initialised once per process; another device, precision or number of threads starts it anew,
+    which invalidates every simulator made before.
 
     Args:
         device: ``cpu`` or ``cuda``.
@@ -83,21 +83,29 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     if precision not in PRECISIONS:
         raise ValueError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     wanted = 1 if device == "cuda" else max(1, threads or available_threads())
-    same = _current is not None and (_current.device, _current.precision, _current.threads) == (device, precision, wanted)
-    # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so that the
-    # next one starts from a fresh count when nothing is left of those before.
+    same = _current is not None and (_current.device, _current.precision, _current.threads) == (
+        device,
+        precision,
+        wanted,
+    )
+    # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so
+    # that the next one starts from a fresh count when nothing is left of those before.
     if same and len(_users) > 0:
         return _current
     _users.clear()
     if device == "cuda" and not cuda_available():
-        raise DeviceError("no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi")
+        raise DeviceError(
+            "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
+        )
     ti.init(
         arch=ti.cuda if device == "cuda" else ti.cpu,
         default_fp=ti.f32 if precision == "float32" else ti.f64,
         cpu_max_num_threads=wanted,
-        # Square roots in float64 on CUDA lose digits under fast_math; on the CPU it is what lets LLVM use FMA.
+        # Square roots in float64 on CUDA lose digits under fast_math; on the CPU it is what lets LLVM use
+        # FMA.
         fast_math=device == "cpu" or precision == "float32",
-        # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of them asserts.
+        # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of them
+        # asserts.
         advanced_optimization=False,
         offline_cache=True,
         log_level=ti.WARN,
@@ -115,8 +123,8 @@ def cuda_available() -> bool:
 def remember_source_positions() -> None:
     """Let Taichi format the source excerpt of an AST node once, not at every inlining.
 
-    The excerpts are for its error messages; formatting them is half of what compiling from a warm cache takes. Where a
-    future Taichi has no such method, nothing is changed.
+    The excerpts are for its error messages; formatting them is half of what compiling from a warm cache
+    takes. Where a future Taichi has no such method, nothing is changed.
     """
     from taichi.lang.ast import ast_transformer_utils
 

@@ -1,7 +1,8 @@
 """Signed distances of the manipulators in their own frames, with what the adjoint of contact needs of them.
 
-Every shape is three functions of a local point: the distance d, the outward normal n = grad d, and the product of the
-Hessian of d with a vector. They are all exact distances, so |n| = 1 and the broad phase may rely on it.
+Every shape is three functions of a local point: the distance d, the outward normal n = grad d, and the
+product of the Hessian of d with a vector. They are all exact distances, so |n| = 1 and the broad phase may
+rely on it.
 """
 
 import taichi as ti
@@ -133,7 +134,8 @@ def revolved_hessian_product(m, h, safe, radial, w):
 
 @ti.func
 def hessian_product(shape: ti.template(), p, size, gap, w):
-    """Hessian of the distance of a shape times w, in its own frame; arguments as for :func:`signed_distance`."""
+    """Hessian of the distance of a shape times w, in its own frame; arguments as for
+    :func:`signed_distance`."""
     out = p * 0.0
     if ti.static(shape in ("Torus", "Cylinder")):
         rho, safe, radial = planar(p[1], p[0], p[2])

@@ -58,8 +58,9 @@ class Rollout:
 class Simulator:
     """Differentiable elastoplastic MLS-MPM for a batch of environments.
 
-    All environments share the numbers of particles and manipulators, the manipulators' shapes, grid and time step;
-    positions, sizes, material and targets may differ. One process has one device and precision at a time.
+    All environments share the numbers of particles and manipulators, the manipulators' shapes, grid and time
+    step; positions, sizes, material and targets may differ. One process has one device and precision at a
+    time.
     """
 
     def __init__(
@@ -78,7 +79,8 @@ class Simulator:
             scenes: One scene per environment.
             precision: ``float32`` or ``float64``.
             device: ``cpu`` or ``cuda``.
-            memory_mb: Budget for the states kept for gradients [MB]; fewer are kept and more recomputed to stay in it.
+            memory_mb: Budget for the states kept for gradients [MB]; fewer are kept and more recomputed to
+                stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
 
@@ -108,14 +110,15 @@ class Simulator:
         positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
         self._order = np.stack([_cell_order(x, scenes[0].grid_size) for x in positions])
         self._initial_poses = np.array(
-            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes], dtype=np.float64
+            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
+            dtype=np.float64,
         ).reshape(self.batch, self.manipulator_count, 8)
         self._initial.from_numpy(self._pack(_rest_state(np.stack(positions), self._initial_poses)))
         self.set_contact("soft")
         self.set_loss_weights(10.0, 10.0, 1.0)
         self.reset()
 
-    # -- sizes -----------------------------------------------------------------------------------------------------
+    # -- sizes --------------------------------------------------------------------------------------
 
     @property
     def batch(self) -> int:
@@ -147,7 +150,7 @@ class Simulator:
         """Substeps per environment step."""
         return self.scenes[0].substeps
 
-    # -- settings --------------------------------------------------------------------------------------------------
+    # -- settings -----------------------------------------------------------------------------------
 
     def set_contact(self, model: str, softness: float = 666.0) -> None:
         """Choose the contact model; nothing is compiled anew.
@@ -185,7 +188,7 @@ class Simulator:
         sums = np.asarray(mass, self._numpy_real).astype(np.float64).sum(axis=(1, 2, 3))
         self._engine.target_sum.from_numpy(sums)
 
-    # -- forward ---------------------------------------------------------------------------------------------------
+    # -- forward ------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Put all environments into their initial states."""
@@ -256,7 +259,7 @@ class Simulator:
         self._engine.export_mass(out)
         return out.reshape(self.batch, n, n, n).astype(np.float64)
 
-    # -- state -----------------------------------------------------------------------------------------------------
+    # -- state --------------------------------------------------------------------------------------
 
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
@@ -277,7 +280,9 @@ class Simulator:
         expected = (self.batch, self.particle_count)
         for name, tail in (("x", (3,)), ("v", (3,)), ("C", (3, 3)), ("F", (3, 3))):
             if np.shape(getattr(state, name)) != (*expected, *tail):
-                raise ValueError(f"{name} has shape {np.shape(getattr(state, name))}, not {(*expected, *tail)}")
+                raise ValueError(
+                    f"{name} has shape {np.shape(getattr(state, name))}, not {(*expected, *tail)}"
+                )
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
         self._current.from_numpy(self._pack(state))
@@ -285,12 +290,13 @@ class Simulator:
         self._engine.fault.fill(0)
 
     def set_initial_state(self, state: State) -> None:
-        """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in :class:`State`."""
+        """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
+        :class:`State`."""
         self.set_state(state)
         self._initial_poses = np.array(state.poses, np.float64)
         self._engine.copy_slot(self._current, 0, self._initial, 0)
 
-    # -- internals -------------------------------------------------------------------------------------------------
+    # -- internals ----------------------------------------------------------------------------------
 
     def _state_array(self, slots: int) -> ti.Ndarray:
         engine = self._engine
@@ -301,7 +307,8 @@ class Simulator:
         return self.batch * engine.tiles * STATE * engine.lanes * np.dtype(self._numpy_real).itemsize
 
     def _plan(self, steps: int) -> int:
-        """Environment steps per segment whose every state is kept, so that all fits into the memory budget."""
+        """Environment steps per segment whose every state is kept, so that all fits into the memory
+        budget."""
         budget = self.memory_mb * 1e6
 
         def cost(length: int) -> int:
@@ -318,7 +325,8 @@ class Simulator:
         if not fitting:
             need = min(cost(length) for length in range(1, steps + 1)) / 1e6
             raise MemoryError(
-                f"the gradient of {steps} steps needs at least {need:.0f} MB, but memory_mb is {self.memory_mb:g}: "
+                f"the gradient of {steps} steps needs at least {need:.0f} MB, but memory_mb is "
+                f"{self.memory_mb:g}: "
                 f"set sim.memory_mb={need:.0f} or more"
             )
         # Fewest recomputed steps first: as few segments as possible, of even length.
@@ -332,12 +340,14 @@ class Simulator:
         if self._history is None or self._history.shape[0] < size:
             self._history = None
             self._history = self._state_array(slots)
-        if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * self._current.shape[0]):
+        if segments > 1 and (
+            self._checkpoints is None or self._checkpoints.shape[0] < segments * self._current.shape[0]
+        ):
             self._checkpoints = self._state_array(segments)
         if self._bar is None:
             self._bar = self._state_array(1)
 
-    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> None:  # noqa: ANN001
+    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> None:
         if length is None:
             for t in range(steps):
                 self._advance(self._current, 0, 0, t, actions, poses)
@@ -362,7 +372,7 @@ class Simulator:
         end = (steps - (segments - 1) * length) * self.substeps
         self._engine.copy_slot(self._history, end, self._current, 0)
 
-    def _run_backward(self, actions, poses, steps: int, length: int) -> np.ndarray:  # noqa: ANN001
+    def _run_backward(self, actions, poses, steps: int, length: int) -> np.ndarray:
         segments = -(-steps // length)
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
         actions_bar.fill(0.0)
@@ -393,13 +403,15 @@ class Simulator:
         for t in reversed(range(steps)):
             bad = np.flatnonzero(~np.isfinite(gradient[:, t]).all(axis=1))
             if bad.size:
-                raise SimulationError(f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}")
+                raise SimulationError(
+                    f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}"
+                )
         return gradient
 
-    def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:  # noqa: ANN001
+    def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
         self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
 
-    def _losses(self, state, slot: int, terms, at: int) -> None:  # noqa: ANN001
+    def _losses(self, state, slot: int, terms, at: int) -> None:
         self._engine.losses(state, slot, terms, at, self._take_stamps(1))
 
     def _place(self, poses: np.ndarray) -> None:
@@ -435,19 +447,23 @@ class Simulator:
         if bad.size:
             step, substep = divmod(int(faults[bad[0]]) - 1, self.substeps)
             raise SimulationError(
-                f"the state is not finite or a particle crosses the domain in one substep: environment {bad[0]}, "
+                f"the state is not finite or a particle crosses the domain in one substep: "
+                f"environment {bad[0]}, "
                 f"environment step {step + 1}, substep {substep + 1}"
             )
 
     def _check_terms(self, terms: np.ndarray) -> None:
         bad = np.argwhere(~np.isfinite(terms))
         if bad.size:
-            raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, environment step {bad[0][0]}")
+            raise SimulationError(
+                f"the loss is not finite: environment {bad[0][1]}, environment step {bad[0][0]}"
+            )
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
             raise RuntimeError(
-                "this simulator's memory is gone: Taichi was started anew with another device, precision or number of "
+                "this simulator's memory is gone: Taichi was started anew with another device, precision or "
+                "number of "
                 "threads; build the simulator again"
             )
 
@@ -466,12 +482,20 @@ class Simulator:
     def _unpack(self, tiles: np.ndarray, poses: np.ndarray) -> State:
         engine = self._engine
         b, n = self.batch, self.particle_count
-        flat = tiles.reshape(b, engine.tiles, STATE, engine.lanes).transpose(0, 1, 3, 2).reshape(b, -1, STATE)[:, :n]
+        flat = (
+            tiles.reshape(b, engine.tiles, STATE, engine.lanes)
+            .transpose(0, 1, 3, 2)
+            .reshape(b, -1, STATE)[:, :n]
+        )
         values = np.empty((b, n, STATE))
         np.put_along_axis(values, self._order[:, :, None], flat.astype(np.float64), axis=1)
         shape = (b, n, 3, 3)
         return State(
-            values[..., 0:3], values[..., 3:6], values[..., 6:15].reshape(shape), values[..., 15:24].reshape(shape), poses
+            values[..., 0:3],
+            values[..., 3:6],
+            values[..., 6:15].reshape(shape),
+            values[..., 15:24].reshape(shape),
+            poses,
         )
 
 
@@ -490,7 +514,8 @@ def _unit(rotation: Sequence[float]) -> list[float]:
 
 
 def _cell_order(x: np.ndarray, n: int) -> np.ndarray:
-    """Permutation that sorts particles by block and by cell, so that neighbours in memory share grid nodes."""
+    """Permutation that sorts particles by block and by cell, so that neighbours in memory share grid
+    nodes."""
     cell = np.floor(x * n - 0.5).astype(np.int64) + 1
     block = cell // 4
     key = (block[:, 0] * n + block[:, 1]) * n + block[:, 2]
@@ -514,4 +539,6 @@ def _require_alike(scenes: Sequence[Scene]) -> None:
                     f"scene {number} has {getattr(scene, name)}"
                 )
         if [m.shape for m in scene.manipulators] != [m.shape for m in first.manipulators]:
-            raise SceneError(f"scenes of one batch need the same manipulators; scene {number} differs from scene 0")
+            raise SceneError(
+                f"scenes of one batch need the same manipulators; scene {number} differs from scene 0"
+            )

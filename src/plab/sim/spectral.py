@@ -1,8 +1,9 @@
-"""The material update by singular values, for strains outside the range of the series in :mod:`plab.sim.material`.
+"""The material update by singular values, for strains outside the range of the series in
+:mod:`plab.sim.material`.
 
-Reached by few particles (strong compression, inverted or nearly singular F, stiff materials that do not yield), so it is
-written for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the smallest singular value
-carries the sign of det F) and a derivative in divided differences with their limits.
+Reached by few particles (strong compression, inverted or nearly singular F, stiff materials that do not
+yield), so it is written for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the
+smallest singular value carries the sign of det F) and a derivative in divided differences with their limits.
 """
 
 import taichi as ti
@@ -48,7 +49,8 @@ def svd_signed(f):
     v = f * 0.0
     for i in ti.static(range(3)):
         v[i, i] = 1.0
-    # Hestenes: rotate pairs of columns until they are orthogonal; six sweeps reach rounding for any 3x3 matrix.
+    # Hestenes: rotate pairs of columns until they are orthogonal; six sweeps reach rounding for any 3x3
+    # matrix.
     for _ in range(6):
         for p, q in ti.static(((0, 1), (0, 2), (1, 2))):
             alpha = a[0, p] * a[0, p] + a[1, p] * a[1, p] + a[2, p] * a[2, p]
@@ -98,7 +100,8 @@ def mapped_values(s, mu, lam, yield_strain):
     """Return mapping of singular values.
 
     Returns:
-        g: new singular values; t: eigenvalues of tau; e: clamped Hencky strains; k: factor of their deviator; n: |dev|.
+        g: new singular values; t: eigenvalues of tau; e: clamped Hencky strains; k: factor of their
+            deviator; n: |dev|.
     """
     e = s * 0.0
     for i in ti.static(range(3)):
@@ -151,7 +154,8 @@ def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_stra
         mu: Shear modulus.
         lam: Lame's lambda.
         yield_strain: Yield stress / (2 mu).
-        tiny: Relative difference of two singular values below which a divided difference is taken at its limit.
+        tiny: Relative difference of two singular values below which a divided difference is taken at its
+            limit.
 
     Returns:
         Adjoint of f_trial, 3x3.

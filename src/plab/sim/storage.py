@@ -1,13 +1,15 @@
 """Memory of the batched simulator: constants fixed when it is built, and Taichi fields.
 
-Layout. Particle state is one array of tiles: a tile holds ``lanes`` particles, each of its 24 entries a vector of lanes
-(x 0:3, v 3:6, C 6:15, F 15:24), so that the material update runs on SIMD registers on the CPU and loads coalesce on CUDA.
-Tile t of environment e at time slot s is entry ``((s * batch + e) * tiles + t) * 24 + component``.
+Layout. Particle state is one array of tiles: a tile holds ``lanes`` particles, each of its 24 entries a
+vector of lanes (x 0:3, v 3:6, C 6:15, F 15:24), so that the material update runs on SIMD registers on the
+CPU and loads coalesce on CUDA. Tile t of environment e at time slot s is entry ``((s * batch + e) * tiles +
+t) * 24 + component``.
 
-Grids are dense in memory and sparse in use: only blocks of 4^3 nodes that hold mass are read, written and cleared. Array
-index i along an axis is node i - 1: the layer below the domain is there because particles within dx/2 of the floor
-reach it. On the CPU an environment's particles are split into ``chunks`` of consecutive particles with a private grid each,
-so that scattering needs no atomics and its result does not depend on the number of threads.
+Grids are dense in memory and sparse in use: only blocks of 4^3 nodes that hold mass are read, written and
+cleared. Array index i along an axis is node i - 1: the layer below the domain is there because particles
+within dx/2 of the floor reach it. On the CPU an environment's particles are split into ``chunks`` of
+consecutive particles with a private grid each, so that scattering needs no atomics and its result does not
+depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ CHUNKS = 8
 """Private grids per environment on the CPU: a constant, because the order of summation follows from it."""
 
 FRAME_ADJOINT = 25
-"""Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap (1)."""
+"""Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap
+(1)."""
 
 WORK = 20
 """4-vectors per thread of work for the transfers of one particle."""
@@ -154,7 +157,8 @@ class Storage:
         self.block_list = ti.field(ti.i32, shape=b * self.blocks)
         self.block_count = ti.field(ti.i32, shape=b)
         self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
-        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next block.
+        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
+        # block.
         private = 1 if self.cuda else grids
         self.mark_stamp = ti.field(ti.i32, shape=private * self.blocks)
         self.mark_code = ti.field(ti.i32, shape=private * self.blocks)

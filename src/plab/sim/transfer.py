@@ -1,8 +1,9 @@
 """Transfers between one particle and its 27 grid nodes: quadratic B-splines, APIC, moving least squares.
 
-A field that is affine around the particle is a 4-vector at the base node and three increments, one per axis, also
-4-vectors: three components of momentum or velocity and the mass (or nothing). All arithmetic is on such 4-vectors, which
-LLVM keeps in SIMD registers. Sums over the stencil go axis by axis: over z first, then y, then x.
+A field that is affine around the particle is a 4-vector at the base node and three increments, one per axis,
+also 4-vectors: three components of momentum or velocity and the mass (or nothing). All arithmetic is on such
+4-vectors, which LLVM keeps in SIMD registers. Sums over the stencil go axis by axis: over z first, then y,
+then x.
 """
 
 import taichi as ti
@@ -51,8 +52,10 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work
         stride_x: Index distance of neighbours along x.
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
-        work: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only that.
-        at: First entry of the result: sum of w g, then of w g times the node's offset (0, 1, 2) along x, y and z.
+        work: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only
+            that.
+        at: First entry of the result: sum of w g, then of w g times the node's offset (0, 1, 2) along x, y
+            and z.
     """
     for i in ti.static(range(3)):
         r0 = grid[node] * 0.0
@@ -104,11 +107,12 @@ def gather_adjoint(
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
         dw: :func:`spline_slope`.
-        work: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at the base node and
-            increments along x, y, z, with the mass at the end) and that of the velocity's adjoint h, likewise, with 0
-            at the end. On return, from ``at``: moments of momentum_bar as in :func:`gather`, then the sum over nodes of
-            grad_f w (momentum_bar . q + velocity . h) as three 4-vectors, still to be summed over their entries. Entries
-            15 to 17 hold the weights along x, their slopes and the offsets 0, 1, 2.
+        work: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at the base
+            node and increments along x, y, z, with the mass at the end) and that of the velocity's adjoint
+            h, likewise, with 0 at the end. On return, from ``at``: moments of momentum_bar as in
+            :func:`gather`, then the sum over nodes of grad_f w (momentum_bar . q + velocity . h) as three
+            4-vectors, still to be summed over their entries. Entries 15 to 17 hold the weights along x,
+            their slopes and the offsets 0, 1, 2.
         at: First entry in ``work``.
     """
     zero = velocity[node] * 0.0
@@ -135,7 +139,9 @@ def gather_adjoint(
             t1 = zero
             for k in ti.static(range(3)):
                 p = momentum_bar[row + k]
-                chi = p * (qj + float(k) * work[at + 10]) + velocity[row + k] * (hj + float(k) * work[at + 14])
+                chi = p * (qj + float(k) * work[at + 10]) + velocity[row + k] * (
+                    hj + float(k) * work[at + 14]
+                )
                 t0 += w[k][2] * chi
                 t1 += dw[k][2] * chi
                 wp = w[k][2] * p
