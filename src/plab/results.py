@@ -108,6 +108,8 @@ def config_dict(cfg: Any) -> dict[str, Any]:
 def config_hash(cfg: Any) -> str:
     """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
+    # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
+    plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 

@@ -1,7 +1,8 @@
 """What is in a scene: bodies of plasticine, manipulators, material, floor.
 
 A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi,
-Hydra or Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start from it.
+Hydra or Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start
+from it.
 """
 
 from __future__ import annotations

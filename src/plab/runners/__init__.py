@@ -45,10 +45,10 @@ def run_config(cfg: Config) -> float:
         ResultsError: If the results folder cannot be written.
         RunError: If the run broke off; what it computed is kept in the partial file.
     """
-    runner = _runner(cfg.method.family)
     run = RunFile(cfg)
     if run.finished:
         return _conclude(run, "finished before")
+    runner = _runner(cfg.method.family)
     try:
         runner(cfg, run)
     except KeyboardInterrupt:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import io
 import os
 import weakref
 from dataclasses import dataclass
@@ -97,10 +99,19 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         raise DeviceError(
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
         )
+    # Taichi announces the device on standard output, which belongs to the caller.
+    with contextlib.redirect_stdout(io.StringIO()):
+        _start_taichi(device, precision, wanted)
+    remember_source_positions()
+    _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
+    return _current
+
+
+def _start_taichi(device: str, precision: str, threads: int) -> None:
     ti.init(
         arch=ti.cuda if device == "cuda" else ti.cpu,
         default_fp=ti.f32 if precision == "float32" else ti.f64,
-        cpu_max_num_threads=wanted,
+        cpu_max_num_threads=threads,
         # Square roots in float64 on CUDA lose digits under fast_math; on the CPU it is what lets LLVM use
         # FMA.
         fast_math=device == "cpu" or precision == "float32",
@@ -110,9 +121,6 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         offline_cache=True,
         log_level=ti.WARN,
     )
-    remember_source_positions()
-    _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
-    return _current
 
 
 def cuda_available() -> bool:

@@ -455,9 +455,8 @@ class Simulator:
     def _check_terms(self, terms: np.ndarray) -> None:
         bad = np.argwhere(~np.isfinite(terms))
         if bad.size:
-            raise SimulationError(
-                f"the loss is not finite: environment {bad[0][1]}, environment step {bad[0][0]}"
-            )
+            when = f"after environment step {bad[0][0]}" if bad[0][0] else "at the start"
+            raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, {when}")
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
