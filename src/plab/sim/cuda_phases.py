@@ -308,19 +308,3 @@ class CudaPhases(Phases):
         terms[at] = self.target_sum[e] + self.loss_part[e, 0][0]
         terms[at + 1] = self.loss_part[e, 0][1]
         terms[at + 2] = self.contact_term(e)
-
-    @ti.func
-    def contact_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
-        """Add the gradient of the contact term to the nearest particles' and the poses' adjoints."""
-        for shape, start, stop in ti.static(self.runs):
-            if ti.static(shape != "Cylinder"):
-                for m in range(start, stop):
-                    if self.contact_part[e, 0, m] > 0.0:
-                        particle = self.contact_particle[e, 0, m]
-                        tile = particle // self.lanes
-                        lane = particle - tile * self.lanes
-                        x = self.vector(state, self.tile_entry(slot, e, tile), lane)
-                        x_bar = self.contact_adjoint_at(shape, e, m, x)
-                        entry = self.tile_entry(0, e, tile)
-                        for i in ti.static(range(3)):
-                            bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]

@@ -329,22 +329,6 @@ class CpuEngine(Phases):
                 for i in ti.static(range(3)):
                     bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
 
-    @ti.func
-    def contact_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
-        """Add the gradient of the contact term to the nearest particles' and the poses' adjoints."""
-        for shape, start, stop in ti.static(self.runs):
-            if ti.static(shape != "Cylinder"):
-                for m in range(start, stop):
-                    if self.contact_part[e, 0, m] > 0.0:
-                        particle = self.contact_particle[e, 0, m]
-                        tile = particle // self.lanes
-                        lane = particle - tile * self.lanes
-                        x = self.vector(state, self.tile_entry(slot, e, tile), lane)
-                        x_bar = self.contact_adjoint_at(shape, e, m, x)
-                        entry = self.tile_entry(0, e, tile)
-                        for i in ti.static(range(3)):
-                            bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
-
     # -- kernels ------------------------------------------------------------------------------------
 
     @ti.kernel

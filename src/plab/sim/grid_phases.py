@@ -5,7 +5,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.shapes import hessian_product, nearer_stick, signed_distance
+from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
 
 __all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases"]
@@ -21,15 +21,6 @@ WALL = 3
 
 STICKING = 10.0
 """From this floor friction on, the floor sticks."""
-
-
-@ti.func
-def sdf_point(shape: ti.template(), p, size, gap):
-    """Derivative of the chopsticks' local point, relative to the nearer stick, with respect to the gap."""
-    out = 0.0 * gap
-    if ti.static(shape == "Chopsticks"):
-        out = -0.5 * nearer_stick(p, size, gap)
-    return out
 
 
 class GridPhases(Storage):
@@ -193,7 +184,7 @@ class GridPhases(Storage):
                         self.accumulate_frame(grid_index, m, 15 + 3 * i + j, u_bar[i] * p[j])
             if ti.static(shape == "Chopsticks"):
                 self.accumulate_frame(
-                    grid_index, m, FRAME_ADJOINT - 1, sdf_point(shape, p, size, gap) * from_distance[0]
+                    grid_index, m, FRAME_ADJOINT - 1, gap_slope(shape, p) * from_distance[0]
                 )
 
     @ti.func

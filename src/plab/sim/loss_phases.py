@@ -7,7 +7,7 @@ the layer below the domain counts at the face's node, so that the tensor holds a
 import taichi as ti
 
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
-from plab.sim.shapes import signed_distance
+from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import Storage
 from plab.sim.transfer import spline, spline_slope
 
@@ -143,6 +143,21 @@ class LossPhases(Storage):
             for i in ti.static(range(4)):
                 self.pose_bar[e, m][3 + i] += q_bar[i]
         if ti.static(shape == "Chopsticks"):
-            side = ti.select(p[0] < 0.0, -1.0, 1.0)
-            self.pose_bar[e, m][7] -= 0.5 * side * d_bar * n64[0]
+            self.pose_bar[e, m][7] += ti.cast(gap_slope(shape, p), ti.f64) * d_bar * n64[0]
         return ti.cast(x_bar, self.real)
+
+    @ti.func
+    def contact_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
+        """Add the gradient of the contact term to the nearest particles' and the poses' adjoints."""
+        for shape, start, stop in ti.static(self.runs):
+            if ti.static(shape != "Cylinder"):
+                for m in range(start, stop):
+                    if self.contact_part[e, 0, m] > 0.0:
+                        particle = self.contact_particle[e, 0, m]
+                        tile = particle // self.lanes
+                        lane = particle - tile * self.lanes
+                        x = self.vector(state, self.tile_entry(slot, e, tile), lane)
+                        x_bar = self.contact_adjoint_at(shape, e, m, x)
+                        entry = self.tile_entry(0, e, tile)
+                        for i in ti.static(range(3)):
+                            bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]

@@ -7,7 +7,7 @@ rely on it.
 
 import taichi as ti
 
-__all__ = ["hessian_product", "signed_distance"]
+__all__ = ["gap_slope", "hessian_product", "signed_distance"]
 
 
 @ti.func
@@ -71,7 +71,7 @@ def solid_hessian_product(q, half, w):
 
 
 @ti.func
-def nearer_stick(p, size, gap):
+def nearer_stick(p):
     """Sign of the own x offset of the chopstick nearer to p."""
     return ti.select(p[0] < 0.0, -1.0, 1.0)
 
@@ -79,8 +79,17 @@ def nearer_stick(p, size, gap):
 @ti.func
 def stick_point(p, size, gap):
     """p relative to the nearest point of the nearer chopstick's axis."""
-    side = nearer_stick(p, size, gap)
+    side = nearer_stick(p)
     return on_segment(p - ti.Vector([0.5 * side * gap, 0.0, 0.0]), -size[0], 0.0 * gap)
+
+
+@ti.func
+def gap_slope(shape: ti.template(), p):
+    """Derivative of the local point's x, relative to the nearer chopstick, with respect to the gap."""
+    out = 0.0 * p[0]
+    if ti.static(shape == "Chopsticks"):
+        out = -0.5 * nearer_stick(p)
+    return out
 
 
 @ti.func
