@@ -33,6 +33,16 @@ def make_config(folder: Path, **changes) -> dict:
     return config | changes
 
 
+def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
+    config = make_config(tmp_path)
+    hash_ = config_hash(config)
+    for key, value in (("results_dir", "elsewhere"), ("force", True), ("progress", True)):
+        assert config_hash(config | {key: value}) == hash_
+    assert config_hash(config | {"sim": config["sim"] | {"memory_mb": 7.0}}) == hash_
+    assert config_hash(config | {"sim": config["sim"] | {"precision": "float32"}}) != hash_
+    assert config_hash(config | {"seed": 4}) != hash_
+
+
 def make_row(iteration: int) -> dict[str, float]:
     terms = ("loss", "loss_density", "loss_sdf", "loss_contact")
     names = (*terms, "reward", "iou", "score", "gradient_norm", "seconds")

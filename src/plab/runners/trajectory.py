@@ -7,10 +7,10 @@ The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. 
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -134,25 +134,31 @@ class Problem:
         }
 
 
+_kept: dict[tuple, Simulator] = {}
+"""The last simulator of this process and what it was made for: a sweep over seeds or methods
+compiles once."""
+
+
 def _simulator(scene: Scene, sim: SimConfig) -> Simulator:
-    """Return this process's simulator of a scene; a sweep over seeds or methods compiles it once."""
+    """Return the simulator of a scene, the one kept from the last run if it fits."""
     wanted = scene, sim.precision, sim.device, sim.memory_mb
     try:
-        simulator = _build_simulator(*wanted)
-        try:
-            simulator.reset()
-        except RuntimeError:
-            # Somebody else restarted Taichi with another precision or device, and the memory is gone.
-            _build_simulator.cache_clear()
-            simulator = _build_simulator(*wanted)
+        if wanted in _kept:
+            _kept[wanted].reset()
+            return _kept[wanted]
+    except RuntimeError:
+        # Somebody else restarted Taichi with another precision or device, and the memory is gone.
+        pass
+    # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels again.
+    _kept.clear()
+    gc.collect()
+    try:
+        _kept[wanted] = Simulator(
+            [scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
+        )
     except DeviceError as error:
         raise RunError(str(error)) from error
-    return simulator
-
-
-@lru_cache(maxsize=1)
-def _build_simulator(scene: Scene, precision: str, device: str, memory_mb: float) -> Simulator:
-    return Simulator([scene], precision=precision, device=device, memory_mb=memory_mb)
+    return _kept[wanted]
 
 
 def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:

@@ -80,8 +80,8 @@ class Series:
     exp_terms: int
     cbrt_steps: int
     z_squared_max: float = 0.0144
-    j_min: float = 0.75
-    j_max: float = 1.35
+    j_min: float = 0.6
+    j_max: float = 1.6
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
