@@ -85,8 +85,7 @@ class Series:
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
-        """The numbers of terms for ``float32`` or ``float64``: truncation errors below rounding at |Z| =
-        0.12."""
+        """Terms for ``float32`` or ``float64``: truncation errors below rounding within the range."""
         return cls(4, 6, 3) if precision == "float32" else cls(9, 11, 4)
 
 
