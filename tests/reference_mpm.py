@@ -325,7 +325,7 @@ def _move(manipulator: Manipulator, pose: Tensor, motion: Tensor) -> Tensor:
     elif rule == "rigid":
         displacement, q = motion[:3], quaternion_product(rotation_quaternion(motion[3:6]), q)
     else:
-        raise NotImplementedError(f"motion rule '{rule}'")
+        raise ValueError(f"motion rule '{rule}' is unknown")
     low = torch.tensor(manipulator.lower_bound, dtype=torch.float64)
     high = torch.tensor(manipulator.upper_bound, dtype=torch.float64)
     return torch.cat([(position + displacement).clamp(low, high), q, gap])
