@@ -1,6 +1,7 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
 # make test   set up .venv and run all tests (those marked gpu skip themselves without a CUDA device)
 # make lint   check style
+# make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
 # make clean  remove everything that can be made again, except results
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ ARGS ?= task=Rope method=adam seed=0
 
 BIN := $(VENV)/bin
 
-.PHONY: run test lint clean
+.PHONY: run test lint clean system-packages
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
@@ -20,6 +21,9 @@ test: $(VENV)/.dev.stamp
 lint: $(VENV)/.dev.stamp
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
+
+system-packages:
+	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri
 
 clean:
 	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov

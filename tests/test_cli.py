@@ -58,7 +58,7 @@ def plab(*argv: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str
 
 
 REFUSED = [
-    (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Move, Rope"),
+    (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks,"),
     (["method=ppo"], "choose from: adam, adam_h, gd"),
     (["sim=slow"], "choose from: fast, reference"),
     (["tsk=Move"], "unknown key 'tsk'; did you mean task?"),
@@ -77,8 +77,10 @@ REFUSED = [
     (["--cfg", "job", "-m"], "Only one of --run, --multirun, --cfg"),
     (["--cfg", "job", "task=Ropee"], "did you mean Rope?"),
     (["--config-name", "other"], "other"),
-    (["--config-dir", "nowhere"], "nowhere"),
+    (["--config-dir", "nowhere"], "config folder 'nowhere' does not exist"),
     (["-m", "variant=1,2", "task=Ropee"], "did you mean Rope?"),
+    (["variant=random", "seed_scene=-1"], "seed_scene must be an integer of at least 0, not -1"),
+    (["seed_scene=1"], "has no effect without variant=random"),
     (["hydra/launcher=cluster"], "hydra/launcher 'cluster' does not exist"),
     (["hydra.run.dri=x"], "unknown key 'hydra.run.dri'"),
 ]
@@ -120,7 +122,7 @@ def test_help_names_everything(capsys):
     text, _ = capsys.readouterr()
     for group in ("task", "method", "sim"):
         assert all(f"{group}={name}" in text for name in choices(group))
-    for key in ("variant=1", "seed=0", "results_dir=results", "force=false", "progress=true"):
+    for key in ("variant=1", "seed_scene=0", "seed=0", "results_dir=results", "force=false", "progress=true"):
         assert key in text
     for key in (
         "sim.precision=float32",
@@ -162,7 +164,7 @@ def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_p
     (cfg,) = seen
     assert (cfg.task.name, cfg.variant, cfg.method.name, cfg.seed, cfg.method.lr) == (
         "Move",
-        2,
+        "2",
         "gd",
         7,
         0.05,
@@ -173,13 +175,13 @@ def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_p
 
 def test_flags_and_overrides_come_in_any_order(seen):
     assert main(["seed=0,1", "-m", "variant=1,2"]) == 0
-    assert [(cfg.seed, cfg.variant) for cfg in seen] == [(0, 1), (0, 2), (1, 1), (1, 2)]
+    assert [(cfg.seed, cfg.variant) for cfg in seen] == [(0, "1"), (0, "2"), (1, "1"), (1, "2")]
     assert sorted(path.name for path in Path.cwd().rglob("*")) == ["multirun.yaml", "results"]
 
 
 def test_a_sweep_goes_on_after_a_refused_job(seen, capsys):
     assert main(["-m", "variant=1,9,2"]) == 2
-    assert [cfg.variant for cfg in seen] == [1, 2]
+    assert [cfg.variant for cfg in seen] == ["1", "2"]
     assert capsys.readouterr().err.count("\n") == 1
 
 

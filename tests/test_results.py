@@ -22,7 +22,7 @@ from plab.results import ResultsError, RunFile, RunResult, config_hash, load, re
 def make_config(folder: Path, **changes) -> dict:
     config = {
         "task": {"name": "Rope", "yield_stress": 50.0},
-        "variant": 2,
+        "variant": "2",
         "method": {"name": "adam", "family": "trajectory", "lr": 0.1},
         "sim": {"device": "cpu", "precision": "float64"},
         "seed": 3,
@@ -92,7 +92,7 @@ def rng() -> np.random.Generator:
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, compress: bool) -> None:
-    config = make_config(tmp_path, variant=4)
+    config = make_config(tmp_path, variant="4")
     config["task"]["yield_stress"] = float("inf")
     written = RunResult(
         config=config,
@@ -266,7 +266,7 @@ def test_load_on_a_mixed_folder(tmp_path: Path, rng) -> None:
     assert broken.path.name in str(caught[0].message)
     table = table.set_index("seed")
     assert table["status"].to_dict() == {3: "finished", 4: "running", 5: "stopped"}
-    assert table.loc[3, ["task", "variant", "method"]].tolist() == ["Rope", 2, "adam"]
+    assert table.loc[3, ["task", "variant", "method"]].tolist() == ["Rope", "2", "adam"]
     assert table.loc[3, ["score", "iou", "loss", "score_printed"]].tolist() == [0.75, 0.4, 12.0, 0.3]
     assert np.isnan(table.loc[4, "score"])
     assert table["iterations"].tolist() == [1, 1, 0]

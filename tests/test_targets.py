@@ -8,10 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plab.config import build_scene, load_config, variant_task
+from plab.config import ConfigError, build_scene, load_config, variant_task
 from plab.objective import soft_iou, spread_mass, target_sdf
+from plab.problem import Problem
 from plab.scene import Scene, sample_particles
-from plab.targets import RECIPES, TARGET_SEED, TargetError, build_target, make_recipe
+from plab.targets import (
+    RECIPES,
+    TARGET_SEED,
+    TargetError,
+    build_target,
+    build_targets,
+    check_target,
+    demonstration,
+    load_release_target,
+    make_recipe,
+)
+from plab.targets.store import TargetStore
 
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}
 BALL = {"shape": "sphere", "center": [0.5, 0.5, 0.5], "size": [0.1]}
@@ -102,8 +114,9 @@ def test_target_differs_from_a_shifted_copy_of_the_scene(rope):
 
 def test_every_recipe_is_a_dataclass_with_documented_fields():
     for recipe in RECIPES.values():
+        documented = "\n".join(kind.__doc__ or "" for kind in recipe.__mro__)
         for field in recipe.__dataclass_fields__:
-            assert re.search(rf"^\s*{field}: ", recipe.__doc__, re.MULTILINE)
+            assert re.search(rf"^\s*{field}: ", documented, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -139,3 +152,156 @@ def test_every_recipe_is_a_dataclass_with_documented_fields():
 def test_refused_targets(rope, target, message):
     with pytest.raises(TargetError, match=message):
         build_target(rope, target)
+
+
+# ------------------------------------------------------------------ simulated targets and the cache
+
+
+class Recorder:
+    """Stands for a simulator in the cache's key."""
+
+    precision, device = "float32", "cpu"
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch) -> TargetStore:
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
+    return TargetStore(Recorder())
+
+
+def test_cached_mass_comes_back_and_other_scenes_do_not(rope, store):
+    actions = np.zeros((50, 6))
+    mass = np.zeros((64, 64, 64))
+    mass[3, 4, 5], mass[63, 63, 63] = 1.25e-4, np.float32(0.1)
+    assert store.load(rope, actions) is None
+    store.save(rope, actions, mass)
+    assert np.array_equal(store.load(rope, actions), mass)
+    # The length of later episodes does not matter, all else does.
+    assert store.load(replace(rope, horizon=3), actions) is not None
+    assert store.load(replace(rope, yield_stress=51.0), actions) is None
+    assert store.load(replace(rope, particle_seed=1), actions) is None
+    assert store.load(rope, actions + 1e-4) is None
+    Recorder.precision = "float64"
+    try:
+        assert TargetStore(Recorder()).load(rope, actions) is None
+    finally:
+        Recorder.precision = "float32"
+
+
+def test_a_damaged_cache_is_not_believed(rope, store):
+    actions = np.zeros((50, 6))
+    store.save(rope, actions, np.ones((64, 64, 64)))
+    path = store.path(rope, actions)
+    path.write_bytes(path.read_bytes()[:100])
+    assert store.load(rope, actions) is None
+    path.write_bytes(b"")
+    assert store.load(rope, actions) is None
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(rope, tmp_path, monkeypatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(blocked))
+    store = TargetStore(Recorder())
+    store.save(rope, np.zeros((50, 6)), np.ones((64, 64, 64)))
+    assert store.load(rope, np.zeros((50, 6))) is None
+
+
+COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
+
+
+def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, monkeypatch, device):
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
+    overrides = ("task=RollingPin", *COARSE, f"sim.device={device}")
+    cfgs = [load_config([*overrides, f"variant={k}"]) for k in (2, 3)]
+    problem = Problem([*cfgs, cfgs[0]])
+    assert len(list(tmp_path.glob("targets/RollingPin-*.npz"))) == 2
+    assert not list(tmp_path.glob("targets/*.tmp"))
+    assert np.array_equal(problem.target_mass[0], problem.target_mass[2])
+    assert not np.array_equal(problem.target_mass[0], problem.target_mass[1])
+    # From the initial state, whatever was done before; targets leave no trace in it.
+    np.testing.assert_array_equal(problem.simulator.state().v, 0)
+    simulator, calls = problem.simulator, []
+    monkeypatch.setattr(simulator, "rollout", lambda *a, **k: calls.append(1))
+    again = build_targets(simulator, [c.task.target for c in (*cfgs, cfgs[0])])
+    assert np.array_equal(again, problem.target_mass) and not calls
+    monkeypatch.undo()
+    script = demonstration(problem.scenes[0], cfgs[0].task.target)
+    simulator.set_contact("hard")
+    simulator.rollout(np.stack([script] * 3), gradient=False)
+    reached = simulator.mass_tensor()[0]
+    np.testing.assert_allclose(reached, problem.target_mass[0], atol=1e-5 * reached.max())
+
+
+def test_a_simulated_target_needs_a_simulator():
+    scene, target = load("task=Torus")
+    check_target(scene, target)
+    with pytest.raises(TargetError, match="press is simulated: build it with"):
+        build_target(scene, target)
+
+
+# ------------------------------------------------------------------ files of the original release
+
+
+@pytest.fixture(scope="module")
+def released() -> tuple[Scene, np.ndarray]:
+    scene, target = load("task=Move")
+    return scene, build_target(scene, target)
+
+
+def test_release_files_are_loaded_as_they_are(tmp_path, released):
+    scene, mass = released
+    np.save(tmp_path / "Move3D-v1.npy", mass)
+    assert np.array_equal(load_release_target(tmp_path, scene, "1"), mass)
+    np.save(tmp_path / "Rollingpin3D-v2.npy", mass)
+    assert np.array_equal(load_release_target(tmp_path, replace(scene, name="RollingPin"), "2"), mass)
+
+
+def test_release_targets_of_pinch_hold_more_mass_than_its_scene(tmp_path, released):
+    scene, mass = released
+    np.save(tmp_path / "Pinch3D-v1.npy", mass)
+    fewer = replace(scene, name="Pinch", bodies=(replace(scene.bodies[0], particles=6000),))
+    assert np.array_equal(load_release_target(tmp_path, fewer, "1"), mass)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (None, r"Move3D-v1.npy does not exist; name the files like Move3D-v1.npy"),
+        (lambda m: m[:32], r"has shape \(32, 64, 64\), but the grid is \(64, 64, 64\)"),
+        (lambda m: m - 1e-9, "has negative masses, the least is -1e-09"),
+        (lambda m: m * 64, "holds 640000 particle masses of 6.1e-05, but the scene has 10000"),
+        (lambda m: np.where(m > 1e-4, np.nan, m), "must hold finite numbers"),
+        (lambda m: m.astype(str), "must hold finite numbers"),
+        (lambda m: b"not an array", "is no NumPy array file"),
+    ],
+)
+def test_release_files_that_are_refused(tmp_path, released, change, message):
+    scene, mass = released
+    path = tmp_path / "Move3D-v1.npy"
+    changed = None if change is None else change(mass)
+    if isinstance(changed, bytes):
+        path.write_bytes(changed)
+    elif changed is not None:
+        np.save(path, changed)
+    with pytest.raises(TargetError, match=f"targets.source: .*{message}"):
+        load_release_target(tmp_path, scene, "1")
+
+
+def test_a_folder_of_release_files_that_is_missing(tmp_path, released):
+    with pytest.raises(TargetError, match=r"targets.source: there is no folder .*nowhere"):
+        load_release_target(tmp_path / "nowhere", released[0], "1")
+
+
+def test_a_problem_takes_its_targets_from_the_folder(tmp_path, device):
+    overrides = ("task=Move", *COARSE, f"targets.source={tmp_path}", f"sim.device={device}")
+    scene, target = load("task=Move", "variant=3", *COARSE)
+    mass = build_target(scene, target)
+    np.save(tmp_path / "Move3D-v1.npy", mass)
+    problem = Problem([load_config(overrides)])
+    assert np.array_equal(problem.target_mass[0], mass)
+
+
+def test_a_folder_of_release_files_has_none_for_random_variants(tmp_path):
+    with pytest.raises(ConfigError, match="no files for variant=random"):
+        load_config(["variant=random", f"targets.source={tmp_path}"])

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from plab.config import choices, config_dir
+from plab.config import GROUPS, choices, conf_folder
 
 __all__ = ["help_text"]
 
@@ -24,25 +24,30 @@ EXAMPLES
   python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs, one after the other
 
   python -m plab.run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
+  python -m plab.run -m variant=random 'seed_scene=range(10)'  ten drawn configurations
+  python -m plab.run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
 
 FLAGS
   -m, --multirun    run every combination of the values given with commas
   --cfg job         print the configuration and stop; with --package sim, only that section
+  --config-dir DIR  use the YAML files in DIR/task, DIR/method and DIR/sim, too
   -h, --help        this text; --hydra-help explains Hydra's own flags
 """
 
 _KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P<comment>.*))?$")
 
 
-def help_text() -> str:
-    """Return the text of ``--help``: usage, choices, and every key with its default and explanation."""
-    folder = config_dir()
+def help_text(config_dir: str | None = None) -> str:
+    """Return the text of ``--help``: usage, choices, and every key with its default and explanation.
+
+    Args:
+        config_dir: Folder with files of the user's own, whose names are listed, too.
+    """
+    folder = conf_folder()
     parts = [_USAGE]
-    for group in ("task", "method", "sim"):
+    for group in GROUPS:
         parts.append(f"{group.upper()}S" if group != "sim" else "SIMULATOR PRESETS")
-        parts += [
-            f"  {group}={name:<10} {_title(folder / group / f'{name}.yaml')}" for name in choices(group)
-        ]
+        parts += [f"  {group}={name:<10} {_title(path)}" for name, path in choices(group, config_dir).items()]
         parts.append("")
     parts.append("KEYS, with their defaults")
     parts += _keys(folder / "config.yaml", "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from collections.abc import Iterator, Sequence
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
@@ -11,11 +12,20 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
+    KeyValidationError,
     MissingMandatoryValue,
     OmegaConfBaseException,
 )
+from yaml import MarkedYAMLError, YAMLError
 
-__all__ = ["explain", "pick"]
+__all__ = ["COMPOSE_ERRORS", "ConfigError", "explain", "pick"]
+
+COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
+"""What composing a configuration raises where the configuration is wrong."""
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
 
 
 def pick(name: str, names: Sequence[str]) -> str:
@@ -25,11 +35,11 @@ def pick(name: str, names: Sequence[str]) -> str:
     return f"{guess}choose from: {', '.join(names)}"
 
 
-def explain(error: HydraException | OmegaConfBaseException) -> str:
+def explain(error: HydraException | OmegaConfBaseException | YAMLError) -> str:
     """Return one line that says what is wrong with a configuration.
 
     Args:
-        error: What Hydra or OmegaConf raised.
+        error: What composing it raised.
 
     Returns:
         The line, without a full stop.
@@ -37,11 +47,19 @@ def explain(error: HydraException | OmegaConfBaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return f"{group} '{name}' does not exist; {pick(name, error.options)}"
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"{mark.name}, line {mark.line + 1}: {error.problem}"
     if isinstance(error, OverrideParseException):
         return f"cannot read '{error.override}': write key=value, and quote values with special characters"
     cause = _omegaconf_cause(error)
+    file = re.match(r"In '(.+)': \w+ raised", str(error))
+    if file and cause is not None:
+        return f"{file[1]}.yaml: {explain(cause)}"
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _unknown_key(cause)
+    if isinstance(cause, KeyValidationError):
+        return f"{cause.full_key}: put the name into quotes"
     if isinstance(cause, MissingMandatoryValue):
         return f"{cause.full_key} has no value: give one"
     if cause is not None:
@@ -59,7 +77,8 @@ def explain(error: HydraException | OmegaConfBaseException) -> str:
 
 def _omegaconf_cause(error: BaseException | None) -> OmegaConfBaseException | None:
     while error is not None and not isinstance(error, OmegaConfBaseException):
-        error = error.__cause__
+        # Hydra raises some of its errors while it handles another, without naming it as the cause.
+        error = error.__cause__ or error.__context__
     return error
 
 

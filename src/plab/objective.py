@@ -20,6 +20,7 @@ __all__ = [
     "observation",
     "rewards",
     "scores",
+    "scores_from_iou",
     "soft_iou",
     "spread_mass",
     "target_sdf",
@@ -161,9 +162,6 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
 def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
     """Judge an episode by its first and last mass tensor.
 
-    Where the initial shape is as good as the target itself, so that nothing can be gained and the formulas
-    divide by zero, a score is 1 if the final shape is still as good, and 0 otherwise.
-
     Args:
         initial: Mass tensor at the start, shape [n, n, n].
         final: Mass tensor after the last step, shape [n, n, n].
@@ -172,7 +170,23 @@ def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
     Returns:
         The IoUs and both scores.
     """
-    start, end, best = soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target)
+    return scores_from_iou(soft_iou(initial, target), soft_iou(final, target), soft_iou(target, target))
+
+
+def scores_from_iou(start: float, end: float, best: float) -> Scores:
+    """Judge an episode by soft IoUs with its target.
+
+    Where the initial shape is as good as the target itself, so that nothing can be gained and the formulas
+    divide by zero, a score is 1 if the final shape is still as good, and 0 otherwise.
+
+    Args:
+        start: Soft IoU of the initial mass tensor.
+        end: Soft IoU of the final mass tensor.
+        best: Soft IoU of the target itself.
+
+    Returns:
+        The IoUs and both scores.
+    """
     return Scores(
         iou_initial=start,
         iou_final=end,
@@ -200,7 +214,8 @@ def total_loss(terms: ArrayLike, weights: LossWeights) -> np.ndarray:
     Returns:
         Loss, shape [...].
     """
-    return np.asarray(terms) @ np.array([weights.density, weights.sdf, weights.contact])
+    # No matrix product: its rounding depends on how many losses are computed at once.
+    return (np.asarray(terms) * [weights.density, weights.sdf, weights.contact]).sum(axis=-1)
 
 
 def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeights) -> np.ndarray:

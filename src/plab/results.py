@@ -449,7 +449,7 @@ def _summary(path: Path, keys: Sequence[str]) -> dict[str, Any]:
         columns = _columns(file)
         known = {
             "task": config["task"]["name"],
-            "variant": config["variant"],
+            "variant": str(config["variant"]),
             "method": config["method"]["name"],
             "seed": config["seed"],
             "status": file.attrs["status"],

@@ -10,6 +10,7 @@ import ctypes
 import math
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
@@ -18,15 +19,13 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
 from plab.cli_help import help_text
-from plab.config import Config, ConfigError, build_scene, check_overrides, config_dir, finish, variant_task
-from plab.config_errors import explain, pick
+from plab.config import Config, ConfigError, build_scene, check_overrides, conf_folder, finish
+from plab.config_errors import COMPOSE_ERRORS, explain, pick
 from plab.scene import SceneError
-from plab.targets import TargetError, build_target
+from plab.targets import TargetError, check_target, load_release_target
 
 __all__ = ["cuda_is_usable", "main"]
 
@@ -60,13 +59,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             return math.nan
 
     try:
-        argv, wants_help = _parse(list(sys.argv[1:] if argv is None else argv))
-        if wants_help:
-            print(help_text())
+        argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
+        if arguments.help:
+            print(help_text(arguments.config_dir))
             return 0
         with _hydra_raises(argv):
-            hydra.main(config_path=str(config_dir()), config_name="config", version_base="1.3")(job)()
-    except (HydraException, OmegaConfBaseException) as error:
+            hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(job)()
+    except COMPOSE_ERRORS as error:
         return _complain(explain(error), EXIT_USER_ERROR)
     except ConfigError as error:
         return _complain(str(error), EXIT_USER_ERROR)
@@ -98,7 +97,7 @@ def _run(composed: DictConfig) -> float:
     """Check one composed configuration and run it; raise :class:`_Refused` for what is no bug."""
     try:
         cfg = finish(composed, HydraConfig.get().overrides.task)
-        build_target(build_scene(cfg), variant_task(cfg).target)
+        _check_target(cfg)
         _check_device(cfg)
     except _CONFIG_ERRORS as error:
         raise _Refused(error, EXIT_USER_ERROR) from error
@@ -114,14 +113,15 @@ def _run(composed: DictConfig) -> float:
         raise _Refused(error, EXIT_BROKE_OFF) from error
 
 
-def _parse(argv: list[str]) -> tuple[list[str], bool]:
+def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     """Check the arguments and put them into the order that Hydra reads: overrides, then flags.
 
     Returns:
-        The arguments, and whether help is asked for.
+        The arguments in this order, and what they mean.
 
     Raises:
-        ConfigError: If a flag does not exist or an override makes no sense.
+        ConfigError: If a flag does not exist, an override makes no sense or the folder of ``--config-dir``
+            does not do.
         hydra.errors.HydraException: If an override cannot be parsed.
     """
     parser = get_args_parser()
@@ -133,13 +133,20 @@ def _parse(argv: list[str]) -> tuple[list[str], bool]:
 
     parser.error = refuse
     arguments = parser.parse_intermixed_args(argv)
-    if arguments.help:
-        return argv, True
-    check_overrides(arguments.overrides)
+    check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)
     for override in arguments.overrides:
         rest.remove(override)
-    return [*arguments.overrides, *rest], False
+    return [*arguments.overrides, *rest], arguments
+
+
+def _check_target(cfg: Config) -> None:
+    """Find mistakes in what the target comes from before anything is compiled."""
+    scene, source = build_scene(cfg), cfg.targets.source
+    if source is None:
+        check_target(scene, cfg.task.target)
+    else:
+        load_release_target(source, scene, cfg.variant)
 
 
 def _check_device(cfg: Config) -> None:

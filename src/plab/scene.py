@@ -14,6 +14,7 @@ import numpy as np
 
 __all__ = [
     "MANIPULATOR_SHAPES",
+    "ROLL_RADIUS",
     "Body",
     "Manipulator",
     "ManipulatorShape",
@@ -24,6 +25,11 @@ __all__ = [
 
 Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+
+
+ROLL_RADIUS = 0.03
+"""Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
+release."""
 
 
 class SceneError(ValueError):

@@ -16,19 +16,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from plab.config import build_scene, variant_task
-from plab.objective import rewards, scores, target_sdf, total_loss
+from plab.config import build_scene
+from plab.problem import Problem
 from plab.results import RunFile
 from plab.runners import RunError
 from plab.runners.progress import show_progress
 from plab.sim import DeviceError, SimulationError, Simulator
-from plab.targets import build_target
 
 if TYPE_CHECKING:
-    from plab.config import Config, SimConfig, TrajectoryConfig
-    from plab.scene import Scene
+    from plab.config import Config, TrajectoryConfig
 
-__all__ = ["OPTIMIZERS", "ActionSequence", "Problem", "run_trajectory"]
+__all__ = ["OPTIMIZERS", "ActionSequence", "Episode", "run_trajectory"]
 
 
 def run_trajectory(cfg: Config, run: RunFile) -> None:
@@ -42,14 +40,14 @@ def run_trajectory(cfg: Config, run: RunFile) -> None:
         RunError: If the loss, the gradient or the state stops being finite.
     """
     with run.phase("build"):
-        problem = Problem(cfg)
-        actions = ActionSequence(cfg.method, problem.horizon, problem.action_dim, cfg.seed)
+        episode = Episode(cfg)
+        actions = ActionSequence(cfg.method, episode.horizon, episode.action_dim, cfg.seed)
         if run.result.resume is not None:
             actions.restore(run.result.resume)
-    _optimise(cfg, problem, actions, run)
+    _optimise(cfg, episode, actions, run)
     with run.phase("evaluate"):
-        evaluation, final_mass = _evaluate(problem, run.result.best_actions)
-    masses = {"initial": problem.initial_mass, "final": final_mass, "target": problem.target_mass}
+        evaluation, final_mass = _evaluate(episode, run.result.best_actions)
+    masses = {"initial": episode.initial_mass, "final": final_mass, "target": episode.target_mass}
     run.finish(evaluation, masses)
 
 
@@ -68,8 +66,8 @@ class Rollout:
     final_mass: np.ndarray
 
 
-class Problem:
-    """One task with its simulator: what actions are judged by.
+class Episode:
+    """One task with its simulator: what a sequence of actions is judged by.
 
     Attributes:
         initial_mass: Mass tensor of the initial state, shape [n, n, n].
@@ -77,20 +75,23 @@ class Problem:
     """
 
     def __init__(self, cfg: Config) -> None:
-        """Build scene, target and simulator."""
-        scene = build_scene(cfg)
+        """Build scene, target and simulator.
+
+        Raises:
+            RunError: If the device is not there, or the demonstration that makes the target fails.
+        """
+        try:
+            self._problem = Problem([cfg], _simulator(cfg))
+        except (DeviceError, SimulationError) as error:
+            raise RunError(str(error)) from error
+        scene = self._problem.scenes[0]
         self.horizon, self.action_dim = scene.horizon, scene.action_dim
-        self._weights = cfg.method.loss_weights
-        self.target_mass = build_target(scene, variant_task(cfg).target)
-        self._simulator = _simulator(scene, cfg.sim)
-        self._simulator.set_target(self.target_mass[None], target_sdf(self.target_mass)[None])
-        self._simulator.set_loss_weights(self._weights.density, self._weights.sdf, self._weights.contact)
-        self._simulator.reset()
-        self.initial_mass = self._simulator.mass_tensor()[0]
+        self.initial_mass = self._problem.initial_mass[0]
+        self.target_mass = self._problem.target_mass[0]
 
     def set_contact(self, model: str, softness: float = 0.0) -> None:
         """Choose the contact model of the rollouts to come: ``soft``, with its decay rate, or ``hard``."""
-        self._simulator.set_contact(model, softness=softness)
+        self._problem.simulator.set_contact(model, softness=softness)
 
     def rollout(self, actions: np.ndarray, *, gradient: bool) -> Rollout:
         """Run actions from the initial state.
@@ -103,35 +104,24 @@ class Problem:
             RunError: If the loss, the gradient or the state is not finite, or the gradient needs more memory.
         """
         try:
-            result = self._simulator.rollout(actions[None], gradient=gradient)
+            result = self._problem.rollout(actions[None], gradient=gradient)
         except (SimulationError, MemoryError) as error:
             raise RunError(str(error)) from error
-        terms = result.step_terms[0]
-        slope = result.gradient[0] if gradient else None
-        # Before the scores: a tensor that is not finite has none.
-        _require_finite("loss", total_loss(terms, self._weights))
-        if slope is not None:
-            _require_finite("gradient", slope)
-        final_mass = self._simulator.mass_tensor()[0]
-        _require_finite("mass tensor", final_mass)
-        return Rollout(self._measures(result.initial_terms[0], terms, final_mass), slope, final_mass)
-
-    def _measures(self, initial: np.ndarray, terms: np.ndarray, final_mass: np.ndarray) -> dict[str, float]:
-        """Return loss, reward and scores of an episode from its terms [3], [T, 3] and last mass tensor."""
-        density, sdf, contact = terms.sum(axis=0)
-        judged = scores(self.initial_mass, final_mass, self.target_mass)
-        return {
-            "loss": float(total_loss(terms, self._weights).sum()),
+        density, sdf, contact = result.terms[0].sum(axis=0)
+        judged = result.scores[0]
+        measures = {
+            "loss": float(result.loss[0].sum()),
             "loss_density": float(density),
             "loss_sdf": float(sdf),
             "loss_contact": float(contact),
-            "reward": float(rewards(initial, terms, self._weights).sum()),
+            "reward": float(result.reward[0].sum()),
             "iou": judged.iou_final,
             "score": judged.score,
             "score_printed": judged.score_printed,
             "iou_initial": judged.iou_initial,
             "iou_target_self": judged.iou_target_self,
         }
+        return Rollout(measures, result.gradient[0] if gradient else None, result.final_mass[0])
 
 
 _kept: dict[tuple, Simulator] = {}
@@ -139,8 +129,9 @@ _kept: dict[tuple, Simulator] = {}
 compiles once."""
 
 
-def _simulator(scene: Scene, sim: SimConfig) -> Simulator:
-    """Return the simulator of a scene, the one kept from the last run if it fits."""
+def _simulator(cfg: Config) -> Simulator:
+    """Return the simulator of a configuration's scene, the one kept from the last run if it fits."""
+    scene, sim = build_scene(cfg), cfg.sim
     wanted = scene, sim.precision, sim.device, sim.memory_mb
     try:
         if wanted in _kept:
@@ -152,12 +143,7 @@ def _simulator(scene: Scene, sim: SimConfig) -> Simulator:
     # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels again.
     _kept.clear()
     gc.collect()
-    try:
-        _kept[wanted] = Simulator(
-            [scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
-        )
-    except DeviceError as error:
-        raise RunError(str(error)) from error
+    _kept[wanted] = Simulator([scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
     return _kept[wanted]
 
 
@@ -229,16 +215,16 @@ class ActionSequence:
         self._generator.set_state(torch.from_numpy(state["random"]))
 
 
-def _optimise(cfg: Config, problem: Problem, actions: ActionSequence, run: RunFile) -> None:
+def _optimise(cfg: Config, episode: Episode, actions: ActionSequence, run: RunFile) -> None:
     """Do the iterations that the file does not hold yet."""
-    problem.set_contact(cfg.method.contact, cfg.method.softness)
+    episode.set_contact(cfg.method.contact, cfg.method.softness)
     start, total = len(run.result.iterations), cfg.method.iterations
     title = f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
     with show_progress(title, start, total, enabled=cfg.progress) as report:
         for iteration in range(start, total):
             # The first rollout of a process compiles the kernels.
             with run.phase("compile" if iteration == start else "optimise"):
-                row, changes = _iterate(problem, actions, iteration, run.result.best_loss)
+                row, changes = _iterate(episode, actions, iteration, run.result.best_loss)
             run.record(row, actions.state(), **changes)
             best = f"best {run.result.best_loss:.5g}"
             report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best}")
@@ -248,7 +234,7 @@ _COLUMNS = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou",
 
 
 def _iterate(
-    problem: Problem, actions: ActionSequence, iteration: int, best_loss: float
+    episode: Episode, actions: ActionSequence, iteration: int, best_loss: float
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Do one iteration: rollout with gradient, row, update of the actions.
 
@@ -258,7 +244,7 @@ def _iterate(
     start = time.perf_counter()
     tried = actions.numpy()
     try:
-        rollout = problem.rollout(tried, gradient=True)
+        rollout = episode.rollout(tried, gradient=True)
         actions.step(rollout.gradient)
     except RunError as error:
         raise RunError(f"iteration {iteration}: {error}") from error
@@ -271,19 +257,11 @@ def _iterate(
     return row, best if better else {}
 
 
-def _evaluate(problem: Problem, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+def _evaluate(episode: Episode, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
     """Run the best actions in the hard contact model; return its scalars and the last mass tensor."""
-    problem.set_contact("hard")
+    episode.set_contact("hard")
     try:
-        rollout = problem.rollout(actions, gradient=False)
+        rollout = episode.rollout(actions, gradient=False)
     except RunError as error:
         raise RunError(f"final evaluation: {error}") from error
     return rollout.measures, rollout.final_mass
-
-
-def _require_finite(what: str, values: np.ndarray) -> None:
-    """Raise unless all values are finite; of a series over time, shape [T], say where it stops being so."""
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        place = f" at environment step {bad[0] + 1}" if np.ndim(values) == 1 else ""
-        raise RunError(f"{what} is {values.flat[bad[0]]}{place}")

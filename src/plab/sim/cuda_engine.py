@@ -13,7 +13,7 @@ import taichi as ti
 
 from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
 from plab.sim.grid_phases import MASS_MIN
-from plab.sim.storage import BLOCK, BLOCK_BITS, STATE
+from plab.sim.storage import BLOCK, BLOCK_BITS, MEASURES, STATE
 from plab.sim.transfer import spline
 
 __all__ = ["CudaEngine"]
@@ -81,7 +81,7 @@ class CudaEngine(CudaPhases):
             self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp + s)
 
     def losses(self, state: ti.Ndarray, slot: int, terms: ti.Ndarray, at: int, stamp: int) -> None:
-        """Unweighted loss terms of all environments, written to ``terms`` from entry ``at``."""
+        """Measures (:data:`MEASURES`) of all environments, written to ``terms`` from entry ``at``."""
         self.losses_kernel(state, slot, terms, at, stamp)
 
     def step_adjoint(
@@ -185,10 +185,10 @@ class CudaEngine(CudaPhases):
         at: ti.i32,
         stamp: ti.i32,
     ):
-        """Unweighted loss terms; leaves mass and the loss's slope at the nodes of active blocks."""
+        """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
         self.block_count[0] = 0
         for e in range(self.batch):
-            self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 2)
+            self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 4)
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             if particle < self.particles:
@@ -203,23 +203,31 @@ class CudaEngine(CudaPhases):
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, (self.block_count[0] << NODE_BITS) // BLOCK)):
                 e, first = self.node_of((w + turn * self.node_threads) * BLOCK)
-                part = ti.Vector.zero(ti.f64, 2)
+                part = ti.Vector.zero(ti.f64, 4)
                 for r in range(BLOCK):
                     i = ti.Vector([first[0], first[1], first[2] + r])
                     node = e * self.nodes + self.linear(i)
                     mass = self.take(self.momentum, node)[3]
-                    density, sdf, slope = self.node_loss(e, i, mass)
-                    part += ti.Vector([ti.cast(density, ti.f64), ti.cast(sdf, ti.f64)])
+                    density, sdf, slope, overlap = self.node_loss(e, i, mass)
+                    part[0] += density
+                    part[1] += sdf
+                    part[2] += overlap
+                    part[3] = ti.max(part[3], ti.cast(mass, ti.f64))
                     self.velocity[node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
-                if part[0] != 0.0 or part[1] != 0.0:
-                    ti.atomic_add(self.loss_part[e, 0], part)
+                # Written so that NaN is not taken for an empty row.
+                if not (part[0] == 0.0 and part[1] == 0.0 and part[3] == 0.0):
+                    for c in ti.static(range(3)):
+                        ti.atomic_add(self.loss_part[e, 0][c], part[c])
+                    # Most rows are below a peak seen already.
+                    if part[3] > self.loss_part[e, 0][3]:
+                        ti.atomic_max(self.loss_part[e, 0][3], part[3])
         for q in range(self.pose_threads * NEAREST_GROUPS):
             for m in ti.static(range(self.manipulators)):
                 if ti.static(self.motions[m] != "static"):
                     if q // NEAREST_GROUPS % max(1, self.manipulators) == m:
                         self.scan_group(q // (NEAREST_GROUPS * self.manipulators), m, q % NEAREST_GROUPS)
         for e in range(self.batch):
-            self.join_losses(e, terms, at + 3 * e)
+            self.join_losses(e, terms, at + MEASURES * e)
 
     @ti.kernel
     def loss_gradient_kernel(

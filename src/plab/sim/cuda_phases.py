@@ -299,7 +299,7 @@ class CudaPhases(Phases):
 
     @ti.func
     def join_losses(self, e, terms: ti.template(), at):
-        """Three unweighted terms of an environment, and its nearest particles."""
+        """Measures of an environment, and its nearest particles."""
         for m in ti.static(range(self.manipulators)):
             if ti.static(self.motions[m] == "static"):
                 self.contact_part[e, 0, m] = 0.0
@@ -308,3 +308,5 @@ class CudaPhases(Phases):
         terms[at] = self.target_sum[e] + self.loss_part[e, 0][0]
         terms[at + 1] = self.loss_part[e, 0][1]
         terms[at + 2] = self.contact_term(e)
+        terms[at + 3] = self.loss_part[e, 0][2]
+        terms[at + 4] = self.loss_part[e, 0][3]

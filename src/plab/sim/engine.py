@@ -17,7 +17,7 @@ from plab.sim.loss_phases import LossPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.pose_phases import PosePhases
 from plab.sim.runtime import Runtime
-from plab.sim.storage import BLOCK, STAGE, STATE, WORK
+from plab.sim.storage import BLOCK, MEASURES, STAGE, STATE, WORK
 from plab.sim.transfer import spline
 
 __all__ = ["CpuEngine"]
@@ -83,7 +83,8 @@ class CpuEngine(Phases):
     """Kernels for the CPU.
 
     The public methods are :meth:`step`, :meth:`losses`, :meth:`step_adjoint`, :meth:`place`,
-    :meth:`export_mass` and :meth:`copy_slot`; :class:`plab.sim.cuda_engine.CudaEngine` has the same.
+    :meth:`export_mass`, :meth:`observe` and :meth:`copy_slot`;
+    :class:`plab.sim.cuda_engine.CudaEngine` has the same.
     """
 
     def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
@@ -262,7 +263,7 @@ class CpuEngine(Phases):
     @ti.func
     def grid_loss_chunk(self, e, c):
         """Loss terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
-        part = ti.Vector.zero(ti.f64, 2)
+        part = ti.Vector.zero(ti.f64, 4)
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
             holders = self.block_chunks[e * self.blocks + block]
@@ -270,19 +271,23 @@ class CpuEngine(Phases):
                 i = self.node_of_block(block, r)
                 node = self.linear(i)
                 mass = self.take(self.momentum, e, node, holders)[3]
-                density, sdf, slope = self.node_loss(e, i, mass)
+                density, sdf, slope, overlap = self.node_loss(e, i, mass)
                 part[0] += density
                 part[1] += sdf
+                part[2] += overlap
+                part[3] = ti.max(part[3], ti.cast(mass, ti.f64))
                 self.velocity[e * self.nodes + node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
         self.loss_part[e, c] = part
 
     @ti.func
     def join_losses(self, e, terms: ti.template(), at):
-        """Sum the chunks' parts into three unweighted terms; the nearest particles go to chunk 0's
-        entries."""
-        part = ti.Vector.zero(ti.f64, 2)
+        """Join the chunks' parts into the measures; the nearest particles go to chunk 0's entries."""
+        part = ti.Vector.zero(ti.f64, 4)
         for c in range(self.chunks):
-            part += self.loss_part[e, c]
+            share = self.loss_part[e, c]
+            peak = ti.max(part[3], share[3])
+            part += share
+            part[3] = peak
             for m in ti.static(range(self.manipulators)):
                 if self.contact_part[e, c, m] < self.contact_part[e, 0, m]:
                     self.contact_part[e, 0, m] = self.contact_part[e, c, m]
@@ -293,12 +298,14 @@ class CpuEngine(Phases):
         terms[at] = self.target_sum[e] + part[0]
         terms[at + 1] = part[1]
         terms[at + 2] = self.contact_term(e)
+        terms[at + 3] = part[2]
+        terms[at + 4] = part[3]
 
     @ti.func
     def losses_of_team(
         self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at
     ):
-        """Loss terms of one environment."""
+        """Measures of one environment."""
         for r in range(self.rounds(rank, size)):
             self.scatter_mass_chunk(state, slot, e, rank + r * size, stamp)
         self.barrier(team, size)
@@ -384,7 +391,7 @@ class CpuEngine(Phases):
         at: ti.i32,
         stamp: ti.i32,
     ):
-        """Unweighted loss terms of all environments, written to ``terms`` from entry ``at``."""
+        """Measures (:data:`MEASURES`) of all environments, written to ``terms`` from entry ``at``."""
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
@@ -394,7 +401,7 @@ class CpuEngine(Phases):
                 rank = q // SPLIT % size
                 for turn in range((self.batch - team + teams - 1) // teams):
                     e = team + turn * teams
-                    self.losses_of_team(state, slot, e, team, rank, size, stamp, terms, at + 3 * e)
+                    self.losses_of_team(state, slot, e, team, rank, size, stamp, terms, at + MEASURES * e)
 
     @ti.kernel
     def step_adjoint_kernel(
@@ -429,7 +436,7 @@ class CpuEngine(Phases):
                     if rank == 0:
                         self.advance_manipulators(e, actions, poses, t, t, t + 1)
                     self.barrier(team, size)
-                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, 3 * e)
+                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, MEASURES * e)
                     for r in range(self.rounds(rank, size)):
                         self.loss_gradient_chunk(state, end, bar, e, rank + r * size)
                     self.barrier(team, size)

@@ -50,10 +50,12 @@ class LossPhases(Storage):
 
     @ti.func
     def node_loss(self, e, i, mass):
-        """Density and SDF terms of one node, relative to an empty node, and d (weighted loss) / d mass."""
+        """Density and SDF terms of one node, relative to an empty node, d (weighted loss) / d mass, and mass
+        times target mass."""
         density = 0.0 * mass
         sdf = 0.0 * mass
         slope = 0.0 * mass
+        overlap = 0.0 * mass
         index = self.tensor_index(e, i)
         # Written so that NaN is not taken for an empty node.
         if index >= 0 and not (mass <= 0.0):
@@ -61,13 +63,14 @@ class LossPhases(Storage):
             weights = self.loss_weights[None]
             density = ti.abs(difference) - self.target[index]
             sdf = self.target_sdf[index] * mass
+            overlap = self.target[index] * mass
             sign = 0.0 * mass
             if difference > 0.0:
                 sign = 1.0
             elif difference < 0.0:
                 sign = -1.0
             slope = weights[0] * sign + weights[1] * self.target_sdf[index]
-        return density, sdf, slope
+        return density, sdf, slope, overlap
 
     @ti.func
     def mass_slope(self, grid: ti.template(), e, base, fx):

@@ -7,6 +7,8 @@ quaternion products. Everything here is float64 in both precisions; a manipulato
 
 import taichi as ti
 
+from plab.scene import ROLL_RADIUS
+
 __all__ = [
     "ROLL_RADIUS",
     "advance_pose",
@@ -15,9 +17,6 @@ __all__ = [
     "rotation_matrix_adjoint",
 ]
 
-ROLL_RADIUS = 0.03
-"""Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
-release."""
 
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)

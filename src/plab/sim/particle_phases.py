@@ -62,6 +62,23 @@ class ParticlePhases(Storage):
         """Three scalars of one particle as a vector."""
         return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
 
+    @ti.kernel
+    def observe(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        places: ti.types.ndarray(ndim=1),
+        count: ti.i32,
+        out: ti.types.ndarray(ndim=1),
+    ):
+        """Write position and velocity of ``count`` particles per environment, at their places in the tiles'
+        order."""
+        for q in range(self.batch * count):
+            tile = places[q] // self.lanes
+            lane = places[q] % self.lanes
+            entry = self.tile_entry(0, q // count, tile)
+            for i in ti.static(range(6)):
+                out[q * 6 + i] = state[entry + i][lane]
+
     @ti.func
     def stencil(self, x):
         """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5).

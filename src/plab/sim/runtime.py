@@ -52,6 +52,7 @@ class Runtime:
 
 _current: Runtime | None = None
 _users: weakref.WeakSet = weakref.WeakSet()
+_process: int | None = None
 
 
 def available_threads() -> int:
@@ -78,8 +79,16 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     Raises:
         DeviceError: If CUDA was asked for and is not there.
         ValueError: If a name is unknown.
+        RuntimeError: If this process was forked from one that has started Taichi.
     """
-    global _current
+    global _current, _process
+    if _process not in (None, os.getpid()):
+        # Taichi would wait for its threads, which a fork leaves behind.
+        raise RuntimeError(
+            "plab cannot be used in a process forked from one that uses it: start workers with the context "
+            "'forkserver' or 'spawn', such as make_vec(..., vector_kwargs={'context': 'spawn'})"
+        )
+    _process = os.getpid()
     if device not in DEVICES:
         raise ValueError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
@@ -94,11 +103,11 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     # that the next one starts from a fresh count when nothing is left of those before.
     if same and len(_users) > 0:
         return _current
-    _users.clear()
     if device == "cuda" and not cuda_available():
         raise DeviceError(
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
         )
+    _users.clear()
     # Taichi announces the device on standard output, which belongs to the caller.
     with contextlib.redirect_stdout(io.StringIO()):
         _start_taichi(device, precision, wanted)

@@ -11,9 +11,9 @@ import taichi as ti
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
-from plab.sim.storage import STATE
+from plab.sim.storage import MEASURES, STATE
 
-__all__ = ["CONTACT_MODELS", "Rollout", "Simulator", "State"]
+__all__ = ["CONTACT_MODELS", "Measures", "Rollout", "Simulator", "State"]
 
 CONTACT_MODELS = ("soft", "hard")
 
@@ -40,18 +40,36 @@ class State:
 
 
 @dataclass(frozen=True)
+class Measures:
+    """What a state is judged by.
+
+    Attributes:
+        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3].
+        iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
+            NaN before :meth:`Simulator.set_target`.
+    """
+
+    terms: np.ndarray
+    iou: np.ndarray
+
+
+@dataclass(frozen=True)
 class Rollout:
     """What a rollout of T environment steps gives.
 
     Attributes:
         initial_terms: Unweighted loss terms (density, SDF, contact) of the initial state, shape [batch, 3].
         step_terms: The same after each environment step, shape [batch, T, 3].
+        initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
+        step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
             [batch, T, action], or None if it was not asked for.
     """
 
     initial_terms: np.ndarray
     step_terms: np.ndarray
+    initial_iou: np.ndarray
+    step_iou: np.ndarray
     gradient: np.ndarray | None
 
 
@@ -105,7 +123,9 @@ class Simulator:
         self._bar: ti.Ndarray | None = None
         self._current = self._state_array(1)
         self._initial = self._state_array(1)
-        self._scratch_terms = ti.ndarray(ti.f64, shape=3 * self.batch)
+        self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
+        self._observed: dict[int, tuple[ti.Ndarray, ti.Ndarray]] = {}
+        self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
         self._order = np.stack([_cell_order(x, scenes[0].grid_size) for x in positions])
@@ -119,6 +139,16 @@ class Simulator:
         self.reset()
 
     # -- sizes --------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> str:
+        """``cpu`` or ``cuda``."""
+        return self._runtime.device
+
+    @property
+    def precision(self) -> str:
+        """``float32`` or ``float64``."""
+        return self._runtime.precision
 
     @property
     def batch(self) -> int:
@@ -187,6 +217,8 @@ class Simulator:
         self._engine.target_sdf.from_numpy(np.asarray(sdf, self._numpy_real).reshape(-1))
         sums = np.asarray(mass, self._numpy_real).astype(np.float64).sum(axis=(1, 2, 3))
         self._engine.target_sum.from_numpy(sums)
+        peaks = np.asarray(mass, self._numpy_real).astype(np.float64).max(axis=(1, 2, 3))
+        self._target_scale = np.stack([sums, peaks])
 
     # -- forward ------------------------------------------------------------------------------------
 
@@ -235,25 +267,32 @@ class Simulator:
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
         whole[0] = self._initial_poses
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
-        terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * 3)
+        terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
         self._losses(self._current, 0, terms, 0)
         self._run_forward(array, poses, terms, steps, plan)
-        values = terms.to_numpy().reshape(steps + 1, self.batch, 3)
+        values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
         self._check_fault()
         self._check_terms(values)
         actions_bar = self._run_backward(array, poses, steps, plan) if plan is not None else None
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
-        return Rollout(values[0], values[1:].transpose(1, 0, 2), actions_bar)
+        judged = self._measures(values)
+        step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
+        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar)
+
+    def measure(self) -> Measures:
+        """Loss terms and soft IoU of the current state."""
+        self._require_runtime()
+        self._losses(self._current, 0, self._scratch_terms, 0)
+        return self._measures(self._scratch_terms.to_numpy().reshape(self.batch, MEASURES))
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
-        self._require_runtime()
-        self._losses(self._current, 0, self._scratch_terms, 0)
-        return self._scratch_terms.to_numpy().reshape(self.batch, 3)
+        return self.measure().terms
 
     def mass_tensor(self) -> np.ndarray:
         """Mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
-        self.losses()
+        self._require_runtime()
+        self._losses(self._current, 0, self._scratch_terms, 0)
         n = self.grid_size
         out = np.zeros(self.batch * n**3, self._numpy_real)
         self._engine.export_mass(out)
@@ -263,9 +302,32 @@ class Simulator:
 
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
-        self._require_runtime()
-        poses = self._pose.to_numpy()[: self._initial_poses.size].reshape(self._initial_poses.shape)
+        poses = self.poses()
         return self._unpack(self._current.to_numpy(), poses)
+
+    def observe(self, stride: int) -> np.ndarray:
+        """Position and velocity of every ``stride``-th particle, in the order in which they were given.
+
+        Only these are copied from the device.
+
+        Args:
+            stride: Distance of the observed particles' numbers, at least 1.
+
+        Returns:
+            Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
+        """
+        self._require_runtime()
+        if stride not in self._observed:
+            self._observed[stride] = self._allocate_observation(stride)
+        places, out = self._observed[stride]
+        count = places.shape[0] // self.batch
+        self._engine.observe(self._current, places, count, out)
+        return out.to_numpy().reshape(self.batch, count, 6)
+
+    def poses(self) -> np.ndarray:
+        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`."""
+        self._require_runtime()
+        return self._pose.to_numpy()[: self._initial_poses.size].reshape(self._initial_poses.shape)
 
     def set_state(self, state: State) -> None:
         """Replace the current state.
@@ -297,6 +359,21 @@ class Simulator:
         self._engine.copy_slot(self._current, 0, self._initial, 0)
 
     # -- internals ----------------------------------------------------------------------------------
+
+    def _measures(self, values: np.ndarray) -> Measures:
+        """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""
+        overlap, peak = values[..., 3], values[..., 4]
+        target_sum, target_peak = self._target_scale
+        total = self.scenes[0].particle_mass * self.particle_count
+        both = overlap / (peak * target_peak)
+        return Measures(values[..., :3], both / (total / peak + target_sum / target_peak - both))
+
+    def _allocate_observation(self, stride: int) -> tuple[ti.Ndarray, ti.Ndarray]:
+        """Places of the observed particles in the tiles' order, and room for what is observed of them."""
+        where = np.argsort(self._order, axis=1)[:, ::stride]
+        places = ti.ndarray(ti.i32, shape=where.size)
+        places.from_numpy(where.astype(np.int32).reshape(-1))
+        return places, ti.ndarray(self._runtime.real, shape=where.size * 6)
 
     def _state_array(self, slots: int) -> ti.Ndarray:
         engine = self._engine
@@ -351,7 +428,7 @@ class Simulator:
         if length is None:
             for t in range(steps):
                 self._advance(self._current, 0, 0, t, actions, poses)
-                self._losses(self._current, 0, terms, (t + 1) * self.batch * 3)
+                self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
             return
         segments = -(-steps // length)
         self._allocate_gradient(length, segments)
@@ -365,10 +442,10 @@ class Simulator:
                 if last:
                     slot = (t - k * length) * self.substeps
                     self._advance(self._history, slot, 1, t, actions, poses)
-                    self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * 3)
+                    self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * MEASURES)
                 else:
                     self._advance(self._current, 0, 0, t, actions, poses)
-                    self._losses(self._current, 0, terms, (t + 1) * self.batch * 3)
+                    self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
         end = (steps - (segments - 1) * length) * self.substeps
         self._engine.copy_slot(self._history, end, self._current, 0)
 

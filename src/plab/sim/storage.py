@@ -23,10 +23,13 @@ from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
 from plab.sim.runtime import Runtime
 
-__all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "STATE", "WORK", "Storage"]
+__all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "MEASURES", "STATE", "WORK", "Storage"]
 
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9)."""
+
+MEASURES = 5
+"""Entries per environment of what a state is judged by: density, SDF and contact term, overlap, peak."""
 
 BLOCK_BITS = 2
 BLOCK = 1 << BLOCK_BITS
@@ -143,7 +146,8 @@ class Storage:
         self.target = ti.field(real, shape=b * self.n**3)
         self.target_sdf = ti.field(real, shape=b * self.n**3)
         self.target_sum = ti.field(ti.f64, shape=b)
-        self.loss_part = ti.Vector.field(2, ti.f64, shape=(b, self.chunks))
+        # Density, SDF, overlap (sum of mass times target mass) and peak (largest mass).
+        self.loss_part = ti.Vector.field(4, ti.f64, shape=(b, self.chunks))
         self.contact_part = ti.field(real, shape=(b, self.chunks, m))
         self.contact_particle = ti.field(ti.i32, shape=(b, self.chunks, m))
         self.once = ti.field(ti.i32, shape=())

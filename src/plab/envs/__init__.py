@@ -1,0 +1,45 @@
+"""Environments: the tasks for reinforcement learning, through Gymnasium and Stable-Baselines3.
+
+Importing plab registers ``plab/<Task>-v<variant>`` for every task of the suite and its five variants. This
+module imports neither Taichi nor torch nor Hydra; making an environment does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+
+from plab.suite import SUITE_VARIANTS, suite_tasks
+
+__all__ = ["register_suite", "register_task"]
+
+
+def register_suite() -> None:
+    """Register all tasks of the suite with Gymnasium."""
+    for task in suite_tasks():
+        register_task(task)
+
+
+def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs: Any) -> None:
+    """Register ``plab/<task>-v<variant>`` with Gymnasium.
+
+    Args:
+        task: Name of the task, a file of ``task/`` in plab's own folder or in ``config_dir``.
+        variants: Numbers of its variants.
+        **kwargs: Arguments of :class:`plab.envs.single.PlabEnv` that are always the same, such as
+            ``config_dir``.
+    """
+    for variant in variants:
+        env_id = f"plab/{task}-v{variant}"
+        gymnasium.register(
+            env_id,
+            entry_point="plab.envs.single:PlabEnv",
+            vector_entry_point="plab.envs.vector:PlabVectorEnv",
+            kwargs={"task": task, "variant": variant, **kwargs},
+        )
+        # To Gymnasium a version is a revision, and every one but the highest out of date: it would warn of
+        # v1 to v4. Variants are no revisions, so the number is made a part of the name.
+        spec = gymnasium.registry[env_id]
+        spec.name, spec.version = f"{task}-v{variant}", None

@@ -1,0 +1,306 @@
+"""What all environments share: a batch of episodes that start, advance and end together.
+
+The environments for Gymnasium and Stable-Baselines3 put :class:`EpisodeBatch` into the form that each library
+asks for, and add nothing of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike
+
+from plab.config import Config, load_config
+from plab.objective import OBSERVED_PARTICLES, scores_from_iou, total_loss
+from plab.problem import Problem
+from plab.scene import Scene
+from plab.sim import CONTACT_MODELS, Simulator
+
+if TYPE_CHECKING:
+    from plab.render import Renderer
+
+__all__ = [
+    "METADATA",
+    "EpisodeBatch",
+    "Transition",
+    "action_array",
+    "check_render_mode",
+    "compose_configs",
+    "refuse_options",
+]
+
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
+"""Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
+
+
+# -------------------------------------------------------------------------------------------------- arguments
+
+
+def compose_configs(
+    task: str,
+    variant: str,
+    *,
+    num_envs: int = 1,
+    overrides: Sequence[str] = (),
+    overrides_per_env: Sequence[Sequence[str]] | None = None,
+    config_dir: str | Path | None = None,
+) -> list[Config]:
+    """Compose one configuration per sub-environment.
+
+    Args:
+        task: Name of the task.
+        variant: Name of its variant.
+        num_envs: Number of sub-environments.
+        overrides: Overrides for all of them, as on the command line.
+        overrides_per_env: Further overrides, one list per sub-environment.
+        config_dir: Folder with YAML files of the user's own.
+
+    Returns:
+        The checked configurations.
+
+    Raises:
+        ValueError: If the numbers do not fit, or overrides are no lists or name a task.
+        plab.config.ConfigError: If an override or a file does not fit.
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+    own = [()] * num_envs if overrides_per_env is None else list(overrides_per_env)
+    if len(own) != num_envs:
+        raise ValueError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
+    for entries in (overrides, *own):
+        _check_overrides(entries, task)
+    lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
+    made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
+    return [made[entries] for entries in lists]
+
+
+def _check_overrides(overrides: Sequence[str], task: str) -> None:
+    if isinstance(overrides, str):
+        raise ValueError(f"overrides are a list of texts, such as ['sim.device=cuda'], not '{overrides}'")
+    for override in overrides:
+        if override.partition("=")[0] == "task":
+            raise ValueError(f"'{override}' in an environment of task {task}: make that task's environment")
+
+
+def action_array(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return actions as an array, float64.
+
+    Args:
+        actions: What the caller gave.
+        shape: Shape that it must have.
+
+    Raises:
+        ValueError: If it has another shape or its entries are no numbers.
+    """
+    array = np.asarray(actions, np.float64)
+    if array.shape != shape:
+        raise ValueError(f"actions have shape {list(array.shape)}, not {list(shape)}")
+    return array
+
+
+def refuse_options(options: Mapping[str, Any] | None) -> None:
+    """Raise ValueError if ``reset`` was given an option: there are none."""
+    if options:
+        raise ValueError(f"unknown reset option '{next(iter(options))}': plab's environments have none")
+
+
+def check_render_mode(render_mode: str | None) -> str | None:
+    """Return a render mode that exists.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    modes = METADATA["render_modes"]
+    if render_mode is not None and render_mode not in modes:
+        raise ValueError(f"render_mode '{render_mode}' is not one of {', '.join(modes)}")
+    return render_mode
+
+
+# --------------------------------------------------------------------------------------------------- episodes
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What one step of all sub-environments gave. The arrays are the caller's.
+
+    Attributes:
+        observation: Observations, shape [batch, entry], float32.
+        reward: Rewards, shape [batch], float64.
+        truncated: Whether the episodes are over.
+        info: The entries of ``info``, each of shape [batch], float64.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    truncated: bool
+    info: dict[str, np.ndarray]
+
+
+class EpisodeBatch:
+    """Sub-environments in one simulator, all in the same step of their episodes.
+
+    Attributes:
+        problem: Their scenes, targets and simulator.
+        size: Number of sub-environments.
+        horizon: Steps of an episode.
+        observation_space: Space of one sub-environment's observation.
+        action_space: Space of one sub-environment's action.
+    """
+
+    def __init__(self, cfgs: Sequence[Config], *, contact: str = "hard") -> None:
+        """Build everything; the episodes start at :meth:`reset`.
+
+        Args:
+            cfgs: One configuration per sub-environment, alike in ``sim`` and ``method``.
+            contact: Contact model, ``hard`` or ``soft``.
+
+        Raises:
+            ValueError: If the contact model does not exist.
+            plab.config.ConfigError: If the configurations do not fit together.
+            plab.scene.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+            plab.targets.TargetError: If a target cannot be built.
+            plab.sim.DeviceError: If CUDA was asked for and is not there.
+            RuntimeError: If this process was forked from one that has made environments.
+        """
+        if contact not in CONTACT_MODELS:
+            raise ValueError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
+        self.problem: Problem | None = Problem(cfgs)
+        self.size = len(cfgs)
+        self.horizon = cfgs[0].sim.horizon
+        scenes = self.problem.scenes
+        self._stride = max(scenes[0].particle_count // OBSERVED_PARTICLES, 1)
+        self._pose_entries = _pose_entries(scenes[0])
+        self.observation_space = _observation_space(scenes, self._stride)
+        self.action_space = Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
+        self._renderers: list[Renderer] = []
+        self._step: int | None = None
+        self._simulator.set_contact(contact, softness=cfgs[0].method.softness)
+        self._judged = self.problem.scores(self.problem.initial_mass)
+        self._initial_info = self._info()
+        self._initial_observation = self._observe()
+
+    @property
+    def _simulator(self) -> Simulator:
+        if self.problem is None:
+            raise RuntimeError("the environment is closed: make a new one")
+        return self.problem.simulator
+
+    def reset(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Put all sub-environments into their initial states.
+
+        Returns:
+            Observations, shape [batch, entry], float32; and ``info``, each entry of shape [batch].
+
+        Raises:
+            RuntimeError: If the environment is closed or its simulator's memory is gone.
+        """
+        self._simulator.reset()
+        self._step = 0
+        # Copies: a caller may keep and change what it is given.
+        return self._initial_observation.copy(), {name: v.copy() for name, v in self._initial_info.items()}
+
+    def step(self, actions: np.ndarray) -> Transition:
+        """Advance all sub-environments by one step.
+
+        Args:
+            actions: Actions, shape [batch, action]; clipped to [-1, 1].
+
+        Raises:
+            ValueError: If the shape is wrong or an action is not finite.
+            gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
+            plab.sim.SimulationError: If a state stops being finite.
+            RuntimeError: If the environment is closed or its simulator's memory is gone.
+        """
+        simulator = self._simulator
+        if self._step is None or self._step == self.horizon:
+            what = "no episode has started" if self._step is None else "the episode is over"
+            raise ResetNeeded(f"{what}: call reset() before step()")
+        simulator.step(actions)
+        self._step += 1
+        info = self._info()
+        reward = self._initial_info["loss"] - info["loss"]
+        return Transition(self._observe(), reward, self._step == self.horizon, info)
+
+    def frames(self) -> tuple[np.ndarray, ...]:
+        """Draw the current states.
+
+        Returns:
+            One picture per sub-environment, shape [height, width, 3], uint8.
+        """
+        simulator = self._simulator
+        if not self._renderers:
+            # Imported here: drawing is not for everyone, and its library takes a second to load.
+            from plab.render import Renderer
+
+            pairs = zip(self.problem.scenes, self.problem.target_mass, strict=True)
+            self._renderers = [Renderer(scene, target) for scene, target in pairs]
+        x, poses = simulator.observe(1)[..., :3], simulator.poses()
+        return tuple(r.frame(x[e], poses[e]) for e, r in enumerate(self._renderers))
+
+    def close(self) -> None:
+        """Let go of the simulator and the renderers; closing twice is allowed."""
+        for renderer in self._renderers:
+            renderer.close()
+        self._renderers = []
+        self.problem = None
+
+    def _observe(self) -> np.ndarray:
+        particles, poses = self._simulator.observe(self._stride), self._simulator.poses()
+        out = np.empty((self.size, *self.observation_space.shape), np.float32)
+        split = particles[0].size
+        out[:, :split] = particles.reshape(self.size, -1)
+        out[:, split:] = poses.reshape(self.size, -1)[:, self._pose_entries]
+        return out
+
+    def _info(self) -> dict[str, np.ndarray]:
+        measures = self._simulator.measure()
+        density, sdf, contact = measures.terms.T.copy()
+        pairs = zip(self._judged, measures.iou, strict=True)
+        scores = [scores_from_iou(first.iou_initial, iou, first.iou_target_self) for first, iou in pairs]
+        return {
+            "loss": total_loss(measures.terms, self.problem.weights),
+            "loss_density": density,
+            "loss_sdf": sdf,
+            "loss_contact": contact,
+            "iou": measures.iou,
+            "score": np.array([s.score for s in scores]),
+            "score_printed": np.array([s.score_printed for s in scores]),
+        }
+
+
+def _pose_entries(scene: Scene) -> np.ndarray:
+    """Return which of the manipulators' 8 numbers each are observed: the gap only of chopsticks."""
+    observed = np.ones((len(scene.manipulators), 8), bool)
+    observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
+    return np.flatnonzero(observed)
+
+
+def _observation_space(scenes: Sequence[Scene], stride: int) -> Box:
+    """Return the space that holds the observations of all scenes."""
+    observed = len(range(0, scenes[0].particle_count, stride))
+    # A particle that crosses the domain in one substep is a fault that ends the simulation.
+    speed = 1.0 / scenes[0].dt
+    low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
+    bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
+    return Box(
+        np.concatenate([low * observed, bounds[:, 0].min(axis=0)]).astype(np.float32),
+        np.concatenate([high * observed, bounds[:, 1].max(axis=0)]).astype(np.float32),
+        dtype=np.float32,
+    )
+
+
+def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
+    """Return the lowest and the highest poses of the manipulators, 8 numbers each."""
+    low, high = [], []
+    for m in scene.manipulators:
+        widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.shape == "Chopsticks" else m.gap
+        low += [*m.lower_bound, *[-1.0] * 4, min(m.gap, m.minimal_gap)]
+        # Opened all the way step by step, the gap is off by some rounding.
+        high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]
+    return low, high

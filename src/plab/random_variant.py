@@ -1,0 +1,181 @@
+"""``variant=random``: a start and a target drawn from the ranges in the task's section ``random``.
+
+What is drawn depends on the task and on ``seed_scene`` alone: not on the method's seed, the machine, the grid
+or the number of particles.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from plab.config_errors import ConfigError, explain, pick
+from plab.config_types import RandomConfig, RangeConfig, TaskConfig
+from plab.scene import Body, Scene, SceneError
+from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
+from plab.variants import variant_changes
+
+__all__ = ["ATTEMPTS", "FIRST_TARGET_SEED", "draw_variant"]
+
+ATTEMPTS = 100
+"""How often a scene is drawn until one is valid."""
+
+DECIMALS = 4
+"""Drawn numbers are rounded to so many decimals, as the suite's own are."""
+
+FIRST_TARGET_SEED = 1000
+"""Drawn seeds of scripted targets are not below this, so that none is that of a variant in a YAML."""
+
+# Entropy besides seed_scene, one per purpose; 0 would be the same as none.
+_NUMBERS, _TARGET_SEED = 1, 2
+
+
+def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
+    """Draw what a variant changes.
+
+    Args:
+        task: A composed task, with all its variants and the section ``random``.
+        seed_scene: Which one to draw, >= 0.
+
+    Returns:
+        A part of the task's structure, as the entries of ``variants`` are.
+
+    Raises:
+        ConfigError: If the task does not say what to draw, or none of :data:`ATTEMPTS` draws is valid.
+        omegaconf.errors.OmegaConfBaseException: If the task lacks a value or has one of the wrong type.
+    """
+    if not task.random:
+        raise ConfigError(
+            f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"
+        )
+    if seed_scene is None or seed_scene < 0:
+        raise ConfigError(f"seed_scene must be an integer of at least 0, not {seed_scene}")
+    random = _ranges(task)
+    fixed = OmegaConf.create({})
+    if random.variant is not None:
+        fixed = variant_changes(task, random.variant)
+    base = OmegaConf.merge(task, fixed)
+    if "seed" in base.target.keys():
+        fixed = OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}})
+    rng = np.random.default_rng([seed_scene, _NUMBERS])
+    for _ in range(ATTEMPTS):
+        changes = OmegaConf.merge(fixed, _draw(base, random, rng))
+        try:
+            _check(OmegaConf.to_object(OmegaConf.merge(base, changes)), random)
+        except (ConfigError, SceneError, TargetError) as error:
+            flaw = error
+            continue
+        return changes
+    raise ConfigError(
+        f"task {task.name}: none of {ATTEMPTS} draws with seed_scene={seed_scene} is valid; the last: {flaw}"
+    )
+
+
+def _ranges(task: DictConfig) -> RandomConfig:
+    try:
+        random = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RandomConfig), task.random))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"task.random: {explain(error)}") from None
+    random.check("task.random")
+    return random
+
+
+def _target_seed(seed_scene: int) -> int:
+    # Not Generator.integers: NumPy keeps SeedSequence the same for good.
+    (word,) = np.random.SeedSequence([seed_scene, _TARGET_SEED]).generate_state(1)
+    return FIRST_TARGET_SEED + int(word) % (2**31 - FIRST_TARGET_SEED)
+
+
+# ------------------------------------------------------------------------------------------------------ draws
+
+
+def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> DictConfig:
+    """Draw all ranges and the displacement once; return them as a part of the task's structure."""
+    changes = OmegaConf.create({})
+    for name, draw in (random.ranges or {}).items():
+        values = _uniform(draw, rng)
+        for key in draw.keys:
+            _require_list(base, key, f"task.random.ranges.{name}.keys")
+            OmegaConf.update(changes, key, values)
+    if random.shift is not None:
+        displacement = _uniform(random.shift, rng)
+        for key in _places(base):
+            if OmegaConf.select(changes, key) is None:
+                start = OmegaConf.select(base, key, throw_on_missing=True)
+                # Rounding takes off the digits that adding decimals leaves, nothing else.
+                moved = [round(a + b, 12) for a, b in zip(start, displacement, strict=True)]
+                OmegaConf.update(changes, key, moved)
+    return changes
+
+
+def _uniform(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
+    unit = rng.random(len(bounds.low))
+    drawn = [low + u * (high - low) for low, high, u in zip(bounds.low, bounds.high, unit, strict=True)]
+    return np.clip(np.round(drawn, DECIMALS), bounds.low, bounds.high).tolist()
+
+
+def _places(base: DictConfig) -> Iterator[str]:
+    """Yield the keys of the centres of all bodies and of the positions of all manipulators that move."""
+    yield from (f"bodies.{name}.center" for name in base.bodies)
+    yield from (f"manipulators.{name}.position" for name, item in base.manipulators.items() if item.scale)
+
+
+def _require_list(base: DictConfig, key: str, path: str) -> None:
+    """Raise unless a key of the task is a list, perhaps one that only variants give."""
+    node: Any = base
+    for name in key.split("."):
+        # A missing value is a list, unless what is drawn does not fit in its place.
+        if node is None:
+            return
+        names = [str(n) for n in node] if isinstance(node, DictConfig) else []
+        if name not in names:
+            raise ConfigError(f"{path}: task.{key} does not exist; {pick(name, names)}")
+        node = None if OmegaConf.is_missing(node, name) else node[name]
+    if not isinstance(node, ListConfig | None):
+        raise ConfigError(f"{path}: task.{key} is not a list of numbers")
+
+
+# ----------------------------------------------------------------------------------------------------- checks
+
+
+def _check(task: TaskConfig, random: RandomConfig) -> None:
+    """Raise what is wrong with a drawn task, short of simulating it."""
+    task.check("task")
+    bodies = tuple(body.build() for body in task.bodies.values())
+    manipulators = tuple(manipulator.build() for manipulator in task.manipulators.values())
+    # The suite's grid and material, not the run's: they must not decide what is drawn.
+    scene = Scene(task.name, bodies, manipulators)
+    scene.validate()
+    check_target(scene, task.target)
+    recipe = make_recipe(task.target)
+    if isinstance(recipe, BodiesTarget):
+        keys = [key for draw in (random.ranges or {}).values() for key in draw.keys]
+        _check_apart(recipe.bodies, {key.split(".")[2] for key in keys if key.startswith("target.bodies.")})
+        if random.reach is not None:
+            _check_reach(task, recipe.bodies, random.reach)
+
+
+def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
+    """Raise if the bounding box of a drawn body of a target overlaps another one's; they may touch."""
+    for (first, a), (second, b) in itertools.combinations(bodies.items(), 2):
+        distance = np.abs(np.subtract(a.center, b.center))
+        overlap = np.all(distance < _half_extent(a) + _half_extent(b) - 1e-9)
+        # Those that are not drawn stick together by intention.
+        if overlap and drawn & {first, second}:
+            raise TargetError(f"target.bodies.{first} overlaps target.bodies.{second}")
+
+
+def _half_extent(body: TargetBody) -> np.ndarray:
+    return Body(body.shape, tuple(body.center), tuple(body.size), 1).half_extent()
+
+
+def _check_reach(task: TaskConfig, goals: dict[str, TargetBody], reach: float) -> None:
+    for name in task.bodies.keys() & goals.keys():
+        way = np.abs(np.subtract(goals[name].center, task.bodies[name].center)).max()
+        if way > reach:
+            raise TargetError(f"target.bodies.{name} is {way:.3g} away along an axis, beyond reach {reach:g}")

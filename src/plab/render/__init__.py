@@ -1,0 +1,21 @@
+"""Pictures of scenes and rollouts: :class:`Renderer`, and ``python -m plab.render`` on the command line.
+
+PyVista, which draws, is optional: ``pip install 'plab[render]'``. docs/rendering.md has the details.
+"""
+
+from typing import Any
+
+from plab.render.camera import Camera, View, fit_camera
+from plab.render.graphics import RenderError, require_graphics
+
+__all__ = ["Camera", "RenderError", "Renderer", "View", "fit_camera"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the renderer when it is asked for: all else works without PyVista."""
+    if name != "Renderer":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require_graphics()
+    from plab.render.renderer import Renderer
+
+    return Renderer

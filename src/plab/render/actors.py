@@ -1,0 +1,183 @@
+"""What is on the stage: clay, manipulators and the target, as PyVista draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyvista as pv
+
+from plab.objective import TARGET_MASS
+from plab.render.camera import Camera
+from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud
+from plab.render.shapes import manipulator_parts, pose_matrix, transform
+from plab.render.surface import Field, target_field
+from plab.scene import Manipulator, Scene
+
+__all__ = ["Clay", "Floor", "Rigid", "Target", "surface_mesh"]
+
+MANIPULATOR_COLOR = "#5a6470"
+TARGET_COLOR = "#2b8c9b"
+
+_CLAY = {"ambient": 0.26, "diffuse": 0.86, "specular": 0.05, "specular_power": 10}
+_METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25, "smooth_shading": True}
+_GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "culling": "back"}
+_SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
+_SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
+_TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
+_SHADOW = 0.6  # strength of the shadows on the floor
+_LINE = 1.3  # width of the floor's lines [pixels]
+_LINE_OPACITY = 0.16
+
+
+class Clay:
+    """A surface of plasticine, darker in its corners.
+
+    Attributes:
+        actors: What stands for it in the window: one actor.
+    """
+
+    def __init__(self, plotter: pv.Plotter, mesh: pv.PolyData, color: str) -> None:
+        """Add it to a window, in the shape of a mesh."""
+        self._color = _rgb(color)
+        mesh["color"] = np.zeros((mesh.n_points, 3), np.uint8)
+        self.actors = [plotter.add_mesh(mesh, scalars="color", rgb=True, smooth_shading=True, **_CLAY)]
+
+    def mould(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
+        """Give it another shape, in the light that there is."""
+        if mesh.n_points:
+            light = ambient.at(mesh.points, mesh.point_normals)[:, None]
+            # Light that goes back and forth between walls of clay takes on more of their colour.
+            mesh["color"] = (255 * light * (self._color / 255) ** (1.5 - 0.5 * light)).astype(np.uint8)
+            mesh.set_active_scalars("color")
+        self.actors[0].mapper.SetInputData(mesh)
+
+
+class Rigid:
+    """A manipulator.
+
+    Attributes:
+        actors: What stands for its parts in the window.
+        cloud: What stands for it in shadows, at the last pose.
+        moves: Whether actions move it.
+    """
+
+    def __init__(self, plotter: pv.Plotter, manipulator: Manipulator) -> None:
+        """Add it to a window."""
+        self.moves = manipulator.action_dim > 0
+        self._parts = manipulator_parts(manipulator)
+        self._samples = [part.scatter(_SAMPLE_AREA) for part in self._parts]
+        self.actors = []
+        for part in self._parts:
+            mesh = pv.PolyData(part.vertices, faces=_quads(part.faces)).clean()
+            mesh = mesh.compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=False)
+            self.actors.append(plotter.add_mesh(mesh, color=MANIPULATOR_COLOR, **_METAL))
+
+    def place(self, pose: np.ndarray) -> None:
+        """Put it at a pose, shape [8]."""
+        matrices = [pose_matrix(pose, part.side) for part in self._parts]
+        for actor, matrix in zip(self.actors, matrices, strict=True):
+            actor.user_matrix = matrix
+        samples = [transform(m, points) for m, points in zip(matrices, self._samples, strict=True)]
+        self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
+
+
+class Target:
+    """The target, as a ghost and as a solid.
+
+    Attributes:
+        actors: What stands for both in the window.
+        mesh: Its surface.
+        cloud: What stands for the solid in shadows.
+        ghost: What stands for the ghost in the window.
+        solid: The solid.
+    """
+
+    def __init__(self, plotter: pv.Plotter, scene: Scene, mass: np.ndarray, camera: Camera) -> None:
+        """Add the target with a mass tensor, shape [n, n, n], to a window."""
+        self.mesh = surface_mesh(target_field(scene, mass), _TARGET_SMOOTHING)
+        self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
+        self.solid = Clay(plotter, self.mesh.copy(), TARGET_COLOR)
+        toward = camera.position - self.mesh.points
+        facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
+        # Like a bubble: clear where it faces the camera, dense at the rim.
+        self._alpha = 255 * (0.2 + 0.6 * (1.0 - facing) ** 1.5)
+        self._bubble = self.mesh.copy()
+        self._bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (self.mesh.n_points, 1)).astype(np.uint8)
+        self.ghost = plotter.add_mesh(self._bubble, scalars="color", rgba=True, smooth_shading=True, **_GLASS)
+        self.actors = [self.ghost, *self.solid.actors]
+
+    def fade(self, bodies: Sequence[Field]) -> None:
+        """Let the ghost vanish where the plasticine's surface has come to it."""
+        density = sum(field.at(self.mesh.points) for field in bodies)
+        self._bubble["color"][:, 3] = self._alpha * np.clip((0.12 - density) / 0.1, 0.0, 1.0)
+        self._bubble.Modified()
+
+
+class Floor:
+    """Paper with lines, ten to the domain unit, on which shadows fall."""
+
+    def __init__(self, plotter: pv.Plotter, paper: str, ink: str, pixel: float) -> None:
+        """Add it to a window.
+
+        Args:
+            plotter: The window.
+            paper: Colour in the light.
+            ink: Colour of the lines, and of the shadows that are too deep to be.
+            pixel: Size of a pixel [domain units], to which the lines are fitted.
+        """
+        self._paper, self._ink = _rgb(paper), _rgb(ink)
+        low, high = FLOOR_LOW, FLOOR_LOW + FLOOR_EDGE
+        corners = np.array([[low, 0, low], [low, 0, high], [high, 0, high], [high, 0, low]])
+        floor = pv.PolyData(corners, faces=_quads(np.arange(4)[None]))
+        floor.active_texture_coordinates = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.float32)
+        self._texture = pv.Texture(np.zeros((2, 2, 3), np.uint8))
+        self._texture.interpolate = True
+        plotter.add_mesh(floor, texture=self._texture, lighting=False)
+        plotter.add_mesh(self._lines(0.5 * _LINE * pixel), color=ink, opacity=_LINE_OPACITY, lighting=False)
+
+    def shade(self, light: np.ndarray) -> None:
+        """Let light fall on it, shape [z, x], as :func:`plab.render.shadows.floor_light` returns it."""
+        dark = _SHADOW * (1.0 - light)[..., None]
+        colors = self._paper + dark * (self._ink - self._paper)
+        image = pv.ImageData(dimensions=(*light.shape[::-1], 1))
+        image["color"] = colors.reshape(-1, 3).astype(np.uint8)
+        self._texture.SetInputData(image)
+
+    def _lines(self, half: float) -> pv.PolyData:
+        """Return the lines, which are narrow rectangles of some half width."""
+        line = np.array([[-half, -half], [-half, 1 + half], [half, 1 + half], [half, -half]])
+        along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
+        both = np.concatenate([along, along[:, ::-1]])
+        # Just above the floor, which would hide them otherwise.
+        corners = np.arange(len(both)).reshape(-1, 4)
+        return pv.PolyData(np.insert(both, 1, 4e-4, axis=1), faces=_quads(corners))
+
+
+def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.PolyData:
+    """Return the surface of a field, smoothed, with normals.
+
+    Args:
+        field: The field.
+        smoothing: Iterations and pass band of Taubin's filter.
+    """
+    image = pv.ImageData(dimensions=field.values.shape, spacing=(field.spacing,) * 3, origin=field.origin)
+    image["density"] = field.values.ravel(order="F")
+    mesh = image.contour(
+        [field.level], "density", method="flying_edges", compute_normals=False, compute_scalars=False
+    )
+    if not mesh.n_points:
+        return mesh
+    iterations, pass_band = smoothing
+    mesh = mesh.smooth_taubin(n_iter=iterations, pass_band=pass_band)
+    return mesh.compute_normals(split_vertices=False, consistent_normals=False, auto_orient_normals=False)
+
+
+def _quads(corners: np.ndarray) -> np.ndarray:
+    """Return faces of four corners, shape [face, 4], as VTK has them."""
+    return np.insert(corners, 0, 4, axis=1).ravel()
+
+
+def _rgb(color: str) -> np.ndarray:
+    """Return a colour in [0, 255], shape [3]."""
+    return np.array(pv.Color(color).int_rgb, np.float64)

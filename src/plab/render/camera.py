@@ -1,0 +1,146 @@
+"""Where the camera stands."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from plab.objective import TARGET_MASS
+from plab.render.shapes import manipulator_parts, pose_matrix, transform
+from plab.scene import Scene, sample_particles
+
+__all__ = ["DEFAULT_VIEW", "VIEWS", "Camera", "View", "fit_camera", "scene_camera"]
+
+
+@dataclass(frozen=True)
+class View:
+    """The direction from which a task is looked at.
+
+    Attributes:
+        azimuth: Angle around the y axis [degrees]; 0 looks along -z, 90 along -x.
+        elevation: Angle above the floor [degrees].
+    """
+
+    azimuth: float
+    elevation: float
+
+
+DEFAULT_VIEW = View(20.0, 30.0)
+"""View of tasks that :data:`VIEWS` does not have."""
+
+VIEWS: dict[str, View] = {
+    "Assembly": View(10.0, 25.0),
+    "Chopsticks": View(50.0, 28.0),
+    "Move": View(25.0, 38.0),
+    "Pinch": View(30.0, 30.0),
+    "RollingPin": View(25.0, 32.0),
+    "Rope": View(0.0, 50.0),
+    "Table": View(25.0, 22.0),
+    "Torus": View(20.0, 40.0),
+    "TripleMove": View(15.0, 30.0),
+    "Writer": View(20.0, 40.0),
+}
+"""Views by task name."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A perspective camera that stands upright.
+
+    Attributes:
+        position: Where it stands [domain units].
+        look_at: The point in the middle of its pictures [domain units].
+        angle: Vertical field of view [degrees].
+    """
+
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float]
+    angle: float = 24.0
+
+    def axes(self) -> np.ndarray:
+        """Return the unit vectors to the right, up and backwards, in rows, shape [3, 3]."""
+        back = np.subtract(self.position, self.look_at)
+        back /= np.linalg.norm(back)
+        right = np.cross((0.0, 1.0, 0.0), back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), back])
+
+    def pixel(self, height: int) -> float:
+        """Return the size of a pixel at the point looked at [domain units], in pictures of some height."""
+        distance = math.dist(self.position, self.look_at)
+        return 2 * math.tan(math.radians(self.angle) / 2) * distance / height
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return where points of the scene are in a picture.
+
+        Args:
+            points: Positions [domain units], shape [..., 3].
+            size: Width and height of the picture [pixels].
+
+        Returns:
+            Column and row [pixels] from the upper left corner, shape [..., 2].
+        """
+        right, up, back = np.moveaxis((points - np.array(self.position)) @ self.axes().T, -1, 0)
+        scale = size[1] / 2 / math.tan(math.radians(self.angle) / 2)
+        return np.stack([size[0] / 2 - scale * right / back, size[1] / 2 + scale * up / back], axis=-1)
+
+
+def scene_camera(
+    scene: Scene,
+    target_mass: np.ndarray | None = None,
+    size: tuple[int, int] = (480, 360),
+    x: np.ndarray | None = None,
+    poses: np.ndarray | None = None,
+) -> Camera:
+    """Return the camera that sees a scene, its shadows on the floor and its target.
+
+    Args:
+        scene: The scene; its name chooses the direction of view from :data:`VIEWS`.
+        target_mass: Mass tensor of the target, shape [n, n, n].
+        size: Width and height of the pictures [pixels].
+        x: Positions of particles [domain units], shape [..., 3]; those at t = 0 if None.
+        poses: Poses of the manipulators, shape [time, manipulator, 8]; those at t = 0 if None.
+    """
+    if poses is None:
+        poses = np.array([[[*m.position, *m.rotation, m.gap] for m in scene.manipulators]])
+    seen = [(sample_particles(scene) if x is None else x).reshape(-1, 3)]
+    for number, manipulator in enumerate(scene.manipulators):
+        for part in manipulator_parts(manipulator):
+            seen += [transform(pose_matrix(pose, part.side), part.vertices) for pose in poses[:, number]]
+    if target_mass is not None:
+        seen.append(np.argwhere(target_mass > TARGET_MASS) * scene.dx)
+    points = np.concatenate(seen)
+    points[:, 1] = np.maximum(points[:, 1], 0.0)
+    # Shadows tell where in space things are.
+    points = np.concatenate([points, points * [1.0, 0.0, 1.0]])
+    return fit_camera(points, VIEWS.get(scene.name, DEFAULT_VIEW), size[0] / size[1])
+
+
+_MARGIN = 1.08  # factor on the distance from which everything just fits
+_ROUNDS = 4  # of centring; each leaves a few percent of the error before it
+
+
+def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
+    """Return the camera whose pictures hold all points.
+
+    Args:
+        points: What is to be seen [domain units], shape [point, 3].
+        view: Direction to look from.
+        aspect: Width of the picture over its height.
+    """
+    azimuth, elevation = math.radians(view.azimuth), math.radians(view.elevation)
+    level = math.cos(elevation)
+    back = np.array([level * math.sin(azimuth), math.sin(elevation), level * math.cos(azimuth)])
+    look_at = (points.min(axis=0) + points.max(axis=0)) / 2
+    camera = Camera(tuple(look_at + back), tuple(look_at))
+    screen = camera.axes()[:2]
+    slope = math.tan(math.radians(camera.angle) / 2) * np.array([aspect, 1.0])
+    for _ in range(_ROUNDS):
+        across, toward = (points - look_at) @ screen.T, (points - look_at) @ back
+        distance = (np.abs(across) / slope + toward[:, None]).max()
+        # Perspective makes near things larger: centre what is seen, not what is there.
+        seen = across / (distance - toward)[:, None]
+        look_at = look_at + (seen.max(axis=0) + seen.min(axis=0)) / 2 * distance @ screen
+    return Camera(tuple(look_at + _MARGIN * distance * back), tuple(look_at))

@@ -1,0 +1,67 @@
+"""What drawing needs from the system: packages, and an OpenGL that works without a screen."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+from importlib.util import find_spec
+
+__all__ = ["RenderError", "missing_graphics", "require_graphics"]
+
+_EGL_PLATFORM_DEVICE = 0x313F
+_WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
+
+
+class RenderError(RuntimeError):
+    """A picture that cannot be drawn or written; the message is one line that says why and what would do."""
+
+
+def require_graphics() -> None:
+    """Raise :class:`RenderError` if something that drawing needs is missing."""
+    reason = missing_graphics()
+    if reason:
+        raise RenderError(reason)
+
+
+@functools.cache
+def missing_graphics() -> str | None:
+    """Return what is missing for drawing, and how to install it; None if nothing is.
+
+    On Linux, VTK is told to draw through EGL, which needs no screen, unless the environment variable
+    ``VTK_DEFAULT_OPENGL_WINDOW`` says otherwise.
+    """
+    for package, name in (("pyvista", "PyVista"), ("PIL", "Pillow")):
+        if find_spec(package) is None:
+            return f"pictures need {name}, which is not installed: pip install 'plab[render]'"
+    if sys.platform.startswith("linux") and _WINDOW not in os.environ:
+        if not _egl_works():
+            # VTK would end the process with a segmentation fault.
+            return (
+                "pictures need OpenGL through EGL, which does not work here; on Debian and Ubuntu: "
+                "apt-get install libegl1 libgl1-mesa-dri"
+            )
+        os.environ[_WINDOW] = "vtkEGLRenderWindow"
+    return None
+
+
+def _egl_works() -> bool:
+    """Return whether EGL can open one of its devices; the software renderer counts as one."""
+    try:
+        egl = ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    integer, pointer = ctypes.c_uint, ctypes.c_void_p
+    egl.eglGetProcAddress.restype = pointer
+    query_devices = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+    open_display = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if not query_devices or not open_display:
+        return False
+    devices, count = (pointer * 16)(), ctypes.c_int(0)
+    query = ctypes.CFUNCTYPE(integer, integer, pointer, pointer)(query_devices)
+    query(len(devices), ctypes.addressof(devices), ctypes.addressof(count))
+    display = ctypes.CFUNCTYPE(pointer, integer, pointer, pointer)(open_display)
+    egl.eglInitialize.argtypes = [pointer, pointer, pointer]
+    found = (display(_EGL_PLATFORM_DEVICE, device, None) for device in devices[: count.value])
+    return any(egl.eglInitialize(each, None, None) for each in found)

@@ -1,0 +1,174 @@
+"""Files: a strip of start, target and end, a film of the rollout, and the contact sheet of all tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from plab.render.camera import scene_camera
+from plab.render.graphics import RenderError
+from plab.render.recording import Recording
+from plab.render.renderer import INK, PAPER, Renderer
+
+__all__ = ["STEPS_PER_SECOND", "SUFFIXES", "check_output", "save", "save_contact_sheet"]
+
+STEPS_PER_SECOND = 20
+"""Environment steps that a film shows in a second, whatever the number of its frames."""
+
+SUFFIXES = (".png", ".gif", ".mp4")
+"""Suffixes of the files that can be written: a strip of pictures, or a film."""
+
+_HOLD = 1.0  # how long a film shows its last frame [s]
+_FILM_COLORS = 96  # of a GIF
+_SHEET_COLORS = 256
+
+
+def check_output(path: Path) -> None:
+    """Refuse a kind of file that cannot be written, before anything is computed.
+
+    Raises:
+        RenderError: If the suffix is not supported, or what it needs is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise RenderError(f"cannot write {path}: its suffix must be one of {', '.join(SUFFIXES)}")
+    if suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise RenderError("MP4 needs imageio-ffmpeg, which is not installed: pip install 'plab[render]'")
+
+
+def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1) -> None:
+    """Write a recording: a strip as PNG, a film as GIF or MP4.
+
+    Args:
+        recording: What to show.
+        path: File to write; see :func:`check_output`.
+        size: Width and height of a frame [pixels]; even numbers for MP4.
+        every: Environment steps from one frame of a film to the next.
+
+    Raises:
+        RenderError: If the file cannot be written.
+    """
+    scene, target_mass = recording.scene, recording.target_mass
+    camera = scene_camera(scene, target_mass, size, recording.x[[0, -1]], recording.poses[::5])
+    with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path):
+        _WRITERS[path.suffix.lower()](recording, renderer, every, path)
+
+
+def save_contact_sheet(rows: Mapping[str, Sequence[Recording]], path: Path, size: tuple[int, int]) -> None:
+    """Write one picture of many tasks as PNG.
+
+    Args:
+        rows: One row per task: its variants, of which start and target are shown.
+        path: File to write.
+        size: Width and height of a cell [pixels]; start and target share it.
+
+    Raises:
+        RenderError: If the file cannot be written.
+    """
+    width, height = size[0] // 2, size[1]
+    text = max(10, height // 10)
+    left, gap = 8 * text, 2 * text
+    columns = max(map(len, rows.values()))
+    sheet = Image.new("RGB", (left + columns * (2 * width + gap), len(rows) * (height + gap)), PAPER)
+    for row, (task, recordings) in enumerate(rows.items()):
+        top = row * (height + gap)
+        _write(sheet, task, (left // 2, top + height // 2), round(1.2 * text))
+        for column, recording in enumerate(recordings):
+            at = left + column * (2 * width + gap)
+            sheet.paste(_start_and_target(recording, (width, height)), (at, top))
+            _write(sheet, recording.variant, (at + width, top + height + text // 2), text)
+    image = _with_palette(sheet, _palette([np.asarray(sheet)], _SHEET_COLORS))
+    with _writing(path):
+        image.save(path, optimize=True)
+
+
+def _start_and_target(recording: Recording, size: tuple[int, int]) -> Image.Image:
+    with closing(Renderer(recording.scene, recording.target_mass, size)) as renderer:
+        start = renderer.frame(recording.x[0], recording.poses[0])
+        return Image.fromarray(np.concatenate([start, renderer.target(recording.poses[0])], axis=1))
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Make a file's folder, and turn what goes wrong with the file into a RenderError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+# ---------------------------------------------------------------------------------------------------- formats
+
+
+def _save_png(recording: Recording, renderer: Renderer, _every: int, path: Path) -> None:
+    """Write start, target and end, side by side, with captions."""
+    first, last, steps = recording.poses[0], recording.poses[-1], len(recording.x) - 1
+    panels = [
+        (renderer.frame(recording.x[0], first), f"{recording.task}, variant {recording.variant}: start"),
+        (renderer.target(first), "target"),
+        (renderer.frame(recording.x[-1], last), f"after {steps} steps: score {recording.score:.2f}"),
+    ]
+    width, height = renderer.size
+    text = max(12, height // 22)
+    sheet = Image.new("RGB", (len(panels) * (width + text) - text, height + 2 * text), PAPER)
+    for number, (picture, caption) in enumerate(panels):
+        left = number * (width + text)
+        sheet.paste(Image.fromarray(picture), (left, 0))
+        _write(sheet, caption, (left + width // 2, height + text), text)
+    sheet.save(path, optimize=True)
+
+
+def _save_gif(recording: Recording, renderer: Renderer, every: int, path: Path) -> None:
+    frames = list(_frames(recording, renderer, every))
+    # One palette for all: what does not change then costs nothing.
+    palette = _palette([frames[0], frames[len(frames) // 2], frames[-1]], _FILM_COLORS)
+    images = [_with_palette(Image.fromarray(frame), palette) for frame in frames]
+    duration = [1000 * every // STEPS_PER_SECOND] * (len(images) - 1) + [round(1000 * _HOLD)]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+
+
+def _save_mp4(recording: Recording, renderer: Renderer, every: int, path: Path) -> None:
+    import imageio_ffmpeg
+
+    writer = imageio_ffmpeg.write_frames(
+        str(path), renderer.size, fps=STEPS_PER_SECOND / every, codec="libx264", quality=8, macro_block_size=2
+    )
+    with closing(writer):
+        writer.send(None)
+        for frame in _frames(recording, renderer, every):
+            writer.send(np.ascontiguousarray(frame))
+        for _ in range(round(_HOLD * STEPS_PER_SECOND / every) - 1):
+            writer.send(np.ascontiguousarray(frame))
+
+
+_WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
+
+
+def _frames(recording: Recording, renderer: Renderer, every: int) -> Iterator[np.ndarray]:
+    last = len(recording.x) - 1
+    for step in [*range(0, last, every), last]:
+        yield renderer.frame(recording.x[step], recording.poses[step])
+
+
+def _palette(pictures: Sequence[np.ndarray], colors: int) -> Image.Image:
+    """Return a picture whose palette suits all pictures, each of shape [row, column, 3]."""
+    pixels = np.concatenate([picture.reshape(-1, 3) for picture in pictures])
+    seen, counts = np.unique(pixels, axis=0, return_counts=True)
+    # By the root of how often a colour is seen: paper is everywhere, yet clay needs its shades, too.
+    weighted = np.repeat(seen, np.ceil(np.sqrt(counts)).astype(int), axis=0)
+    return Image.fromarray(weighted[None]).quantize(colors, method=Image.Quantize.MEDIANCUT, kmeans=1)
+
+
+def _with_palette(picture: Image.Image, palette: Image.Image) -> Image.Image:
+    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
+
+
+def _write(sheet: Image.Image, text: str, center: tuple[int, int], size: int) -> None:
+    """Write a line of some height [pixels] around a point."""
+    ImageDraw.Draw(sheet).text(center, text, fill=INK, font=ImageFont.load_default(size), anchor="mm")

@@ -1,0 +1,133 @@
+"""Rollouts to look at: a run's best actions, or the known demonstration, in the hard contact model."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from plab.config import load_config
+from plab.config_types import Config, SimConfig, TaskConfig
+from plab.problem import Problem
+from plab.render.graphics import RenderError
+from plab.results import read
+from plab.run import cuda_is_usable
+from plab.scene import Scene
+
+__all__ = ["Recording", "demonstration", "record", "result", "starts"]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A rollout in the hard contact model.
+
+    Attributes:
+        task: Name of the task.
+        variant: Name of the variant.
+        scene: The scene.
+        target_mass: Mass tensor of the target, shape [n, n, n].
+        x: Particle positions [domain units] at the start and after each step, shape [T + 1, particle, 3].
+        poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
+        score: Score of the last state.
+    """
+
+    task: str
+    variant: str
+    scene: Scene
+    target_mass: np.ndarray
+    x: np.ndarray
+    poses: np.ndarray
+    score: float
+
+
+def result(path: Path) -> tuple[Config, np.ndarray]:
+    """Return the configuration, as far as a replay needs it, and the best actions of a result file.
+
+    Raises:
+        plab.results.ResultsError: If the file cannot be read.
+        RenderError: If it has no actions yet.
+    """
+    run = read(path)
+    if run.best_actions is None:
+        raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
+    parts = {
+        name: OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), run.config[name]))
+        for name, kind in (("task", TaskConfig), ("sim", SimConfig))
+    }
+    if parts["sim"].device == "cuda" and not cuda_is_usable():
+        _say("the run used CUDA, which this computer has not: replaying it on the CPU")
+        parts["sim"].device = "cpu"
+    return dataclasses.replace(load_config(), variant=str(run.config["variant"]), **parts), run.best_actions
+
+
+def demonstration(cfg: Config) -> np.ndarray:
+    """Return the best actions that are known for a configuration, or an episode of zeros, shape [T, A].
+
+    Raises:
+        RenderError: If the known actions do not fit the scene.
+    """
+    # Imported here: it reads tables, which the replay of a result does not need.
+    from plab.config import build_scene
+    from plab.demonstrations import known_actions
+
+    scene, actions = build_scene(cfg), known_actions(cfg)
+    if actions is None:
+        _say(
+            f"no demonstration of {cfg.task.name}, variant {cfg.variant}, is known: the manipulators stay put"
+        )
+        return np.zeros((scene.horizon, scene.action_dim))
+    if actions.shape[1] != scene.action_dim:
+        raise RenderError(
+            f"the demonstration of {cfg.task.name}, variant {cfg.variant}, has {actions.shape[1]} action "
+            f"components, but this scene takes {scene.action_dim}"
+        )
+    return actions
+
+
+def record(cfg: Config, actions: np.ndarray) -> Recording:
+    """Run actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
+    problem = Problem([cfg])
+    simulator = problem.simulator
+    simulator.set_contact("hard")
+    simulator.reset()
+    states = [simulator.state()]
+    for action in actions:
+        simulator.step(action[None])
+        states.append(simulator.state())
+    return Recording(
+        task=cfg.task.name,
+        variant=cfg.variant,
+        scene=problem.scenes[0],
+        target_mass=problem.target_mass[0],
+        x=np.stack([state.x[0] for state in states]),
+        poses=np.stack([state.poses[0] for state in states]),
+        score=problem.scores(simulator.mass_tensor())[0].score,
+    )
+
+
+def starts(cfgs: Sequence[Config]) -> list[Recording]:
+    """Return recordings of no step, of configurations of one kind of scene."""
+    problem = Problem(cfgs)
+    state = problem.simulator.state()
+    scores = problem.scores(problem.initial_mass)
+    return [
+        Recording(
+            task=cfg.task.name,
+            variant=cfg.variant,
+            scene=problem.scenes[number],
+            target_mass=problem.target_mass[number],
+            x=state.x[number : number + 1],
+            poses=state.poses[number : number + 1],
+            score=scores[number].score,
+        )
+        for number, cfg in enumerate(cfgs)
+    ]
+
+
+def _say(message: str) -> None:
+    print(f"plab: {message}", file=sys.stderr)

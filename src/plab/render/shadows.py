@@ -1,0 +1,109 @@
+"""Soft shadows: on the floor, and where surfaces meet. Plain NumPy.
+
+Whatever throws a shadow is a cloud of points, each of which covers a small area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+__all__ = ["FLOOR_EDGE", "FLOOR_LOW", "AmbientLight", "Cloud", "floor_light"]
+
+FLOOR_LOW = -0.4
+"""Lowest x and z of the floor that can lie in shadow [domain units]."""
+
+FLOOR_EDGE = 1.8
+"""Edge of that square [domain units]."""
+
+_PIXELS = 192  # of the floor, per axis
+_LAYER_HEIGHTS = np.array([0.0, 0.06, 0.18, 0.45])
+_LAYER_BLURS = 0.008 + 0.16 * _LAYER_HEIGHTS  # the light is not a point: high things throw soft shadows
+
+_CELL = 0.02  # of the grid of covered space
+_BLUR = 1.1  # in cells
+_CELLS_AROUND = 5
+_OPACITY = 1.5
+_LOOK_OUT = 0.03  # distance from a surface at which its light is measured
+_OWN_COVER = 0.06  # what a flat surface covers of its own view
+_STRENGTH = 1.1
+_DARKEST = 0.25
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points that stand for a body or a manipulator.
+
+    Attributes:
+        points: Positions [domain units], shape [point, 3].
+        area: Area that each covers [domain units^2].
+    """
+
+    points: np.ndarray
+    area: float
+
+
+def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
+    """Return how much light reaches the floor.
+
+    Args:
+        clouds: What is above it.
+        light: Direction towards the light, shape [3].
+
+    Returns:
+        Fraction of the light, shape [z, x], from :data:`FLOOR_LOW` on, float32.
+    """
+    pixel = FLOOR_EDGE / _PIXELS
+    layers = np.zeros((len(_LAYER_HEIGHTS), _PIXELS**2))
+    for cloud in clouds:
+        height = np.maximum(cloud.points[:, 1], 0.0)
+        ground = cloud.points[:, ::2] - height[:, None] * light[::2] / light[1]
+        column, row = ((ground - FLOOR_LOW) / pixel).astype(np.int64).clip(0, _PIXELS - 1).T
+        # Shared out between the layers above and below, so that nothing jumps when a thing is lifted.
+        place = np.interp(height, _LAYER_HEIGHTS, np.arange(len(_LAYER_HEIGHTS)))
+        for number, layer in enumerate(layers):
+            share = np.maximum(1.0 - np.abs(place - number), 0.0)
+            if share.any():
+                layer += np.bincount(row * _PIXELS + column, share * cloud.area / pixel**2, _PIXELS**2)
+    lit = np.ones((_PIXELS, _PIXELS), np.float32)
+    for blur, layer in zip(_LAYER_BLURS, layers, strict=True):
+        if layer.any():
+            covered = 1.0 - np.exp(-layer.reshape(lit.shape).astype(np.float32))
+            lit *= 1.0 - gaussian_filter(covered, blur / pixel, truncate=2.5)
+    return lit
+
+
+class AmbientLight:
+    """The light from all sides, which does not reach into corners: ambient occlusion."""
+
+    def __init__(self, clouds: Sequence[Cloud]) -> None:
+        """Find out which space is covered; the space below the floor is."""
+        points = np.concatenate([cloud.points for cloud in clouds])
+        self._low = points.min(axis=0) - _CELLS_AROUND * _CELL
+        shape = np.ceil((points.max(axis=0) - self._low) / _CELL).astype(int) + _CELLS_AROUND + 1
+        hidden = np.zeros(shape.prod())
+        for cloud in clouds:
+            i, j, k = np.rint((cloud.points - self._low) / _CELL).astype(np.int64).T
+            node = (i * shape[1] + j) * shape[2] + k
+            hidden += np.bincount(node, minlength=hidden.size) * (cloud.area / _CELL**2)
+        covered = (1.0 - np.exp(-_OPACITY * hidden)).astype(np.float32).reshape(shape)
+        height = self._low[1] + _CELL * np.arange(shape[1])
+        covered = np.maximum(covered, np.clip(0.5 - height / _CELL, 0.0, 1.0)[None, :, None])
+        self._covered = gaussian_filter(covered, _BLUR, mode="nearest")
+
+    def at(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return the fraction of the light that reaches a surface.
+
+        Args:
+            points: Points of the surface [domain units], shape [point, 3].
+            normals: Outward normals, shape [point, 3].
+
+        Returns:
+            Fractions, shape [point].
+        """
+        seen = (points + _LOOK_OUT * normals - self._low) / _CELL
+        covered = map_coordinates(self._covered, seen.T, order=1, mode="nearest")
+        return np.clip(1.0 - _STRENGTH * (covered - _OWN_COVER), _DARKEST, 1.0)

@@ -1,0 +1,48 @@
+"""Which tasks and variants the suite has, found without importing Hydra, torch or Taichi."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+__all__ = ["SUITE_VARIANTS", "conf_folder", "suite_tasks", "task_list"]
+
+SUITE_VARIANTS = ("1", "2", "3", "4", "5")
+"""Variants of every task of the suite."""
+
+
+def conf_folder() -> Path:
+    """Return the folder of plab's YAML files: the source tree's ``conf/``, or ``plab/conf`` of a wheel.
+
+    Raises:
+        plab.config.ConfigError: If the installation is incomplete.
+    """
+    here = Path(__file__).resolve()
+    for folder in (here.parent / "conf", here.parents[2] / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    from plab.config_errors import ConfigError
+
+    raise ConfigError(
+        f"no conf/config.yaml next to {here.parent}: the installation is incomplete, install plab again"
+    )
+
+
+def suite_tasks() -> list[str]:
+    """Return the names of plab's own tasks, those of the files in ``conf/task``."""
+    return sorted(path.stem for path in (conf_folder() / "task").glob("*.yaml"))
+
+
+def task_list(text: str) -> list[str]:
+    """Parse names of tasks with commas between them, for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: If there is no such task.
+    """
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in suite_tasks():
+            raise argparse.ArgumentTypeError(
+                f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}"
+            )
+    return names

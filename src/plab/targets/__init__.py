@@ -1,0 +1,37 @@
+"""Target recipes: what shape the plasticine is to take, as a mass tensor.
+
+A recipe is a dataclass; :data:`RECIPES` lists them by the name that a task's YAML gives as ``target.recipe``.
+The remaining keys of ``target`` are the dataclass's fields. ``python -m plab.targets`` builds the targets of
+the suite.
+"""
+
+from plab.targets.build import (
+    RECIPES,
+    TARGET_SEED,
+    build_target,
+    build_targets,
+    check_target,
+    demonstration,
+    make_recipe,
+)
+from plab.targets.geometric import BodiesTarget, RingTarget, TargetBody
+from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError
+from plab.targets.store import load_release_target
+
+__all__ = [
+    "EPISODE_STEPS",
+    "RECIPES",
+    "TARGET_SEED",
+    "BodiesTarget",
+    "GeometricRecipe",
+    "RingTarget",
+    "ScriptedRecipe",
+    "TargetBody",
+    "TargetError",
+    "build_target",
+    "build_targets",
+    "check_target",
+    "demonstration",
+    "load_release_target",
+    "make_recipe",
+]

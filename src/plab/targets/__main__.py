@@ -1,0 +1,102 @@
+"""The command line of targets: build, cache and describe those of the suite.
+
+python -m plab.targets                       all fifty
+python -m plab.targets --task Torus,Rope     only these
+python -m plab.targets --rebuild             simulate even what is cached
+python -m plab.targets --csv moments.csv     write what is printed to a file, too
+
+More overrides of the configuration, such as sim.device=cuda, may follow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from plab.config import ConfigError, build_scene, load_config, variant_task
+from plab.scene import SceneError
+from plab.sim import DeviceError, SimulationError, Simulator
+from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
+from plab.targets import TargetError, build_targets
+from plab.targets.store import cache_dir
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    args = _parse(argv)
+    try:
+        table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
+    except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
+        print(f"plab: {error}", file=sys.stderr)
+        return 2
+    _show(table)
+    print(f"simulated targets are kept in {cache_dir() / 'targets'}")
+    if args.csv is not None:
+        table.drop(columns="seconds").to_csv(args.csv, index=False, float_format="%.6g", lineterminator="\n")
+    return 0
+
+
+def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:
+    """Build the targets of a task and describe them.
+
+    Args:
+        task: Name of a task of the suite.
+        overrides: Of the configuration.
+        rebuild: Simulate even what is cached.
+
+    Returns:
+        A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and
+        standard deviation along x, y, z [domain units], seconds that building took on average.
+    """
+    cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
+    sim = cfgs[0].sim
+    scenes = [build_scene(cfg) for cfg in cfgs]
+    start = time.perf_counter()
+    simulator = Simulator(scenes, precision=sim.precision, device=sim.device)
+    masses = build_targets(simulator, [variant_task(cfg).target for cfg in cfgs], rebuild=rebuild)
+    seconds = (time.perf_counter() - start) / len(cfgs)
+    rows = [
+        {"task": task, "variant": variant, **_moments(mass / scene.particle_mass), "seconds": seconds}
+        for variant, mass, scene in zip(SUITE_VARIANTS, masses, scenes, strict=True)
+    ]
+    return pd.DataFrame(rows)
+
+
+def _moments(mass: np.ndarray) -> dict[str, float]:
+    """Total, peak, centroid and standard deviation of a mass tensor, shape [n, n, n]."""
+    node = np.indices(mass.shape).reshape(3, -1) / mass.shape[0]
+    share = mass.reshape(-1) / mass.sum()
+    centroid = node @ share
+    spread = np.sqrt(((node - centroid[:, None]) ** 2) @ share)
+    named = zip(("x", "y", "z", "std_x", "std_y", "std_z"), (*centroid, *spread), strict=True)
+    return {"mass": float(mass.sum()), "peak": float(mass.max())} | {k: float(v) for k, v in named}
+
+
+def _show(table: pd.DataFrame) -> None:
+    printed = Table(title="Targets")
+    for name in table.columns:
+        printed.add_column(name)
+    for row in table.to_numpy():
+        printed.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
+    Console().print(printed)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m plab.targets", description="Build the suite's targets.")
+    parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
+    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+    parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
+    parser.add_argument("--csv", type=Path, help="write the table to this file, too")
+    return parser.parse_intermixed_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

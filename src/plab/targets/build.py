@@ -1,0 +1,171 @@
+"""From the ``target`` section of a task to a mass tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from plab.objective import spread_mass
+from plab.scene import Scene
+from plab.targets import geometric, scripted
+from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError
+from plab.targets.store import TargetStore
+
+if TYPE_CHECKING:
+    from plab.sim import Simulator
+
+__all__ = [
+    "RECIPES",
+    "TARGET_SEED",
+    "build_target",
+    "build_targets",
+    "check_target",
+    "demonstration",
+    "make_recipe",
+]
+
+TARGET_SEED = 1
+"""Seed of a geometric target's samples; not the scene's, or a target could be a shifted copy of the
+bodies."""
+
+RECIPES: dict[str, type[GeometricRecipe] | type[ScriptedRecipe]] = {
+    "bodies": geometric.BodiesTarget,
+    "ring": geometric.RingTarget,
+    "carry": scripted.CarryTarget,
+    "dent": scripted.DentTarget,
+    "draw": scripted.DrawTarget,
+    "lift": scripted.LiftTarget,
+    "press": scripted.PressTarget,
+    "push": scripted.PushTarget,
+    "roll": scripted.RollTarget,
+}
+"""Recipes by the name that ``target.recipe`` gives."""
+
+
+def make_recipe(target: Mapping[str, Any]) -> GeometricRecipe | ScriptedRecipe:
+    """Turn the ``target`` section of a task into its recipe.
+
+    Args:
+        target: ``recipe`` and the recipe's parameters.
+
+    Returns:
+        The recipe, with all its fields set and of the right type.
+
+    Raises:
+        TargetError: If the recipe or a parameter does not exist, is missing or has a wrong type.
+    """
+    parameters = dict(target)
+    name = parameters.pop("recipe", None)
+    kind = RECIPES.get(name)
+    if kind is None:
+        raise TargetError(f"target.recipe '{name}' does not exist; choose from: {', '.join(RECIPES)}")
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), parameters))
+    except OmegaConfBaseException as error:
+        reason = (error.msg or str(error)).splitlines()[0]
+        names = ", ".join(kind.__dataclass_fields__)
+        key = f"target.{error.full_key}" if error.full_key else "target"
+        raise TargetError(f"{key}: {reason} (recipe {name} has the keys {names})") from None
+
+
+def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
+    """Return the actions that make a scripted target.
+
+    Args:
+        scene: The scene that the target belongs to.
+        target: ``recipe`` and the recipe's parameters, as a task's YAML has them.
+
+    Returns:
+        Actions in [-1, 1], shape [EPISODE_STEPS, A]; None for a geometric target.
+
+    Raises:
+        TargetError: If the recipe or a parameter does not exist or has a wrong value.
+    """
+    recipe = make_recipe(target)
+    return recipe.actions(scene) if hasattr(recipe, "actions") else None
+
+
+def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
+    """Find every mistake in a ``target`` section that can be found without simulating; see
+    :func:`demonstration` for arguments and errors."""
+    if demonstration(scene, target) is None:
+        build_target(scene, target)
+
+
+def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
+    """Build a geometric target's mass tensor.
+
+    Args:
+        scene: The scene that the target belongs to: grid, particle count and mass, manipulators.
+        target: ``recipe`` and the recipe's parameters, as a task's YAML has them.
+
+    Returns:
+        Mass tensor, shape [n, n, n], float64.
+
+    Raises:
+        TargetError: If the recipe or a parameter does not exist or has a wrong value, the shape leaves the
+            domain, or the target has to be simulated.
+    """
+    recipe = make_recipe(target)
+    if not hasattr(recipe, "sample"):
+        raise TargetError(
+            f"target.recipe {target['recipe']} is simulated: build it with plab.problem.Problem"
+        )
+    points = recipe.sample(scene, np.random.default_rng(TARGET_SEED))
+    top = 1.0 - 3.0 * scene.dx
+    if not np.all((points >= -1e-9) & (points <= top + 1e-9)):
+        raise TargetError(
+            f"the target reaches outside the domain 0 .. {top:.4g}: it covers {points.min(0).round(3)} to "
+            f"{points.max(0).round(3)}"
+        )
+    return spread_mass(points, scene.grid_size, scene.particle_mass)
+
+
+def build_targets(
+    simulator: Simulator, targets: Sequence[Mapping[str, Any]], *, rebuild: bool = False
+) -> np.ndarray:
+    """Build the targets of a simulator's environments, simulating those that are scripted.
+
+    Simulated targets are cached on disk, so that the second time costs nothing. The simulator is left in its
+    initial state, in the hard contact model if it had to simulate.
+
+    Args:
+        simulator: Simulator of the scenes that the targets belong to.
+        targets: ``recipe`` and the recipe's parameters, one per environment.
+        rebuild: Simulate even what is cached.
+
+    Returns:
+        Mass tensors, shape [batch, n, n, n], float64.
+
+    Raises:
+        TargetError: See :func:`build_target`.
+        plab.sim.SimulationError: If a demonstration makes the state not finite.
+    """
+    store, scenes = TargetStore(simulator), simulator.scenes
+    # Vectorised environments are many of one kind: each kind is built once.
+    kinds = [(id(scene), id(target)) for scene, target in zip(scenes, targets, strict=True)]
+    first = {kind: kinds.index(kind) for kind in kinds}
+    scripts = {kind: demonstration(scenes[k], targets[k]) for kind, k in first.items()}
+    masses: dict[tuple[int, int], np.ndarray | None] = {}
+    for kind, k in first.items():
+        if scripts[kind] is None:
+            masses[kind] = build_target(scenes[k], targets[k])
+        else:
+            masses[kind] = None if rebuild else store.load(scenes[k], scripts[kind])
+    missing = [kind for kind, mass in masses.items() if mass is None]
+    if missing:
+        still = np.zeros((EPISODE_STEPS, simulator.action_dim))
+        simulator.set_contact("hard")
+        simulator.rollout(
+            np.stack([scripts[kind] if kind in missing else still for kind in kinds]), gradient=False
+        )
+        made = simulator.mass_tensor()
+        simulator.reset()
+        for kind in missing:
+            masses[kind] = made[first[kind]]
+            store.save(scenes[first[kind]], scripts[kind], masses[kind])
+    return np.stack([masses[kind] for kind in kinds])

@@ -1,0 +1,49 @@
+"""What a target recipe is: a dataclass whose fields are the remaining keys of a task's ``target`` section."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from plab.scene import Scene
+
+__all__ = ["EPISODE_STEPS", "GeometricRecipe", "ScriptedRecipe", "TargetError"]
+
+EPISODE_STEPS = 50
+"""Environment steps of the suite's episodes, hence of its scripted demonstrations."""
+
+
+class TargetError(ValueError):
+    """A target that cannot be built; the message says why."""
+
+
+class GeometricRecipe(Protocol):
+    """A target that is a shape."""
+
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+        """Draw as many points as the scene has particles.
+
+        Args:
+            scene: The scene that the target belongs to.
+            rng: Source of randomness.
+
+        Returns:
+            Positions [domain units], shape [particle, 3].
+        """
+        ...
+
+
+class ScriptedRecipe(Protocol):
+    """A target that is what a demonstration makes of the scene, simulated in the hard contact model."""
+
+    def actions(self, scene: Scene) -> np.ndarray:
+        """Draw the demonstration's actions.
+
+        Args:
+            scene: The scene that is handled.
+
+        Returns:
+            Actions in [-1, 1], shape [EPISODE_STEPS, A].
+        """
+        ...

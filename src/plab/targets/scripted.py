@@ -1,0 +1,377 @@
+"""Scripted target recipes: what a demonstration, drawn from a seed, makes of the scene.
+
+Each recipe draws where and how far its manipulators go, from the ranges in the task's YAML, and turns the way
+into actions; the target is the plasticine after those actions in the hard contact model. So every such
+configuration can be solved, and its solution is known.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plab.scene import ROLL_RADIUS, Body, Manipulator, Scene
+from plab.targets.recipe import EPISODE_STEPS, TargetError
+
+__all__ = [
+    "CarryTarget",
+    "DentTarget",
+    "DrawTarget",
+    "LiftTarget",
+    "PressTarget",
+    "PushTarget",
+    "RollTarget",
+    "Script",
+    "Track",
+]
+
+DRAWS = 200
+"""How often a script is drawn anew when its way is too long for an episode."""
+
+CLEARANCE = 0.02
+"""Height at which a body is carried over another [domain units]."""
+
+DECIMALS = 4
+"""Actions are rounded to so many decimals: what is written down is exactly what was simulated."""
+
+
+class _TooLong(Exception):
+    """A way that does not fit into an episode."""
+
+
+class Track:
+    """The actions of one manipulator, built up way by way."""
+
+    def __init__(self, manipulator: Manipulator) -> None:
+        """Start at the manipulator's place with no step taken."""
+        self._scale = np.asarray(manipulator.scale)
+        self._actions: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        """Environment steps so far."""
+        return len(self._actions)
+
+    def go(self, way: Sequence[float], steps: int = 1) -> None:
+        """Add a straight, even motion.
+
+        Args:
+            way: Motion in all, one entry per action component [domain units or radians].
+            steps: Environment steps to take at least; more if the way is too long for them.
+        """
+        way = np.asarray(way, dtype=float)
+        # A component that cannot move has scale 0.
+        share = np.divide(way, self._scale, out=np.zeros_like(way), where=self._scale > 0)
+        # A hair less, or rounding would cost a step where the way fits exactly.
+        steps = max(steps, math.ceil(np.abs(share).max() - 1e-9), 1)
+        self._actions += [share / steps] * steps
+
+    def wait(self, until: int) -> None:
+        """Stay where it is until so many steps are over."""
+        self._actions += [np.zeros_like(self._scale)] * (until - len(self))
+
+    def actions(self) -> np.ndarray:
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A].
+
+        Raises:
+            _TooLong: If the way takes longer than an episode.
+        """
+        if len(self) > EPISODE_STEPS:
+            raise _TooLong
+        self.wait(EPISODE_STEPS)
+        return np.clip(np.round(self._actions, DECIMALS), -1.0, 1.0)
+
+
+@dataclass
+class Script(ABC):
+    """A scripted demonstration.
+
+    Attributes:
+        seed: Seed of what is drawn, >= 0.
+    """
+
+    seed: int
+
+    def actions(self, scene: Scene) -> np.ndarray:
+        """See :meth:`plab.targets.recipe.ScriptedRecipe.actions`."""
+        if self.seed < 0:
+            raise TargetError(f"target.seed must be at least 0, not {self.seed}")
+        if not any(m.action_dim for m in scene.manipulators):
+            raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
+        rng = np.random.default_rng(self.seed)
+        for _ in range(DRAWS):
+            tracks = [Track(m) for m in scene.manipulators if m.action_dim]
+            try:
+                self.plan(scene, tracks, rng)
+                return np.concatenate([track.actions() for track in tracks], axis=1)
+            except _TooLong:
+                continue
+        raise TargetError(
+            f"the script does not fit into {EPISODE_STEPS} steps: make its ranges smaller or the scale larger"
+        )
+
+    @abstractmethod
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """Draw one way for each manipulator that can move."""
+
+
+@dataclass
+class PressTarget(Script):
+    """A manipulator comes down on the first body, off its centre, and goes up again.
+
+    Attributes:
+        offset: Range of the distance from the body's centre, in x and in z [domain units].
+        depth: Range of how deep it goes below the body's top [domain units].
+    """
+
+    offset: list[float]
+    depth: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        tool, (track, *_) = _mover(scene, 0), tracks
+        x, z = _draw(rng, "offset", self.offset, 2) * rng.choice([-1.0, 1.0], size=2)
+        depth = _draw(rng, "depth", self.depth)
+        height = tool.position[1] - _below(tool) - _top(scene.bodies[0])
+        track.go([x, -height, z])
+        track.go([0.0, -depth, 0.0])
+        track.go([0.0, (EPISODE_STEPS - len(track)) * tool.scale[1] / 2, 0.0], EPISODE_STEPS - len(track))
+
+
+@dataclass
+class DrawTarget(Script):
+    """A pen draws straight strokes over the first body's top, one where the last ended, and is lifted.
+
+    Attributes:
+        strokes: Range of their number, both ends included.
+        length: Range of a stroke's length [domain units].
+        margin: Least distance of their ends from the body's edges [domain units].
+        depth: Range of the tip's depth below the body's top [domain units].
+    """
+
+    strokes: list[int]
+    length: list[float]
+    margin: float
+    depth: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        tool, (track, *_) = _mover(scene, 0), tracks
+        body = scene.bodies[0]
+        depth = _draw(rng, "depth", self.depth)
+        track.go([0.0, _top(body) - depth - (tool.position[1] - _below(tool)), 0.0])
+        at = np.asarray(tool.position)[[0, 2]]
+        room = body.half_extent()[[0, 2]] - self.margin
+        for _ in range(_count(rng, "strokes", self.strokes)):
+            way = self._stroke(at - np.asarray(body.center)[[0, 2]], room, rng)
+            track.go([way[0], 0.0, way[1]])
+            at = at + way
+        track.go([0.0, depth + tool.size[1], 0.0])
+
+    def _stroke(self, at: np.ndarray, room: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Draw a stroke [2] from a place [2] that ends within +-room [2] of the body's centre."""
+        for _ in range(DRAWS):
+            angle, length = rng.uniform(0, 2 * math.pi), _draw(rng, "length", self.length)
+            way = length * np.array([math.cos(angle), math.sin(angle)])
+            if np.all(np.abs(at + way) <= room):
+                return way
+        raise _TooLong
+
+
+@dataclass
+class DentTarget(Script):
+    """A sphere pushes dents into the first body, each towards its centre from a random direction.
+
+    Attributes:
+        dents: Range of their number, both ends included.
+        depth: Range of a dent's depth [domain units].
+    """
+
+    dents: list[int]
+    depth: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        tool, (track, *_) = _mover(scene, 0), tracks
+        body = scene.bodies[0]
+        centre, half = np.asarray(body.center), body.half_extent()
+        radius = tool.size[0]
+        # Far enough to pass the body's corners.
+        clear = float(np.linalg.norm(half)) + radius
+        at = np.asarray(tool.position) - centre
+        for _ in range(_count(rng, "dents", self.dents)):
+            direction = rng.normal(size=3)
+            direction[1] = abs(direction[1])
+            direction /= np.linalg.norm(direction)
+            for point in _arc(at, clear * direction):
+                track.go(point - at)
+                at = point
+            # The sphere touches the face that the direction leaves through.
+            touch = float(np.min((half + radius) / np.maximum(np.abs(direction), 1e-9)))
+            inner = (touch - _draw(rng, "depth", self.depth)) * direction
+            track.go(inner - at)
+            track.go(at - inner)
+
+
+@dataclass
+class RollTarget(Script):
+    """A rolling pin goes to and fro over the first body while it comes down.
+
+    Attributes:
+        reach: Range of its way from the middle to either side [domain units].
+        depth: Range of how far it comes down over the episode [domain units].
+        yaw: Range of its turn about the vertical over the episode [rad].
+    """
+
+    reach: list[float]
+    depth: list[float]
+    yaw: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        tool, (track, *_) = _mover(scene, 0), tracks
+        per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
+        angle = _draw(rng, "reach", self.reach) / ROLL_RADIUS
+        side = rng.choice([-1.0, 1.0])
+        legs = [side * angle]
+        while len(track) < EPISODE_STEPS:
+            steps = max(math.ceil(abs(legs[-1]) / tool.scale[0] - 1e-9), 1)
+            taken = min(steps, EPISODE_STEPS - len(track))
+            track.go([legs[-1] * taken / steps, *(per_step * taken)], taken)
+            legs.append(-2 * angle * math.copysign(1.0, legs[-1]))
+
+
+@dataclass
+class LiftTarget(Script):
+    """Chopsticks lift the first body, move it sideways and turn it.
+
+    Attributes:
+        height: Range of how far they lift [domain units].
+        turn: Range of the turn about the vertical, to either side [rad].
+        shift: Range of the way along x and along z [domain units].
+    """
+
+    height: list[float]
+    turn: list[float]
+    shift: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        (track, *_) = tracks
+        height, turn = _draw(rng, "height", self.height), _draw(rng, "turn", self.turn)
+        turn *= rng.choice([-1.0, 1.0])
+        x, z = _draw(rng, "shift", self.shift, 2)
+        lift = 10
+        track.go([0.0, height, 0.0, 0.0, 0.0, 0.0, 0.0], lift)
+        track.go([x, 0.0, z, 0.0, turn, 0.0, 0.0], EPISODE_STEPS - 10 - lift)
+
+
+@dataclass
+class CarryTarget(Script):
+    """Two spheres grip the last body, set it on the first and let go.
+
+    Attributes:
+        squeeze: Range of how far either sphere presses into the body before the lift [domain units].
+        press: Range of how far it is pressed onto the other [domain units].
+    """
+
+    squeeze: list[float]
+    press: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        base, cargo = scene.bodies[0], scene.bodies[-1]
+        tools = [m for m in scene.manipulators if m.action_dim]
+        squeeze, press = _draw(rng, "squeeze", self.squeeze), _draw(rng, "press", self.press)
+        x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
+        rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
+        # The leading sphere goes up beside the base and passes its edge at the height of its top.
+        lead = max(abs(tool.position[0] - cargo.center[0]) + tool.size[0] for tool in tools)
+        lowest = min(tool.position[1] - tool.size[0] for tool in tools)
+        edge = abs(x) - base.half_extent()[0] - lead
+        beside = math.copysign(edge * rise / (_top(base) - lowest), x)
+        for track, tool in zip(tracks, tools, strict=True):
+            inwards = math.copysign(1.0, cargo.center[0] - tool.position[0])
+            track.go([inwards * squeeze, 0.0, 0.0], 2)
+            track.go([beside, rise, 0.0])
+            track.go([x - beside, 0.0, z])
+            track.go([0.0, -CLEARANCE - press, 0.0])
+            track.go([-inwards * tool.scale[0] * 3, 0.0, 0.0])
+
+
+@dataclass
+class PushTarget(Script):
+    """A sphere between the legs of a table pushes one of them outwards.
+
+    Attributes:
+        legs: So many of the scene's first bodies are legs.
+        distance: Range of how far it goes on after it has met the leg [domain units].
+    """
+
+    legs: int
+    distance: list[float]
+
+    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+        """See :meth:`Script.plan`."""
+        if not 0 < self.legs <= len(scene.bodies):
+            raise TargetError(f"target.legs must be in 1 .. {len(scene.bodies)}, not {self.legs}")
+        tool, (track, *_) = _mover(scene, 0), tracks
+        leg = scene.bodies[rng.integers(self.legs)]
+        way = (np.asarray(leg.center) - np.asarray(tool.position)) * [1.0, 0.0, 1.0]
+        length = float(np.linalg.norm(way))
+        direction = way / length
+        edge = float(np.min(leg.half_extent() / np.maximum(np.abs(direction), 1e-9)))
+        meet = length - edge - tool.size[0]
+        track.go(meet * direction)
+        track.go(_draw(rng, "distance", self.distance) * direction, 20)
+
+
+def _draw(
+    rng: np.random.Generator, name: str, limits: Sequence[float], size: int | None = None
+) -> float | np.ndarray:
+    """Draw uniformly from a range [low, high]; all of a recipe's ranges are checked here."""
+    if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
+        raise TargetError(f"target.{name} must be a range [low, high], not {list(limits)}")
+    return rng.uniform(limits[0], limits[1], size)
+
+
+def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
+    """Draw a whole number from a range, both ends included."""
+    if len(limits) != 2 or not 1 <= limits[0] <= limits[1]:
+        raise TargetError(f"target.{name} must be a range [low, high] from 1 on, not {list(limits)}")
+    return int(rng.integers(limits[0], limits[1] + 1))
+
+
+def _mover(scene: Scene, number: int) -> Manipulator:
+    """The manipulator with that number among those that can move."""
+    return [m for m in scene.manipulators if m.action_dim][number]
+
+
+def _top(body: Body) -> float:
+    """Height of a body's top [domain units]."""
+    return body.center[1] + float(body.half_extent()[1])
+
+
+def _below(tool: Manipulator) -> float:
+    """How far an upright manipulator reaches below its position [domain units]."""
+    reach = {"Sphere": (1.0,), "Capsule": (0.5, 1.0), "Torus": (0.0, 1.0)}.get(tool.shape)
+    if reach is None:
+        raise TargetError(f"the recipe needs a Sphere, Capsule or Torus, not a {tool.shape}")
+    return float(np.dot(reach, tool.size))
+
+
+def _arc(start: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
+    """Points on the way around the origin from one point to another, the start left out; both [3]."""
+    a, b = np.linalg.norm(start), np.linalg.norm(end)
+    angle = math.acos(float(np.clip(start @ end / (a * b), -1.0, 1.0)))
+    if angle < 1e-6:
+        return [end]
+    pieces = max(math.ceil(angle / 0.2), 1)
+    points = []
+    for t in np.arange(1, pieces + 1) / pieces:
+        u = (math.sin((1 - t) * angle) * start / a + math.sin(t * angle) * end / b) / math.sin(angle)
+        points.append(u * ((1 - t) * a + t * b))
+    return points

@@ -1,0 +1,130 @@
+"""Files of mass tensors: the cache of simulated targets, and the original release's."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from dataclasses import asdict, replace
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING
+from zipfile import BadZipFile
+
+import numpy as np
+
+from plab.scene import Scene
+from plab.targets.recipe import TargetError
+
+if TYPE_CHECKING:
+    from plab.sim import Simulator
+
+__all__ = ["TargetStore", "cache_dir", "load_release_target"]
+
+PHYSICS_VERSION = 1
+"""To be raised when the simulator's results change by more than rounding: cached targets are then stale."""
+
+RELEASE_PARTICLES = 10000
+"""Particle masses that each of the release's targets holds, whatever the scene has."""
+
+MASS_TOLERANCE = 0.02
+"""Largest relative error of a release target's total mass."""
+
+
+def cache_dir() -> Path:
+    """Return the folder of what plab can make again: ``PLAB_CACHE_DIR``, or ``plab`` in the user's cache."""
+    chosen = os.environ.get("PLAB_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(base) if base else Path.home() / ".cache") / "plab"
+
+
+class TargetStore:
+    """Simulated targets on disk, by what they depend on."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        """Open the store for targets that this simulator makes: precision and device are part of the key."""
+        self._made_by = (simulator.precision, simulator.device)
+
+    def path(self, scene: Scene, actions: np.ndarray) -> Path:
+        """Return the file of a target.
+
+        Args:
+            scene: The scene.
+            actions: The demonstration, shape [T, A].
+        """
+        # The length of later episodes has no part in it.
+        facts = asdict(replace(scene, horizon=0)) | {"by": self._made_by, "physics": PHYSICS_VERSION}
+        digest = hashlib.sha256(dumps(facts, sort_keys=True).encode() + actions.astype("<f8").tobytes())
+        return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
+
+    def load(self, scene: Scene, actions: np.ndarray) -> np.ndarray | None:
+        """Return a target's mass tensor, shape [n, n, n], or None if it is not there or not readable."""
+        n = scene.grid_size
+        try:
+            with np.load(self.path(scene, actions)) as file:
+                mass = np.zeros(n**3)
+                mass[file["node"]] = file["mass"]
+        except (OSError, EOFError, KeyError, ValueError, IndexError, BadZipFile):
+            return None
+        return mass.reshape(n, n, n)
+
+    def save(self, scene: Scene, actions: np.ndarray, mass: np.ndarray) -> None:
+        """Keep a mass tensor, shape [n, n, n]; where the folder cannot be written, do nothing."""
+        path = self.path(scene, actions)
+        node = np.flatnonzero(mass)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+                np.savez_compressed(file, node=node.astype(np.uint32), mass=mass.reshape(-1)[node])
+            os.replace(file.name, path)
+        except OSError:
+            # The target is made again next time.
+            return
+
+
+def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.ndarray:
+    """Load a target file of the original release, ``<Task>3D-v<k>.npy``.
+
+    Args:
+        folder: Folder of the files.
+        scene: The scene that the target belongs to; its name and grid count.
+        variant: Number of the variant.
+
+    Returns:
+        Mass tensor, shape [n, n, n], float64.
+
+    Raises:
+        TargetError: If the file is missing, or no mass tensor of this scene.
+    """
+    name = "Rollingpin" if scene.name == "RollingPin" else scene.name
+    path = Path(folder) / f"{name}3D-v{variant}.npy"
+    if not Path(folder).is_dir():
+        raise TargetError(f"targets.source: there is no folder {folder}")
+    if not path.is_file():
+        raise TargetError(f"targets.source: {path} does not exist; name the files like Move3D-v1.npy")
+    try:
+        mass = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise TargetError(f"targets.source: {path} is no NumPy array file: {error}") from None
+    _check_release_target(str(path), mass, scene)
+    return mass.astype(np.float64)
+
+
+def _check_release_target(path: str, mass: np.ndarray, scene: Scene) -> None:
+    n = scene.grid_size
+    if mass.shape != (n, n, n):
+        raise TargetError(f"targets.source: {path} has shape {mass.shape}, but the grid is {(n, n, n)}")
+    if mass.dtype.kind not in "fiu" or not np.isfinite(mass).all():
+        raise TargetError(f"targets.source: {path} must hold finite numbers")
+    if mass.min() < 0:
+        raise TargetError(f"targets.source: {path} has negative masses, the least is {mass.min():.3g}")
+    total = float(mass.sum()) / scene.particle_mass
+    if not any(
+        abs(total - count) <= MASS_TOLERANCE * count for count in (scene.particle_count, RELEASE_PARTICLES)
+    ):
+        raise TargetError(
+            f"targets.source: {path} holds {total:.0f} particle masses of {scene.particle_mass:.3g}, but the "
+            f"scene has {scene.particle_count} and the release's files {RELEASE_PARTICLES}"
+        )

@@ -1,0 +1,82 @@
+"""All ten tasks: coarse versions always, all fifty configurations at full size among the slow tests."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from plab.config import load_config
+from plab.demonstrations import known_actions
+from plab.problem import Problem
+from plab.scene import Scene
+from plab.suite import SUITE_VARIANTS, suite_tasks
+from plab.targets.__main__ import moments
+
+TASKS = suite_tasks()
+COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
+MOMENTS = Path(__file__).parent / "target_moments.csv"
+
+
+def problem(task: str, variants: tuple[str, ...], *overrides: str) -> tuple[Problem, np.ndarray]:
+    """A batch of a task's variants and their demonstrations, shape [batch, T, A]."""
+    gc.collect()
+    cfgs = [load_config([f"task={task}", f"variant={k}", *overrides]) for k in variants]
+    return Problem(cfgs), np.stack([known_actions(cfg) for cfg in cfgs])
+
+
+def check_steps(task: Problem, actions: np.ndarray, mass_tolerance: float) -> None:
+    """Go a few steps forward and backward in both contact models."""
+    scene: Scene = task.scenes[0]
+    total = scene.particle_count * scene.particle_mass
+    for contact in ("soft", "hard"):
+        task.simulator.set_contact(contact)
+        result = task.rollout(actions, gradient=True)
+        assert np.isfinite(result.loss).all() and np.isfinite(result.gradient).all()
+        np.testing.assert_allclose(result.final_mass.sum(axis=(1, 2, 3)), total, rtol=mass_tolerance)
+        state = task.simulator.state()
+        assert np.isfinite(state.x).all() and np.isfinite(state.F).all()
+        assert (state.x >= 0).all() and (state.x <= 1 - 3 * scene.dx).all()
+        # Every configuration's actions matter for its loss.
+        assert (np.abs(result.gradient).max(axis=(1, 2)) > 0).all()
+        assert ((result.iou > -1e-9) & (result.iou < 1)).all()
+    np.testing.assert_allclose(task.target_mass.sum(axis=(1, 2, 3)), total, rtol=mass_tolerance)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_coarse_task_steps_scores_and_differentiates(task, device):
+    batch, actions = problem(task, ("1", "4"), *COARSE, f"sim.device={device}")
+    check_steps(batch, actions[:, :3], mass_tolerance=1e-5)
+
+
+def test_the_suite_has_ten_tasks():
+    assert len(TASKS) == 10 and len(SUITE_VARIANTS) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_all_configurations_step_score_and_differentiate(task, device):
+    batch, actions = problem(task, SUITE_VARIANTS, f"sim.device={device}")
+    check_steps(batch, actions[:, :4], mass_tolerance=1e-5)
+    for scores in batch.scores(batch.initial_mass):
+        assert scores.iou_initial < 0.99 * scores.iou_target_self
+        assert scores.score == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_targets_are_those_that_were_published(task, device):
+    """Against ``tests/target_moments.csv``, made by ``python -m plab.targets --csv``.
+
+    The tolerance is what float32 and float64, CPU and CUDA differ by, with a margin.
+    """
+    table = moments(task, [f"sim.device={device}"], rebuild=True)
+    expected = pd.read_csv(MOMENTS, dtype={"variant": str}).query("task == @task")
+    assert list(table["variant"]) == list(expected["variant"])
+    np.testing.assert_allclose(table["mass"], expected["mass"], rtol=1e-5)
+    np.testing.assert_allclose(table["peak"], expected["peak"], rtol=0.02)
+    columns = ["x", "y", "z", "std_x", "std_y", "std_z"]
+    np.testing.assert_allclose(table[columns], expected[columns], atol=2e-4)
