@@ -29,7 +29,7 @@ from plab.problem import Problem
 from plab.scene import SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
-from plab.targets import TargetError
+from plab.targets import EPISODE_STEPS, TargetError
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def replay(cfgs: Sequence[Config]) -> list[Replay]:
     """
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
-    still = np.zeros((cfgs[0].sim.horizon, problem.simulator.action_dim))
+    still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
     known = [known_actions(cfg) for cfg in cfgs]
     actions = np.stack([still if item is None else item for item in known])
     reached = problem.rollout(actions, gradient=False).scores

@@ -91,7 +91,9 @@ def _candidates(
         carried = carry(build_scene(cfg), cfg.task.target)
         for start in [known, *carried]:
             if start is not None:
-                starts.append(start)
+                whole = np.zeros((cfg.sim.horizon, dim))
+                whole[: len(start)] = start[: cfg.sim.horizon]
+                starts.append(whole)
                 rates.append(min(lrs))
         owners += [owner] * (len(starts) - len(owners))
     return starts, owners, rates

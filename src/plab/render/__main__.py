@@ -18,11 +18,15 @@ from plab.targets import TargetError
 __all__ = ["main"]
 
 EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130
 
 _USAGE = """\
-python -m plab.render RESULT_FILE [--output FILE]          the best actions of a run
-python -m plab.render KEY=VALUE ... [--output FILE]        the best actions known for a task
-python -m plab.render --contact-sheet FILE [KEY=VALUE ...]  start and target of every task and variant
+python -m plab.render RESULT_FILE [--output FILE]
+python -m plab.render KEY=VALUE ... [--output FILE]
+python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
+
+Draws the best actions of a run, the best actions known for a task, or start and target of every task and
+variant.
 
 The suffix of FILE decides what is written:
   .png         start, target and the rollout's end, side by side
@@ -44,12 +48,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; those of the process by default.
 
     Returns:
-        Exit code: 0, or 2 for a mistake of the user's.
+        Exit code: 0, 2 for a mistake of the user's, 130 after Ctrl-C.
     """
     try:
         _run(_parse(argv))
     except (RenderError, ConfigError, SceneError, TargetError) as error:
-        return _complain(str(error))
+        return _complain(str(error), EXIT_USER_ERROR)
+    except KeyboardInterrupt:
+        return _complain("stopped", EXIT_INTERRUPTED)
     except SystemExit as stop:
         # argparse leaves this way after --help.
         return stop.code if isinstance(stop.code, int) else 0
@@ -94,7 +100,9 @@ def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
         for number, (task, path) in enumerate(tasks.items(), start=1):
             variants = OmegaConf.load(path).variants
             words = [[f"task={task}", f"variant={variant}", *arguments.overrides] for variant in variants]
-            rows[task] = starts([load_config(each, arguments.config_dir) for each in words])
+            cfgs = [load_config(each, arguments.config_dir) for each in words]
+            if cfgs:
+                rows[task] = starts(cfgs)
             report(number, task)
     save_contact_sheet(rows, arguments.output, arguments.size or _CELL)
 
@@ -137,9 +145,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(usage=_USAGE, allow_abbrev=False)
     add = parser.add_argument
-    add(
-        "what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="overrides are those of python -m plab.run"
-    )
+    add("what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run")
     add("--output", type=Path, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=Path, metavar="FILE", help="a .png")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
@@ -163,9 +169,9 @@ def _size(text: str) -> tuple[int, int]:
     return numbers[0], numbers[1]
 
 
-def _complain(message: str) -> int:
+def _complain(message: str, code: int) -> int:
     print(f"plab: {' '.join(message.split())}", file=sys.stderr)
-    return EXIT_USER_ERROR
+    return code
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ class Floor:
         Args:
             plotter: The window.
             paper: Colour in the light.
-            ink: Colour of the lines, and of the shadows that are too deep to be.
+            ink: Colour of the lines, and of complete darkness.
             pixel: Size of a pixel [domain units], to which the lines are fitted.
         """
         self._paper, self._ink = _rgb(paper), _rgb(ink)
@@ -149,8 +149,8 @@ class Floor:
         line = np.array([[-half, -half], [-half, 1 + half], [half, 1 + half], [half, -half]])
         along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
         both = np.concatenate([along, along[:, ::-1]])
-        # Just above the floor, which would hide them otherwise.
         corners = np.arange(len(both)).reshape(-1, 4)
+        # Just above the floor, which would hide them otherwise.
         return pv.PolyData(np.insert(both, 1, 4e-4, axis=1), faces=_quads(corners))
 
 
