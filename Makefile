@@ -1,5 +1,6 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
-# make test   set up .venv and run all tests (those marked gpu skip themselves without a CUDA device)
+# make test   set up .venv and run the tests but the slow ones (those marked gpu skip themselves without a GPU)
+# make test-slow   the slow ones: all fifty configurations at full size, about half an hour on two cores
 # make lint   check style
 # make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
 # make clean  remove everything that can be made again, except results
@@ -10,13 +11,16 @@ ARGS ?= task=Rope method=adam seed=0
 
 BIN := $(VENV)/bin
 
-.PHONY: run test lint clean system-packages
+.PHONY: run test test-slow lint clean system-packages
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
 
 test: $(VENV)/.dev.stamp
-	$(BIN)/python -m pytest -m ""
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/.dev.stamp
 	$(BIN)/python -m ruff check .

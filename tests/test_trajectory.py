@@ -234,7 +234,6 @@ def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, 
     assert_same_numbers(run(cfg), finished)
 
 
-@pytest.mark.slow
 def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
     cfg = make_config(tmp_path)
     partial = result_path(cfg).with_suffix(".partial.h5")
