@@ -16,10 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from plab.config import build_scene, load_config, variant_task
-from plab.objective import target_sdf
-from plab.sim import Simulator
-from plab.targets import build_target
+from plab.config import load_config
+from plab.problem import Problem
 
 __all__ = ["main", "measure"]
 
@@ -64,13 +62,8 @@ def rows(overrides: list[str], batch: int, steps: int, repeats: int) -> list[dic
         included.
     """
     cfg = load_config(overrides)
-    scene = build_scene(cfg)
-    target = build_target(scene, variant_task(cfg).target)
-    simulator = Simulator(
-        [scene] * batch, precision=cfg.sim.precision, device=cfg.sim.device, memory_mb=cfg.sim.memory_mb
-    )
-    simulator.set_target(np.stack([target] * batch), np.stack([target_sdf(target)] * batch))
-    actions = np.random.default_rng(0).uniform(-0.5, 0.5, size=(batch, steps, scene.action_dim))
+    simulator = Problem([cfg] * batch).simulator
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, size=(batch, steps, simulator.action_dim))
     out = []
     for what, gradient in (("forward", False), ("forward + backward", True)):
         first, seconds = measure(lambda g=gradient: simulator.rollout(actions, gradient=g), repeats)

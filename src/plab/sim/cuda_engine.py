@@ -9,6 +9,9 @@ Sums over particles at a node are atomic, in whatever order the device runs them
 runs by rounding.
 """
 
+import ctypes
+import sys
+
 import taichi as ti
 
 from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
@@ -24,6 +27,23 @@ NODE_MASK = (1 << NODE_BITS) - 1
 THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 
+RESIDENT_BLOCK = 128
+"""Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
+resident whatever their registers."""
+
+RESIDENT_TURNS = 2
+"""Up to so many particles per resident thread a step is one launch."""
+
+
+def multiprocessors() -> int:
+    """Multiprocessors of the CUDA device, by asking the driver; Taichi does not tell."""
+    count = ctypes.c_int(0)
+    driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    attribute = 16  # CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT
+    if driver.cuDeviceGetAttribute(ctypes.byref(count), attribute, 0) != 0 or count.value < 1:
+        return 1
+    return count.value
+
 
 @ti.data_oriented
 class CudaEngine(CudaPhases):
@@ -38,6 +58,7 @@ class CudaEngine(CudaPhases):
         super().__init__(*args)
         self.particle_threads = self.batch * self.tiles * self.lanes
         self.pose_threads = self.batch * max(1, self.manipulators)
+        self.resident_threads = multiprocessors() * RESIDENT_BLOCK
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
 
     # -- threads ------------------------------------------------------------------------------------
@@ -47,6 +68,74 @@ class CudaEngine(CudaPhases):
         """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
         e = q // (self.tiles * self.lanes)
         return e, q - e * (self.tiles * self.lanes)
+
+    @ti.func
+    def scatter_node(self, e, particle, base):
+        """Grid index of a particle's base node; negative, and another for each, where it is padding."""
+        node = e * self.nodes + self.node_index(base)
+        if particle >= self.particles:
+            node = -1 - particle
+        return node
+
+    @ti.func
+    def resident_turns(self, w, total):
+        """How many of ``total`` items resident thread w works on."""
+        return (total - w + self.resident_threads - 1) // self.resident_threads
+
+    @ti.func
+    def meet(self, w, meetings):
+        """Wait until all resident threads are here for the same time; returns how often they have met."""
+        ti.simt.grid.memfence()
+        ti.simt.block.sync()
+        if w % RESIDENT_BLOCK == 0:
+            goal = (meetings + 1) * (self.resident_threads // RESIDENT_BLOCK)
+            ti.atomic_add(self.arrivals[0], 1)
+            # An atomic that changes nothing: a plain load could be hoisted out of the loop.
+            while ti.atomic_or(self.arrivals[0], 0) < goal:
+                pass
+        ti.simt.block.sync()
+        # What others wrote must not be read from this processor's own cache.
+        ti.simt.grid.memfence()
+        return meetings + 1
+
+    @ti.func
+    def scatter_thread(self, state: ti.template(), before, after, q, stamp):
+        """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part."""
+        e, particle = self.particle_of(q)
+        tile = particle // self.lanes
+        source = self.tile_entry(before, e, tile)
+        entry9 = (e * self.tiles + tile) * 9
+        lane = self.sorted_lane(state, source, tile, particle % self.lanes)
+        base, fx = self.stencil(self.vector(state, source, lane))
+        node = self.scatter_node(e, tile * self.lanes + lane, base)
+        run, first, doublings = self.run_of(node, particle % self.lanes)
+        if node >= 0:
+            self.material_particle(state, source, self.tile_entry(after, e, tile), entry9, lane, e, True)
+        first = first and node >= 0
+        if first:
+            self.mark_shared(e, base, stamp)
+        q4 = self.momentum_field(state, source, entry9, lane, fx)
+        self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+
+    @ti.func
+    def grid_thread(self, q, s):
+        """Grid update of node q of the active blocks; the node's momentum is cleared."""
+        e, i = self.node_of(q)
+        node = e * self.nodes + self.linear(i)
+        total = self.take(self.momentum, node)
+        # A test of which manipulators are near would cost a thread as much as contact with them.
+        v = self.update_node(e, s, i, ti.static((1 << self.manipulators) - 1), total)
+        self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+
+    @ti.func
+    def gather_thread(self, state: ti.template(), before, after, q, time):
+        """Grid to particle, for thread q's own particle."""
+        e, particle = self.particle_of(q)
+        if particle < self.particles:
+            tile = particle // self.lanes
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            self.gather_particle(state, source, target, particle % self.lanes, e, time)
 
     @ti.func
     def turns_of(self, w, total):
@@ -75,6 +164,9 @@ class CudaEngine(CudaPhases):
         stamp: int,
     ) -> None:
         """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
+        if self.particle_threads <= RESIDENT_TURNS * self.resident_threads:
+            self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
+            return
         self.advance_kernel(poses, actions, t, pose_before, pose_after)
         for s in range(self.substeps):
             before = slot + s * stride
@@ -147,34 +239,59 @@ class CudaEngine(CudaPhases):
     ):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
         for q in range(self.particle_threads):
-            e, particle = self.particle_of(q)
-            if particle < self.particles:
-                tile = particle // self.lanes
-                lane = particle % self.lanes
-                source = self.tile_entry(before, e, tile)
-                entry9 = (e * self.tiles + tile) * 9
-                base, fx = self.stencil(self.vector(state, source, lane))
-                self.mark_shared(e, base, stamp)
-                self.material_particle(state, source, self.tile_entry(after, e, tile), entry9, lane, e, True)
-                self.scatter_particle(state, source, entry9, lane, e, base, fx)
+            self.scatter_thread(state, before, after, q, stamp)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
-                e, i = self.node_of(w + turn * self.node_threads)
-                node = e * self.nodes + self.linear(i)
-                total = self.take(self.momentum, node)
-                # A test of which manipulators are near would cost a thread as much as contact with them.
-                v = self.update_node(e, s, i, ti.static((1 << self.manipulators) - 1), total)
-                self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+                self.grid_thread(w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             if q == 0:
                 self.block_count[0] = 0
-            e, particle = self.particle_of(q)
-            if particle < self.particles:
-                tile = particle // self.lanes
-                source = self.tile_entry(before, e, tile)
-                self.gather_particle(
-                    state, source, self.tile_entry(after, e, tile), particle % self.lanes, e, time
-                )
+            self.gather_thread(state, before, after, q, time)
+
+    @ti.kernel
+    def resident_step_kernel(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        poses: ti.types.ndarray(ndim=1),
+        actions: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        stride: ti.i32,
+        t: ti.i32,
+        pose_before: ti.i32,
+        pose_after: ti.i32,
+        stamp: ti.i32,
+    ):
+        """One environment step in one launch, for few particles: threads that are all resident at once meet
+        at barriers between the phases, where launches would take longer than the phases do."""
+        self.block_count[0] = 0
+        self.arrivals[0] = 0
+        ti.loop_config(block_dim=RESIDENT_BLOCK)
+        for w in range(self.resident_threads):
+            meetings = 0
+            for m in ti.static(range(self.manipulators)):
+                if w // self.batch == m:
+                    self.advance_manipulator(w % self.batch, m, actions, poses, t, pose_before, pose_after)
+            meetings = self.meet(w, meetings)
+            for turn in range(self.resident_turns(w, self.pose_threads * self.substeps)):
+                q = w + turn * self.resident_threads
+                for m in ti.static(range(self.manipulators)):
+                    if q % self.pose_threads // self.batch == m:
+                        self.set_frame(q % self.pose_threads % self.batch, q // self.pose_threads, m)
+            for s in range(self.substeps):
+                before = slot + s * stride
+                for turn in range(self.resident_turns(w, self.particle_threads)):
+                    q = w + turn * self.resident_threads
+                    self.scatter_thread(state, before, before + stride, q, stamp + s)
+                meetings = self.meet(w, meetings)
+                for turn in range(self.resident_turns(w, self.block_count[0] << NODE_BITS)):
+                    self.grid_thread(w + turn * self.resident_threads, s)
+                meetings = self.meet(w, meetings)
+                if w == 0:
+                    self.block_count[0] = 0
+                for turn in range(self.resident_turns(w, self.particle_threads)):
+                    q = w + turn * self.resident_threads
+                    self.gather_thread(state, before, before + stride, q, t * self.substeps + s)
+                meetings = self.meet(w, meetings)
 
     @ti.kernel
     def losses_kernel(
@@ -261,20 +378,24 @@ class CudaEngine(CudaPhases):
         """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
-            if particle < self.particles:
-                tile = particle // self.lanes
-                lane = particle % self.lanes
-                source = self.tile_entry(before, e, tile)
-                target = self.tile_entry(after, e, tile)
-                entry = self.tile_entry(0, e, tile)
-                entry9 = (e * self.tiles + tile) * 9
-                x = self.vector(state, source, lane)
-                base, fx = self.stencil(x)
-                self.mark_shared(e, base, stamp)
+            tile = particle // self.lanes
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry9 = (e * self.tiles + tile) * 9
+            lane = self.sorted_lane(state, source, tile, particle % self.lanes)
+            x = self.vector(state, source, lane)
+            base, fx = self.stencil(x)
+            node = self.scatter_node(e, tile * self.lanes + lane, base)
+            run, first, doublings = self.run_of(node, particle % self.lanes)
+            if node >= 0:
                 self.material_particle(state, source, target, entry9, lane, e, False)
-                self.scatter_particle(state, source, entry9, lane, e, base, fx)
-                h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
-                self.scatter(self.velocity_bar, e * self.nodes + self.node_index(base), spline(fx), h)
+            first = first and node >= 0
+            if first:
+                self.mark_shared(e, base, stamp)
+            q4 = self.momentum_field(state, source, entry9, lane, fx)
+            self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+            h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
+            self.scatter_run(self.velocity_bar, node, spline(fx), h, run, first, doublings)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
                 e, i = self.node_of(w + turn * self.node_threads)

@@ -19,6 +19,12 @@ __all__ = ["NEAREST_GROUPS", "CudaPhases"]
 NEAREST_GROUPS = 128
 """Threads per environment and manipulator in the search for the nearest particle."""
 
+ALL_LANES = 0xFFFFFFFF
+"""Mask of a warp: 32 threads, which are the 32 lanes of one tile of particles."""
+
+RUN_BITS = 5
+"""A run of particles in one cell is as long as a warp at most, 2^5."""
+
 FAR = 1e9
 """Distance of the nearest particle before any was looked at."""
 
@@ -196,6 +202,110 @@ class CudaPhases(Phases):
             self.affine[entry9 + 3 * i][lane] = self.dx * (mx[i] - fx[0] * m0[i])
             self.affine[entry9 + 3 * i + 1][lane] = self.dx * (my[i] - fx[1] * m0[i])
             self.affine[entry9 + 3 * i + 2][lane] = self.dx * (mz[i] - fx[2] * m0[i])
+
+    # -- scatter by runs ----------------------------------------------------------------------------
+    #
+    # Particles are in the order of their cells at the start, and neighbours stay neighbours, so that the
+    # particles of a tile share few base nodes. A warp takes the particles of its tile in the order of their
+    # nodes; what a run of lanes with the same node adds to the grid is summed in registers first, and its
+    # first lane alone does the atomics. The sums are exact for any order of particles.
+
+    @ti.func
+    def sorted_lane(self, state: ti.template(), source, tile, lane):
+        """Which particle of the tile a lane takes: the one whose base node is the lane-th in order."""
+        base, _fx = self.stencil(self.vector(state, source, lane))
+        node = self.node_index(base)
+        if tile * self.lanes + lane >= self.particles:
+            node = self.nodes
+        # The node and the particle in one number; n = 256 takes 29 bits.
+        packed = node * self.lanes + lane
+        for stage in ti.static(range(1, RUN_BITS + 1)):
+            for step in ti.static(range(stage - 1, -1, -1)):
+                other = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), packed, 1 << step)
+                least, most = ti.min(packed, other), ti.max(packed, other)
+                packed = most
+                # A lane keeps the lesser where it is the lower of a rising pair or the upper of a falling.
+                if (lane >> stage) & 1 == (lane >> step) & 1:
+                    packed = least
+        return packed % self.lanes
+
+    @ti.func
+    def from_lane_above(self, value, offset):
+        """The value that the lane ``offset`` above this one holds."""
+        out = value
+        if ti.static(self.real == ti.f32):
+            out = ti.simt.warp.shfl_down_f32(ti.u32(ALL_LANES), value, offset)
+        else:
+            bits = ti.bit_cast(value, ti.i64)
+            low = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), offset)
+            high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
+            joined = (ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64)
+            out = ti.bit_cast(joined, ti.f64)
+        return out
+
+    @ti.func
+    def run_of(self, key, lane):
+        """Lanes from this one on that hold the same key, whether this is the first of them, and the number
+        of doublings that the warp's longest run needs."""
+        run = 1
+        for k in ti.static(range(RUN_BITS)):
+            above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), run, 1 << k)
+            key_above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), key, 1 << k)
+            if run == (1 << k) and lane + (1 << k) < self.lanes and key_above == key:
+                run += above
+        key_below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), key, 1)
+        doublings = 0
+        for k in ti.static(range(RUN_BITS)):
+            if ti.simt.warp.any_nonzero(ti.u32(ALL_LANES), ti.cast(run > (1 << k), ti.i32)):
+                doublings = k + 1
+        return run, lane == 0 or key_below != key, doublings
+
+    @ti.func
+    def scatter_run(
+        self, grid: ti.template(), node, w: ti.template(), q: ti.template(), run, first, doublings
+    ):
+        """Scatter an affine field as :meth:`scatter` does; every lane of the warp must take part.
+
+        Args:
+            grid: Field of 4-vectors.
+            node: Index of the base node; what other lanes of the run have is not looked at.
+            w: Spline weights.
+            q: Value at the base node and increments along x, y, z, 4-vectors.
+            run: See :meth:`run_of`.
+            first: Whether this lane does the run's atomics.
+            doublings: See :meth:`run_of`.
+        """
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                wij = w[i][0] * w[j][1]
+                r = wij * (q[0] + float(i) * q[1] + float(j) * q[2])
+                z = wij * q[3]
+                r0 = w[0][2] * r
+                r1 = w[1][2] * r + w[1][2] * z
+                r2 = w[2][2] * r + (2.0 * w[2][2]) * z
+                # The same number of rounds for all lanes of the warp.
+                for k in range(doublings):
+                    takes = run > (1 << k)
+                    for c in ti.static(range(4)):
+                        a0 = self.from_lane_above(r0[c], 1 << k)
+                        a1 = self.from_lane_above(r1[c], 1 << k)
+                        a2 = self.from_lane_above(r2[c], 1 << k)
+                        if takes:
+                            r0[c] += a0
+                            r1[c] += a1
+                            r2[c] += a2
+                if first:
+                    row = node + (i * self.axis + j) * self.axis
+                    ti.atomic_add(grid[row], r0)
+                    ti.atomic_add(grid[row + 1], r1)
+                    ti.atomic_add(grid[row + 2], r2)
+
+    @ti.func
+    def momentum_field(self, state: ti.template(), source, entry9, lane, fx):
+        """The affine field of momentum and mass that a particle scatters."""
+        a = self.load(self.affine, entry9, lane, 9)
+        v = self.vector(state, source + 3, lane)
+        return self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
 
     # -- grid ---------------------------------------------------------------------------------------
 
