@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import plab.sim.cuda_engine as cuda_engine
 from plab.sim import Simulator, State
 from suite import batch
 
@@ -69,8 +70,10 @@ def relative_error(got: np.ndarray, want: np.ndarray) -> float:
     return float(np.abs(got - want).max() / np.abs(want).max())
 
 
-@pytest.mark.parametrize("contact", ["soft", "hard"])
-def test_cuda_agrees_with_the_cpu(contact: str) -> None:
+@pytest.mark.parametrize(("contact", "resident"), [("soft", True), ("hard", False)])
+def test_cuda_agrees_with_the_cpu(contact: str, resident: bool, monkeypatch) -> None:
+    # A step of many particles is many launches, one of few a single launch: these scenes have few.
+    monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 1000 if resident else 0)
     want = results("cpu", contact)
     got = results("cuda", contact)
     errors = {name: relative_error(got[name], want[name]) for name in want}

@@ -10,6 +10,7 @@ import pytest
 
 from plab.scene import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator
+from plab.sim.order import curve_order, hilbert_index
 
 STEPS = 4
 
@@ -155,3 +156,17 @@ def test_bad_physics_is_refused() -> None:
         ball(center=(0.5, 0.95, 0.5)).validate()
     with pytest.raises(SceneError, match="same manipulators"):
         Simulator([ball(), replace(ball(), manipulators=())])
+
+
+def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
+    cells = np.indices((8, 8, 8)).reshape(3, -1).T
+    index = hilbert_index(cells, 3)
+    assert sorted(index) == list(range(512))
+    way = cells[np.argsort(index)]
+    assert (np.abs(np.diff(way, axis=0)).sum(axis=1) == 1).all()
+
+
+def test_particles_outside_the_lowest_nodes_are_put_in_order_too() -> None:
+    x = np.random.default_rng(0).random((500, 3)) * (1 - 3 / 16)
+    x[:8] = np.indices((2, 2, 2)).reshape(3, -1).T * (1 - 3 / 16)
+    assert sorted(curve_order(x, 16)) == list(range(500))

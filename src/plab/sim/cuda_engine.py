@@ -308,14 +308,19 @@ class CudaEngine(CudaPhases):
             self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 4)
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
-            if particle < self.particles:
-                x = self.vector(
-                    state, self.tile_entry(slot, e, particle // self.lanes), particle % self.lanes
-                )
-                base, fx = self.stencil(x)
+            tile = particle // self.lanes
+            source = self.tile_entry(slot, e, tile)
+            lane = self.sorted_lane(state, source, tile, particle % self.lanes)
+            x = self.vector(state, source, lane)
+            base, fx = self.stencil(x)
+            node = self.scatter_node(e, tile * self.lanes + lane, base)
+            run, first, doublings = self.run_of(node, particle % self.lanes)
+            first = first and node >= 0
+            if first:
                 self.mark_shared(e, base, stamp)
-                self.scatter_mass(e, base, fx)
-                self.note_distances(e, particle, x)
+            self.scatter_mass_run(e, base, fx, run, first, doublings)
+            if node >= 0:
+                self.note_distances(e, tile * self.lanes + lane, x)
         # A row of nodes per thread makes a quarter of the atomics.
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, (self.block_count[0] << NODE_BITS) // BLOCK)):

@@ -301,6 +301,25 @@ class CudaPhases(Phases):
                     ti.atomic_add(grid[row + 2], r2)
 
     @ti.func
+    def scatter_mass_run(self, e, base, fx, run, first, doublings):
+        """Add every lane's mass to its 27 nodes as :meth:`scatter_mass` does, run by run."""
+        w = spline(fx)
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                wij = self.mass * w[i][0] * w[j][1]
+                row = ti.Vector([wij * w[0][2], wij * w[1][2], wij * w[2][2]])
+                for k in range(doublings):
+                    takes = run > (1 << k)
+                    for c in ti.static(range(3)):
+                        above = self.from_lane_above(row[c], 1 << k)
+                        if takes:
+                            row[c] += above
+                if first:
+                    for c in ti.static(range(3)):
+                        node = e * self.nodes + self.linear(self.folded_node(base, i, j, c))
+                        ti.atomic_add(self.momentum[node][3], row[c])
+
+    @ti.func
     def momentum_field(self, state: ti.template(), source, entry9, lane, fx):
         """The affine field of momentum and mass that a particle scatters."""
         a = self.load(self.affine, entry9, lane, 9)

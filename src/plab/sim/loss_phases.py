@@ -26,7 +26,7 @@ class LossPhases(Storage):
 
     @ti.func
     def scatter_mass(self, grid_index, base, fx):
-        """Add one particle's mass to its 27 nodes."""
+        """Add one particle's mass to its 27 nodes, where one thread owns the grid."""
         w = spline(fx)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
@@ -34,10 +34,7 @@ class LossPhases(Storage):
                     at = self.folded_node(base, i, j, k)
                     node = grid_index * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
                     share = self.mass * w[i][0] * w[j][1] * w[k][2]
-                    if ti.static(self.cuda):
-                        ti.atomic_add(self.momentum[node][3], share)
-                    else:
-                        self.momentum[node][3] = self.momentum[node][3] + share
+                    self.momentum[node][3] = self.momentum[node][3] + share
 
     @ti.func
     def tensor_index(self, e, i):

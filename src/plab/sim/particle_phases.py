@@ -390,11 +390,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def add(self, grid: ti.template(), node, value):
-        """Add to a grid node: plainly where one thread owns the grid, atomically on CUDA."""
-        if ti.static(self.cuda):
-            ti.atomic_add(grid[node], value)
-        else:
-            grid[node] = grid[node] + value
+        """Add to a grid node that one thread owns."""
+        grid[node] = grid[node] + value
 
     @ti.func
     def scatter(self, grid: ti.template(), node, w: ti.template(), q: ti.template()):

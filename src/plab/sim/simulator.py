@@ -10,6 +10,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
+from plab.sim.order import curve_order
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
 
@@ -128,7 +129,7 @@ class Simulator:
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._order = np.stack([_cell_order(x, scenes[0].grid_size) for x in positions])
+        self._order = np.stack([curve_order(x, scenes[0].grid_size) for x in positions])
         self._initial_poses = np.array(
             [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
             dtype=np.float64,
@@ -544,7 +545,7 @@ class Simulator:
             )
 
     def _pack(self, state: State) -> np.ndarray:
-        """User arrays to tiles, particles in cell order, the last tile padded with particles at rest."""
+        """User arrays to tiles along the curve, the last tile padded with particles at rest."""
         engine = self._engine
         b, n = self.batch, self.particle_count
         flat = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
@@ -587,16 +588,6 @@ def _unit(rotation: Sequence[float]) -> list[float]:
     """A quaternion of length 1; YAML files round theirs."""
     q = np.asarray(rotation, float)
     return list(q / np.linalg.norm(q))
-
-
-def _cell_order(x: np.ndarray, n: int) -> np.ndarray:
-    """Permutation that sorts particles by block and by cell, so that neighbours in memory share grid
-    nodes."""
-    cell = np.floor(x * n - 0.5).astype(np.int64) + 1
-    block = cell // 4
-    key = (block[:, 0] * n + block[:, 1]) * n + block[:, 2]
-    inner = (cell[:, 0] * (n + 1) + cell[:, 1]) * (n + 1) + cell[:, 2]
-    return np.lexsort((inner, key))
 
 
 def _rest_state(x: np.ndarray, poses: np.ndarray) -> State:
