@@ -95,7 +95,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=10, help="environment steps per rollout")
     parser.add_argument("--repeats", type=int, default=5, help="timed rollouts after the first")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     print("  ".join(f"{name:>12s}" for name in COLUMNS))
     table = []
     for batch in options.batch:
