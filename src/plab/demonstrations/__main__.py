@@ -31,6 +31,16 @@ from plab.sim import DeviceError, SimulationError
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
 from plab.targets import EPISODE_STEPS, TargetError
 
+HEADING = """\
+# Demonstrations
+
+The best actions known for each configuration, replayed in the hard contact model; made by `python -m
+plab.demonstrations --markdown docs/demonstrations.md`. [suite.md](suite.md) explains them. "Steps" counts up
+to the last motion, "score at rest" is what doing nothing reaches, the IoUs are soft: of the start and the
+target, and of the target and itself.
+
+"""
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -141,7 +151,8 @@ def _show(table: pd.DataFrame, markdown: Path | None) -> None:
     Console().print(printed)
     if markdown is not None:
         lines = [list(table.columns), ["---"] * len(table.columns), *cells]
-        markdown.write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
+        table_text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        markdown.write_text(HEADING + table_text, encoding="utf-8")
 
 
 def _numbers(text: str) -> list[float]:
