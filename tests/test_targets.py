@@ -305,3 +305,9 @@ def test_a_problem_takes_its_targets_from_the_folder(tmp_path, device):
 def test_a_folder_of_release_files_has_none_for_random_variants(tmp_path):
     with pytest.raises(ConfigError, match="no files for variant=random"):
         load_config(["variant=random", f"targets.source={tmp_path}"])
+
+
+def test_a_target_of_too_few_particles_is_told(device):
+    overrides = ("task=Rope", *COARSE[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
+    with pytest.raises(TargetError, match="the target is empty: .*raise sim.particles_scale"):
+        Problem([load_config(overrides)])

@@ -15,7 +15,7 @@ import numpy as np
 from plab.config import ConfigError, build_scene, variant_task
 from plab.objective import LossWeights, Scores, rewards, scores, target_sdf, total_loss
 from plab.sim import Simulator
-from plab.targets import build_targets, load_release_target
+from plab.targets import TargetError, build_targets, load_release_target
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -83,7 +83,7 @@ class Problem:
         )
         self.target_mass = _targets(cfgs, self.simulator)
         # Distances to equal targets are equal.
-        distances = {key: target_sdf(self.target_mass[cfgs.index(cfg)]) for key, cfg in kinds.items()}
+        distances = {key: _distance(self.target_mass[cfgs.index(cfg)]) for key, cfg in kinds.items()}
         self.simulator.set_target(self.target_mass, np.stack([distances[id(cfg)] for cfg in cfgs]))
         self.simulator.set_loss_weights(self.weights.density, self.weights.sdf, self.weights.contact)
         self.simulator.reset()
@@ -119,6 +119,14 @@ class Problem:
             scores(initial, final, target)
             for initial, final, target in zip(self.initial_mass, mass, self.target_mass, strict=True)
         ]
+
+
+def _distance(mass: np.ndarray) -> np.ndarray:
+    """Return the distance to a target, shape [n, n, n]."""
+    try:
+        return target_sdf(mass)
+    except ValueError as error:
+        raise TargetError(f"{error}: raise sim.particles_scale or lower sim.grid_size") from None
 
 
 def _targets(cfgs: Sequence[Config], simulator: Simulator) -> np.ndarray:
