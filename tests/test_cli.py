@@ -59,7 +59,12 @@ def plab(*argv: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str
 
 REFUSED = [
     (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks,"),
-    (["method=ppo"], "choose from: adam, adam_h, gd"),
+    (["method=a2c"], "choose from: adam, adam_h, apg, gd, ppo, sac, td3"),
+    (
+        ["+experiment=yield_ablatoin"],
+        "experiment 'yield_ablatoin' does not exist; did you mean yield_ablation?",
+    ),
+    (["-m", "+experiment=yield_ablatoin"], "did you mean yield_ablation?"),
     (["sim=slow"], "choose from: fast, reference"),
     (["tsk=Move"], "unknown key 'tsk'; did you mean task?"),
     (["seed=abc"], "could not be converted to Integer"),
@@ -122,6 +127,9 @@ def test_help_names_everything(capsys):
     text, _ = capsys.readouterr()
     for group in ("task", "method", "sim"):
         assert all(f"{group}={name}" in text for name in choices(group))
+    assert all(f"+experiment={name}" in text for name in choices("experiment"))
+    for key in ("method.num_envs=1", "method.tau", "method.profiles.paper.tau=3e-4", "method.clip_range"):
+        assert key in text
     for key in ("variant=1", "seed_scene=0", "seed=0", "results_dir=results", "force=false", "progress=true"):
         assert key in text
     for key in (
@@ -177,6 +185,20 @@ def test_flags_and_overrides_come_in_any_order(seen):
     assert main(["seed=0,1", "-m", "variant=1,2"]) == 0
     assert [(cfg.seed, cfg.variant) for cfg in seen] == [(0, "1"), (0, "2"), (1, "1"), (1, "2")]
     assert sorted(path.name for path in Path.cwd().rglob("*")) == ["multirun.yaml", "results"]
+
+
+@pytest.mark.parametrize("flags", [(), ("-m",)])
+def test_an_experiment_is_a_sweep(seen, flags):
+    assert main(["+experiment=yield_ablation", "method.episodes=7", *flags]) == 0
+    assert [cfg.task.yield_stress for cfg in seen] == [10, 20, 50, 100, 200, 1000]
+    assert {(cfg.task.name, cfg.variant, cfg.method.name, cfg.method.episodes) for cfg in seen} == {
+        ("Move", "3", "sac", 7)
+    }
+
+
+def test_an_experiment_is_swept_further(seen):
+    assert main(["-m", "+experiment=yield_ablation", "task.yield_stress=10,20", "seed=0,1"]) == 0
+    assert [(cfg.task.yield_stress, cfg.seed) for cfg in seen] == [(10, 0), (10, 1), (20, 0), (20, 1)]
 
 
 def test_a_sweep_goes_on_after_a_refused_job(seen, capsys):

@@ -13,10 +13,15 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from plab.config import (
+    ApgConfig,
     Config,
     ConfigError,
+    MethodConfig,
+    PpoConfig,
+    SacConfig,
     SimConfig,
     TaskConfig,
+    Td3Config,
     TrajectoryConfig,
     build_scene,
     choices,
@@ -42,8 +47,21 @@ DOCUMENTED = (
     RandomConfig,
     DrawConfig,
     TrajectoryConfig,
+    ApgConfig,
+    SacConfig,
+    Td3Config,
+    PpoConfig,
     SimConfig,
 )
+
+METHOD_KINDS = {
+    "adam": TrajectoryConfig,
+    "apg": ApgConfig,
+    "sac": SacConfig,
+    "td3": Td3Config,
+    "ppo": PpoConfig,
+}
+"""Type of each method's file that does not build on another."""
 
 SUITE = {
     "Move": (200, 10000, 6),
@@ -100,10 +118,28 @@ def test_sim_keys_are_the_fields():
     assert keys(raw("sim/fast.yaml")) == names(SimConfig)
 
 
-def test_trajectory_keys_are_the_fields():
-    method = raw("method/adam.yaml")
-    assert keys(method) == names(TrajectoryConfig)
+@pytest.mark.parametrize("name", METHOD_KINDS)
+def test_method_keys_are_the_fields(name):
+    method = raw(f"method/{name}.yaml")
+    assert keys(method) == names(METHOD_KINDS[name])
     assert keys(method["loss_weights"]) == names(LossWeights)
+
+
+@pytest.mark.parametrize("name", ["sac", "td3", "ppo"])
+def test_profiles_hold_the_values_that_refer_to_them(name):
+    method = raw(f"method/{name}.yaml")
+    referring = {key for key, value in method.items() if str(value).startswith("${")}
+    assert {f"${{.profiles.${{.profile}}.{key}}}" for key in referring} == {method[key] for key in referring}
+    assert [set(profile) for profile in method["profiles"].values()] == [referring] * 2
+    assert list(method["profiles"]) == ["paper", "release"]
+
+
+def test_a_profile_gives_the_numbers_and_overrides_win():
+    paper, release = (load_config(["method=sac", f"method.profile={p}"]).method for p in ("paper", "release"))
+    assert (paper.tau, paper.learning_starts, paper.profiles) == (3e-4, 1000, {})
+    assert (release.tau, release.learning_starts, release.profiles) == (0.005, 2500, {})
+    assert load_config(["method=sac"]).method == release
+    assert load_config(["method=sac", "method.profile=paper", "method.tau=0.1"]).method.tau == 0.1
 
 
 @pytest.mark.parametrize("task", choices("task"))
@@ -139,7 +175,7 @@ def test_every_field_is_documented(kind):
 def test_every_method_and_sim_composes(method, sim):
     cfg = load_config([f"method={method}", f"sim={sim}"])
     assert cfg.method.name == method
-    assert isinstance(cfg, Config) and isinstance(cfg.method, TrajectoryConfig)
+    assert isinstance(cfg, Config) and isinstance(cfg.method, MethodConfig)
 
 
 def test_methods_differ_only_where_their_files_say():
@@ -148,6 +184,13 @@ def test_methods_differ_only_where_their_files_say():
     )
     assert gd == adam | {"name": "gd", "optimizer": "gd"}
     assert adam_h == adam | {"name": "adam_h", "contact": "hard"}
+
+
+def test_an_experiment_presets_what_it_says():
+    cfg = load_config(["+experiment=yield_ablation", "task.yield_stress=20"])
+    assert (cfg.task.name, cfg.variant, cfg.method.name, cfg.task.yield_stress) == ("Move", "3", "sac", 20)
+    # What it sweeps over is left to the sweep.
+    assert load_config(["+experiment=yield_ablation"]).task.yield_stress == 200
 
 
 def test_reference_is_fast_in_float64():
@@ -269,9 +312,9 @@ REFUSED = [
         "task=Ropee",
         "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks, Move,",
     ),
-    ("method=adm", "method 'adm' does not exist; did you mean adam? choose from: adam, adam_h, gd"),
+    ("method=adm", "method 'adm' does not exist; did you mean adam? choose from: adam, adam_h, apg, gd"),
     ("sim=slow", "sim 'slow' does not exist; choose from: fast, reference"),
-    ("method=", "method '' does not exist; choose from: adam, adam_h, gd"),
+    ("method=", "method '' does not exist; choose from: adam, adam_h, apg, gd"),
     ("task=null", "name one task; choose from: Assembly, Chopsticks, Move,"),
     ("task=[Rope,Move]", "name one task; choose from: Assembly, Chopsticks, Move,"),
     ("+sim=reference", "write sim=reference"),
@@ -340,6 +383,11 @@ REFUSED = [
     ("method.eps=0", "method.eps must be positive"),
     ("method.iterations=0", "method.iterations must be at least 1, not 0"),
     ("method.action_init=2", "method.action_init must be in [0, 1], not 2"),
+    ("experiment=yield_ablation", "write +experiment=yield_ablation"),
+    (
+        "+experiment=yield_ablatoin",
+        "experiment 'yield_ablatoin' does not exist; did you mean yield_ablation? choose from: yield_",
+    ),
     ("method.name=", "method.name '' must be"),
     ("sim.precision=float16", "sim.precision 'float16' does not exist; did you mean float64?"),
     ("sim.device=gpu", "sim.device 'gpu' does not exist; choose from: cpu, cuda"),
@@ -356,6 +404,40 @@ REFUSED = [
 def test_refused(override, message):
     with pytest.raises(ConfigError) as info:
         load_config([override])
+    assert message in str(info.value)
+    assert "\n" not in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "override", "message"),
+    [
+        (
+            "sac",
+            "profile=papr",
+            "method.profile 'papr' does not exist; did you mean paper? choose from: paper,",
+        ),
+        ("sac", "algorithm=dqn", "method.algorithm 'dqn' does not exist; choose from: sac, td3, ppo"),
+        ("sac", "num_envs=0", "method.num_envs must be at least 1, not 0"),
+        ("sac", "episodes=0", "method.episodes must be at least 1, not 0"),
+        ("sac", "gamma=0", "method.gamma must be in (0, 1], not 0"),
+        ("sac", "hidden=[0]", "method.hidden must be at least 1, not 0"),
+        ("sac", "tau=2", "method.tau must be in (0, 1], not 2"),
+        ("sac", "torch_device=gpu", "method.torch_device 'gpu' does not exist; choose from: cpu, cuda"),
+        ("sac", "gradient_steps=0", "method.gradient_steps must be at least 1, not 0"),
+        ("sac", "buffer_size=0", "method.buffer_size must be at least 1, not 0"),
+        ("sac", "epochs=3", "unknown key 'method.epochs'; choose from: name"),
+        ("td3", "target_noise=-1", "method.target_noise must be at least 0 and finite, not -1"),
+        ("td3", "policy_delay=0", "method.policy_delay must be at least 1, not 0"),
+        ("ppo", "minibatches=1251", "method.minibatches must be at most steps_per_update / 2 = 1250"),
+        ("ppo", "gae_lambda=1.1", "method.gae_lambda must be in [0, 1], not 1.1"),
+        ("ppo", "value_clip_range=0", "method.value_clip_range must be positive and finite, not 0"),
+        ("apg", "hidden=[16,-1]", "method.hidden must be at least 1, not -1"),
+        ("apg", "torch_threads=0", "method.torch_threads must be at least 1, not 0"),
+    ],
+)
+def test_refused_of_a_method(method, override, message):
+    with pytest.raises(ConfigError) as info:
+        load_config([f"method={method}", f"method.{override}"])
     assert message in str(info.value)
     assert "\n" not in str(info.value)
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from plab.config import GROUPS, choices, conf_folder
+from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
 
 __all__ = ["help_text"]
 
@@ -25,12 +25,14 @@ EXAMPLES
 
   python -m plab.run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
   python -m plab.run -m variant=random 'seed_scene=range(10)'  ten drawn configurations
+  python -m plab.run task=Torus method=ppo method.profile=paper            reinforcement learning
+  python -m plab.run +experiment=yield_ablation                a sweep that a file describes
   python -m plab.run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
 
 FLAGS
   -m, --multirun    run every combination of the values given with commas
   --cfg job         print the configuration and stop; with --package sim, only that section
-  --config-dir DIR  use the YAML files in DIR/task, DIR/method and DIR/sim, too
+  --config-dir DIR  use the YAML files in DIR/task, DIR/method, DIR/sim and DIR/experiment, too
   -h, --help        this text; --hydra-help explains Hydra's own flags
 """
 
@@ -49,17 +51,25 @@ def help_text(config_dir: str | None = None) -> str:
         parts.append(f"{group.upper()}S" if group != "sim" else "SIMULATOR PRESETS")
         parts += [f"  {group}={name:<10} {_title(path)}" for name, path in choices(group, config_dir).items()]
         parts.append("")
-    parts.append("KEYS, with their defaults")
+    parts.append("EXPERIMENTS")
+    names = choices(EXPERIMENT, config_dir).items()
+    parts += [f"  +{EXPERIMENT}={name:<10} {_title(path)}" for name, path in names]
+    parts += ["", "KEYS, with their defaults"]
     parts += _keys(folder / "config.yaml", "")
     parts += _keys(folder / "sim" / "fast.yaml", "sim.")
     parts += _keys(folder / "method" / "adam.yaml", "method.")
+    for method in ("sac", "td3", "ppo", "apg"):
+        parts.append(f"  of method={method}; what has no value here takes the profile's:")
+        parts += _keys(folder / "method" / f"{method}.yaml", "method.")
     parts.append("  and those of the task; here of Rope:")
     parts += _keys(folder / "task" / "Rope.yaml", "task.")
     return "\n".join(parts)
 
 
 def _title(path: Path) -> str:
-    return path.read_text(encoding="utf-8").partition("\n")[0].lstrip("# ")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    # The first line of an experiment says where its keys go.
+    return next(line for line in lines if not line.startswith("# @package")).lstrip("# ")
 
 
 def _keys(path: Path, prefix: str) -> Iterator[str]:
@@ -74,5 +84,5 @@ def _keys(path: Path, prefix: str) -> Iterator[str]:
         if parents[0] in ("defaults", "hydra") or (len(parents) > 1 and parents[0] == "variants"):
             continue
         key = prefix + ".".join(parents)
-        value = re.sub(r"^[&*]\w+", "", match["value"].strip())
+        value = re.sub(r"^[&*]\w+|^\$\{.*", "", match["value"].strip())
         yield f"  {f'{key}={value}' if value else key:<52} {match['comment'] or ''}".rstrip()

@@ -25,12 +25,17 @@ from plab.config_types import (
     DEVICES,
     OPTIMIZERS,
     PRECISIONS,
+    ApgConfig,
     BodyConfig,
     Config,
     ManipulatorConfig,
     MethodConfig,
+    PpoConfig,
+    RlConfig,
+    SacConfig,
     SimConfig,
     TaskConfig,
+    Td3Config,
     TrajectoryConfig,
 )
 from plab.random_variant import draw_variant
@@ -41,16 +46,22 @@ from plab.variants import RANDOM, merge_variant, undone_key, variant_changes
 __all__ = [
     "CONTACTS",
     "DEVICES",
+    "EXPERIMENT",
     "GROUPS",
     "OPTIMIZERS",
     "PRECISIONS",
+    "ApgConfig",
     "BodyConfig",
     "Config",
     "ConfigError",
     "ManipulatorConfig",
     "MethodConfig",
+    "PpoConfig",
+    "RlConfig",
+    "SacConfig",
     "SimConfig",
     "TaskConfig",
+    "Td3Config",
     "TrajectoryConfig",
     "build_scene",
     "check_overrides",
@@ -64,9 +75,20 @@ __all__ = [
 GROUPS = ("task", "method", "sim")
 """Sections of the configuration that are a choice of one file."""
 
+EXPERIMENT = "experiment"
+"""Group of files that preset any keys and sweeps over them; added by ``+experiment=``."""
+
 ConfigStore.instance().store(name="plab_schema", node=Config)
 # A group of its own, so that `method=` offers real methods only.
-ConfigStore.instance().store(group="schema/method", name="trajectory", node=TrajectoryConfig)
+_METHOD_SCHEMAS = {
+    "trajectory": TrajectoryConfig,
+    "apg": ApgConfig,
+    "sac": SacConfig,
+    "td3": Td3Config,
+    "ppo": PpoConfig,
+}
+for _name, _schema in _METHOD_SCHEMAS.items():
+    ConfigStore.instance().store(group="schema/method", name=_name, node=_schema)
 
 
 # ------------------------------------------------------------------------------------------------ composition
@@ -76,7 +98,7 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
     """Return what a group offers.
 
     Args:
-        group: ``task``, ``method`` or ``sim``.
+        group: ``task``, ``method``, ``sim`` or ``experiment``.
         config_dir: Folder with files of the user's own, in subfolders named like the groups.
 
     Returns:
@@ -98,7 +120,7 @@ def _check_config_dir(config_dir: str | Path) -> None:
     """
     if not Path(config_dir).is_dir():
         raise ConfigError(f"config folder '{config_dir}' does not exist")
-    for group in GROUPS:
+    for group in (*GROUPS, EXPERIMENT):
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
@@ -159,6 +181,8 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
             continue
         if override.is_delete():
             raise ConfigError(f"'{text}': keys cannot be removed, only set")
+        if key == EXPERIMENT and not override.is_add():
+            raise ConfigError(f"'{text}': write +{text.lstrip('+')}")
         if key in GROUPS and override.package is None:
             if override.is_add() or override.is_force_add():
                 raise ConfigError(f"'{text}': write {text.lstrip('+')}")
@@ -187,6 +211,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         _reject_unknown(composed, "")
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
+        _choose_profile(composed.method)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
         cfg = OmegaConf.to_object(composed)
@@ -247,6 +272,17 @@ def build_scene(cfg: Config) -> Scene:
 
 
 # ---------------------------------------------------------------------------------------------------- details
+
+
+def _choose_profile(method: DictConfig) -> None:
+    """Put the chosen profile's values where they are referred to, and forget the profiles."""
+    if "profiles" not in method:
+        return
+    if method.profile not in method.profiles:
+        names = [str(name) for name in method.profiles]
+        raise ConfigError(f"method.profile '{method.profile}' does not exist; {pick(method.profile, names)}")
+    OmegaConf.resolve(method)
+    method.profiles = {}
 
 
 def _choose_variant(composed: DictConfig, overrides: Sequence[str]) -> None:

@@ -18,19 +18,26 @@ from plab.scene import Body, Manipulator
 from plab.targets import TargetError, make_recipe
 
 __all__ = [
+    "ALGORITHMS",
     "CONTACTS",
     "DEVICES",
     "OPTIMIZERS",
     "PRECISIONS",
+    "ApgConfig",
     "BodyConfig",
     "Config",
     "DrawConfig",
     "ManipulatorConfig",
     "MethodConfig",
+    "OffPolicyConfig",
+    "PpoConfig",
     "RandomConfig",
     "RangeConfig",
+    "RlConfig",
+    "SacConfig",
     "SimConfig",
     "TaskConfig",
+    "Td3Config",
     "TrajectoryConfig",
 ]
 
@@ -38,6 +45,7 @@ PRECISIONS = ("float32", "float64")
 DEVICES = ("cpu", "cuda")
 CONTACTS = ("soft", "hard")
 OPTIMIZERS = ("adam", "gd")
+ALGORITHMS = ("sac", "td3", "ppo")
 
 
 # ------------------------------------------------------------------------------------------------ dataclasses
@@ -301,6 +309,185 @@ class TrajectoryConfig(MethodConfig):
 
 
 @dataclass
+class ApgConfig(MethodConfig):
+    """A policy network trained through the differentiable simulator.
+
+    Attributes:
+        lr: Learning rate of Adam.
+        iterations: Rollouts with gradient, hence updates.
+        hidden: Widths of the hidden layers.
+        torch_threads: CPU threads of torch.
+    """
+
+    lr: float
+    iterations: int
+    hidden: list[int]
+    torch_threads: int
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        _positive(f"{path}.lr", self.lr)
+        _at_least(f"{path}.iterations", self.iterations, 1)
+        _widths(f"{path}.hidden", self.hidden)
+        _at_least(f"{path}.torch_threads", self.torch_threads, 1)
+
+
+@dataclass
+class RlConfig(MethodConfig):
+    """What the reinforcement-learning methods have in common.
+
+    Attributes:
+        algorithm: A key of ``plab.runners.rl_models.ALGORITHMS``.
+        profile: Which of the profiles gives the values that are not overridden.
+        episodes: Episodes of training.
+        num_envs: Environments simulated together.
+        evaluate_every: Episodes between two evaluations of the deterministic policy.
+        tensorboard: Write TensorBoard's event files next to the result.
+        torch_device: Where the networks are, ``cpu`` or ``cuda``.
+        torch_threads: CPU threads of torch.
+        lr: Learning rate.
+        gamma: Discount factor.
+        hidden: Widths of the hidden layers.
+        profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
+    """
+
+    algorithm: str
+    profile: str
+    episodes: int
+    num_envs: int
+    evaluate_every: int
+    tensorboard: bool
+    torch_device: str
+    torch_threads: int
+    lr: float
+    gamma: float
+    hidden: list[int]
+    profiles: dict[str, Any]
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        _one_of(f"{path}.algorithm", self.algorithm, ALGORITHMS)
+        for name in ("episodes", "num_envs", "evaluate_every", "torch_threads"):
+            _at_least(f"{path}.{name}", getattr(self, name), 1)
+        _one_of(f"{path}.torch_device", self.torch_device, DEVICES)
+        _positive(f"{path}.lr", self.lr)
+        _share(f"{path}.gamma", self.gamma)
+        _widths(f"{path}.hidden", self.hidden)
+
+
+@dataclass
+class OffPolicyConfig(RlConfig):
+    """What the methods that learn from a replay buffer have in common.
+
+    Attributes:
+        buffer_size: Transitions kept for replay.
+        batch_size: Transitions per update.
+        learning_starts: Steps of uniformly random actions before the first update.
+        tau: How far the target networks follow at each update.
+        gradient_steps: Updates per step of all environments; -1 makes one per transition.
+    """
+
+    buffer_size: int
+    batch_size: int
+    learning_starts: int
+    tau: float
+    gradient_steps: int
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        _at_least(f"{path}.buffer_size", self.buffer_size, self.num_envs)
+        _at_least(f"{path}.batch_size", self.batch_size, 1)
+        _at_least(f"{path}.learning_starts", self.learning_starts, 0)
+        _share(f"{path}.tau", self.tau)
+        if self.gradient_steps != -1:
+            _at_least(f"{path}.gradient_steps", self.gradient_steps, 1)
+
+
+@dataclass
+class SacConfig(OffPolicyConfig):
+    """Soft actor-critic."""
+
+
+@dataclass
+class Td3Config(OffPolicyConfig):
+    """Twin delayed DDPG.
+
+    Attributes:
+        exploration_noise: Standard deviation of the noise on the actions.
+        target_noise: Standard deviation of the noise on the target policy.
+        target_noise_clip: Largest noise on the target policy.
+        policy_delay: Critic updates per update of the actor.
+    """
+
+    exploration_noise: float
+    target_noise: float
+    target_noise_clip: float
+    policy_delay: int
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        for name in ("exploration_noise", "target_noise", "target_noise_clip"):
+            _at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)
+        _at_least(f"{path}.policy_delay", self.policy_delay, 1)
+
+
+@dataclass
+class PpoConfig(RlConfig):
+    """Proximal policy optimisation.
+
+    Attributes:
+        lr_decay: Let the learning rate fall linearly to 0 over the run.
+        steps_per_update: Transitions per update.
+        minibatches: Minibatches of each epoch.
+        epochs: Passes over the transitions of an update.
+        gae_lambda: Lambda of the generalised advantage estimate.
+        clip_range: Largest change of the probability ratio.
+        value_clip_range: Largest change of the value; None sets no limit.
+        value_coefficient: Weight of the value function's mean squared error.
+        entropy_coefficient: Weight of the policy's entropy.
+        max_gradient_norm: Longer gradients are scaled down to this norm.
+        adam_eps: Added to adam's denominator.
+        normalise: Scale observations and rewards by running statistics.
+    """
+
+    lr_decay: bool
+    steps_per_update: int
+    minibatches: int
+    epochs: int
+    gae_lambda: float
+    clip_range: float
+    value_clip_range: float | None
+    value_coefficient: float
+    entropy_coefficient: float
+    max_gradient_norm: float
+    adam_eps: float
+    normalise: bool
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        # Advantages are standardised: a minibatch needs two of them.
+        _at_least(f"{path}.steps_per_update", self.steps_per_update, 2)
+        _at_least(f"{path}.minibatches", self.minibatches, 1)
+        if self.minibatches > self.steps_per_update // 2:
+            most = self.steps_per_update // 2
+            raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
+        _at_least(f"{path}.epochs", self.epochs, 1)
+        if not 0 <= self.gae_lambda <= 1:
+            raise ConfigError(f"{path}.gae_lambda must be in [0, 1], not {self.gae_lambda:g}")
+        for name in ("clip_range", "max_gradient_norm", "adam_eps"):
+            _positive(f"{path}.{name}", getattr(self, name))
+        if self.value_clip_range is not None:
+            _positive(f"{path}.value_clip_range", self.value_clip_range)
+        for name in ("value_coefficient", "entropy_coefficient"):
+            _at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)
+
+
+@dataclass
 class SimConfig:
     """How the scene is simulated.
 
@@ -416,6 +603,16 @@ def _at_least(path: str, value: float, low: float, *, finite: bool = False) -> N
 def _fraction(path: str, value: float) -> None:
     if not 0 <= value < 1:
         raise ConfigError(f"{path} must be in [0, 1), not {value:g}")
+
+
+def _share(path: str, value: float) -> None:
+    if not 0 < value <= 1:
+        raise ConfigError(f"{path} must be in (0, 1], not {value:g}")
+
+
+def _widths(path: str, value: Sequence[int]) -> None:
+    for width in value:
+        _at_least(path, width, 1)
 
 
 def _vector(path: str, value: Sequence[float], length: int) -> None:

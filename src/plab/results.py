@@ -110,6 +110,7 @@ def config_hash(cfg: Any) -> str:
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
     # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
+    plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 

@@ -18,6 +18,8 @@ __all__ = ["RUNNERS", "RunError", "Runner", "run_config"]
 
 RUNNERS = {
     "trajectory": "plab.runners.trajectory:run_trajectory",
+    "rl": "plab.runners.rl:run_rl",
+    "apg": "plab.runners.apg:run_apg",
 }
 """Family of methods (``method.family``) to the :class:`Runner` of it, as ``module:name``."""
 

@@ -24,11 +24,13 @@ Report = Callable[[int, str], None]
 """Takes the number of steps done and a short text about how it goes."""
 
 PLAIN_EVERY = 10
-"""Steps between two lines where there is no terminal."""
+"""Steps between two lines where there is no terminal, unless asked for otherwise."""
 
 
 @contextmanager
-def show_progress(title: str, start: int, total: int, *, enabled: bool = True) -> Iterator[Report]:
+def show_progress(
+    title: str, start: int, total: int, *, enabled: bool = True, plain_every: int = PLAIN_EVERY
+) -> Iterator[Report]:
     """Show how far a run has come while the ``with`` block lasts.
 
     Args:
@@ -36,6 +38,7 @@ def show_progress(title: str, start: int, total: int, *, enabled: bool = True) -
         start: Steps done before.
         total: Steps to do, the ones done before included.
         enabled: Whether to show anything.
+        plain_every: Steps between two lines where there is no terminal.
 
     Yields:
         Function to call after every step.
@@ -44,7 +47,7 @@ def show_progress(title: str, start: int, total: int, *, enabled: bool = True) -
     if not enabled:
         yield lambda done, text: None
     elif not console.is_terminal:
-        yield _plain(title, start, total)
+        yield _plain(title, start, total, plain_every)
     else:
         with Progress(*_columns(), console=console, expand=True) as progress:
             task = progress.add_task(title, total=total, completed=start, text="")
@@ -66,8 +69,9 @@ def _columns() -> tuple[ProgressColumn, ...]:
     )
 
 
-def _plain(title: str, start: int, total: int) -> Report:
+def _plain(title: str, start: int, total: int, every: int) -> Report:
     first: list[tuple[float, int]] = []
+    last = start
 
     def left(done: int) -> str:
         # The first step compiles the simulator: it says nothing about the pace.
@@ -79,8 +83,11 @@ def _plain(title: str, start: int, total: int) -> Report:
         return f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
 
     def report(done: int, text: str) -> None:
+        nonlocal last
         remaining = left(done)
-        if done - start == 1 or done % PLAIN_EVERY == 0 or done == total:
+        # A step may be a batch of episodes, that passes a multiple without stopping at it.
+        if last == start or done // every > last // every or done == total:
             print(f"{title} {done}/{total}, {remaining}, {text}", flush=True)
+        last = done
 
     return report

@@ -20,6 +20,7 @@ from plab.config import build_scene
 from plab.problem import Problem
 from plab.results import RunFile
 from plab.runners import RunError
+from plab.runners.common import COLUMNS, measures
 from plab.runners.progress import show_progress
 from plab.sim import DeviceError, SimulationError, Simulator
 
@@ -107,21 +108,7 @@ class Episode:
             result = self._problem.rollout(actions[None], gradient=gradient)
         except (SimulationError, MemoryError) as error:
             raise RunError(str(error)) from error
-        density, sdf, contact = result.terms[0].sum(axis=0)
-        judged = result.scores[0]
-        measures = {
-            "loss": float(result.loss[0].sum()),
-            "loss_density": float(density),
-            "loss_sdf": float(sdf),
-            "loss_contact": float(contact),
-            "reward": float(result.reward[0].sum()),
-            "iou": judged.iou_final,
-            "score": judged.score,
-            "score_printed": judged.score_printed,
-            "iou_initial": judged.iou_initial,
-            "iou_target_self": judged.iou_target_self,
-        }
-        return Rollout(measures, result.gradient[0] if gradient else None, result.final_mass[0])
+        return Rollout(measures(result), result.gradient[0] if gradient else None, result.final_mass[0])
 
 
 _kept: dict[tuple, Simulator] = {}
@@ -230,9 +217,6 @@ def _optimise(cfg: Config, episode: Episode, actions: ActionSequence, run: RunFi
             report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best}")
 
 
-_COLUMNS = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
-
-
 def _iterate(
     episode: Episode, actions: ActionSequence, iteration: int, best_loss: float
 ) -> tuple[dict[str, float], dict[str, Any]]:
@@ -248,7 +232,9 @@ def _iterate(
         actions.step(rollout.gradient)
     except RunError as error:
         raise RunError(f"iteration {iteration}: {error}") from error
-    row = {"iteration": iteration} | {name: rollout.measures[name] for name in _COLUMNS}
+    # What the actions have cost: the rollouts, of an episode each, that led to them.
+    row = {"iteration": iteration, "episodes": iteration, "steps": iteration * episode.horizon}
+    row |= {name: rollout.measures[name] for name in COLUMNS}
     row["gradient_norm"] = float(np.linalg.norm(rollout.gradient))
     row["seconds"] = time.perf_counter() - start
     # Written so that the first loss beats the NaN that stands for none.

@@ -1,0 +1,132 @@
+"""The learning algorithms of Stable-Baselines3, made from a method's configuration."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv
+
+from plab.config import PpoConfig, SacConfig, Td3Config
+from plab.config_types import OffPolicyConfig, RlConfig
+
+__all__ = ["ALGORITHMS", "LinearDecay", "ModelKind", "cycle_steps", "total_steps"]
+
+CLIP = 10.0
+"""Largest observation and reward, in units of their running standard deviations."""
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """A learning algorithm and how a configuration becomes its arguments.
+
+    Attributes:
+        model: Stable-Baselines3's class.
+        arguments: Configuration and environments to keyword arguments of the class.
+    """
+
+    model: type[BaseAlgorithm]
+    arguments: Callable[[Any, VecEnv], dict[str, Any]]
+
+    def make(self, method: RlConfig, env: VecEnv, seed: int, **extra: Any) -> BaseAlgorithm:
+        """Make an untrained model; seeds the random numbers of NumPy and torch."""
+        with warnings.catch_warnings():
+            # The last minibatch of an epoch may be a smaller one.
+            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
+            arguments = self.arguments(method, env) | extra
+            return self.model("MlpPolicy", env, seed=seed, device=method.torch_device, **arguments)
+
+
+class LinearDecay:
+    """A learning rate that falls linearly from its first value to 0.
+
+    Attributes:
+        remaining: Share of the run that is left when the current update begins, in (0, 1].
+    """
+
+    def __init__(self, lr: float) -> None:
+        self._lr = lr
+        self.remaining = 1.0
+
+    def __call__(self, progress_remaining: float) -> float:
+        """Return the learning rate; the argument, of one call of ``learn``, says nothing about the run."""
+        return self._lr * self.remaining
+
+
+def cycle_steps(method: RlConfig, horizon: int) -> int:
+    """Return after how many transitions training can pause: an update of PPO, else a batch of episodes."""
+    if isinstance(method, PpoConfig):
+        return method.num_envs * _rollout_steps(method)
+    return method.num_envs * horizon
+
+
+def total_steps(method: RlConfig, horizon: int) -> int:
+    """Return the transitions of the whole training, ``method.episodes`` in whole cycles."""
+    cycle = cycle_steps(method, horizon)
+    return math.ceil(method.episodes * horizon / cycle) * cycle
+
+
+def _rollout_steps(method: PpoConfig) -> int:
+    return math.ceil(method.steps_per_update / method.num_envs)
+
+
+def _off_policy(method: OffPolicyConfig) -> dict[str, Any]:
+    return {
+        "learning_rate": method.lr,
+        "gamma": method.gamma,
+        "buffer_size": method.buffer_size,
+        "batch_size": method.batch_size,
+        "learning_starts": method.learning_starts,
+        "tau": method.tau,
+        "train_freq": (1, "step"),
+        "gradient_steps": method.gradient_steps,
+        "policy_kwargs": {"net_arch": list(method.hidden), "activation_fn": torch.nn.ReLU},
+    }
+
+
+def _sac(method: SacConfig, env: VecEnv) -> dict[str, Any]:
+    return _off_policy(method) | {"ent_coef": "auto", "target_entropy": "auto"}
+
+
+def _td3(method: Td3Config, env: VecEnv) -> dict[str, Any]:
+    size = env.action_space.shape[0]
+    return _off_policy(method) | {
+        "action_noise": NormalActionNoise(np.zeros(size), np.full(size, method.exploration_noise)),
+        "target_policy_noise": method.target_noise,
+        "target_noise_clip": method.target_noise_clip,
+        "policy_delay": method.policy_delay,
+    }
+
+
+def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
+    steps = _rollout_steps(method)
+    return {
+        "learning_rate": LinearDecay(method.lr) if method.lr_decay else method.lr,
+        "gamma": method.gamma,
+        "n_steps": steps,
+        "batch_size": math.ceil(steps * method.num_envs / method.minibatches),
+        "n_epochs": method.epochs,
+        "gae_lambda": method.gae_lambda,
+        "clip_range": method.clip_range,
+        "clip_range_vf": method.value_clip_range,
+        "vf_coef": method.value_coefficient,
+        "ent_coef": method.entropy_coefficient,
+        "max_grad_norm": method.max_gradient_norm,
+        "policy_kwargs": {
+            "net_arch": list(method.hidden),
+            "activation_fn": torch.nn.Tanh,
+            "optimizer_kwargs": {"eps": method.adam_eps},
+        },
+    }
+
+
+ALGORITHMS = {"sac": ModelKind(SAC, _sac), "td3": ModelKind(TD3, _td3), "ppo": ModelKind(PPO, _ppo)}
+"""Learning algorithms by the name that ``method.algorithm`` gives."""

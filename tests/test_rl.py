@@ -1,0 +1,394 @@
+"""Reinforcement learning on a coarse scene: whole runs, seeds, resumption, the replay buffer, refusals."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium.spaces import Box
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from plab.bench import rl as bench
+from plab.config import Config, ConfigError, load_config
+from plab.envs.core import EpisodeBatch
+from plab.objective import scores
+from plab.results import ResultsError, RunResult, read, result_path
+from plab.runners import RunError, rl, run_config
+from plab.runners.common import COLUMNS, kept_batches
+from plab.runners.replay import EpisodeReplay
+from plab.runners.rl_models import ALGORITHMS, LinearDecay, cycle_steps
+from plab.runners.rl_trainer import Trainer
+from plab.sim import SimulationError
+
+HORIZON = 4
+
+COARSE = (
+    "task=Move",
+    "sim.grid_size=32",
+    "sim.particles_scale=0.03",
+    f"sim.horizon={HORIZON}",
+    "sim.substeps=5",
+    # A target that the ball reaches into, so that IoU and score are not 0.
+    "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
+    "method.episodes=16",
+    "method.num_envs=2",
+    "method.evaluate_every=6",
+    "method.hidden=[8]",
+    "progress=false",
+)
+
+OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")
+"""Updates begin in the second batch of episodes, and the buffer remembers the last four episodes."""
+
+METHODS = {
+    "sac": OFF_POLICY,
+    "td3": OFF_POLICY,
+    # Updates of 10 transitions end within episodes of 4 steps.
+    "ppo": ("method.steps_per_update=10", "method.minibatches=2", "method.epochs=2"),
+}
+
+
+def make_config(folder: Path, method: str, *overrides: str) -> Config:
+    return load_config([*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides])
+
+
+def run(cfg: Config) -> RunResult:
+    score = run_config(cfg)
+    result = read(result_path(cfg))
+    assert result.status == "finished" and result.evaluation["score"] == score
+    return result
+
+
+def assert_same_numbers(a: RunResult, b: RunResult) -> None:
+    """Assert that two runs agree bit for bit in everything but times and provenance."""
+    rows = [result.iterations.drop(columns=["seconds"]) for result in (a, b)]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+    assert np.array_equal(a.best_actions, b.best_actions)
+    assert (a.best_iteration, a.best_loss) == (b.best_iteration, b.best_loss)
+    assert a.evaluation == b.evaluation
+    for name in ("initial", "final", "target"):
+        assert np.array_equal(a.masses[name], b.masses[name]), name
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
+    """An uninterrupted run of each method."""
+    folder = tmp_path_factory.mktemp("results")
+    return {method: run(make_config(folder, method)) for method in METHODS}
+
+
+# ---------------------------------------------------------------- whole runs
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_file_holds_the_whole_run(finished: dict[str, RunResult], method: str) -> None:
+    result = finished[method]
+    rows = result.iterations
+    assert set(COLUMNS) | {"iteration", "episodes", "steps", "train_reward", "seconds"} <= set(rows.columns)
+    assert rows["iteration"].tolist() == list(range(len(rows)))
+    assert np.isfinite(rows[1:].to_numpy()).all()
+    assert math.isnan(rows["train_reward"][0])
+    terms = rows[["loss_density", "loss_sdf", "loss_contact"]].to_numpy()
+    np.testing.assert_allclose(rows["loss"], terms @ [10.0, 10.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-6)
+    judged = scores(result.masses["initial"], result.masses["final"], result.masses["target"])
+    assert result.evaluation["score"] == judged.score > 0
+    assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"}
+    assert result.resume is None
+    assert [path.name for path in result.path.parent.iterdir()] == [result.path.name]
+
+
+def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
+    for method in ("sac", "td3"):
+        rows = finished[method].iterations
+        assert rows["episodes"].tolist() == [0, 6, 12, 16]
+        assert rows["steps"].tolist() == [0, 24, 48, 64]
+    # Seven updates of 10 transitions, the fewest that make 16 episodes.
+    assert finished["ppo"].iterations["steps"].tolist() == [0, 30, 60, 70]
+    assert finished["ppo"].iterations["episodes"].tolist() == [0, 7, 15, 17]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_best_actions_are_those_of_the_best_evaluation(finished: dict[str, RunResult], method: str) -> None:
+    result = finished[method]
+    best = int(result.iterations["loss"].argmin())
+    assert result.best_iteration == best and result.best_loss == result.iterations["loss"][best]
+    assert result.best_actions.shape == (HORIZON, 6) and np.abs(result.best_actions).max() <= 1
+    for name in COLUMNS:
+        assert result.evaluation[name] == pytest.approx(result.iterations[name][best], rel=1e-5, abs=1e-6), (
+            name
+        )
+
+
+def test_policies_change(finished: dict[str, RunResult]) -> None:
+    for result in finished.values():
+        assert result.iterations["loss"].nunique() > 1
+
+
+def test_the_same_seed_gives_the_same_bits_another_seed_others(tmp_path: Path, finished) -> None:
+    assert_same_numbers(run(make_config(tmp_path, "ppo")), finished["ppo"])
+    other = run(make_config(tmp_path, "ppo", "seed=1"))
+    assert not np.array_equal(other.iterations["loss"], finished["ppo"].iterations["loss"])
+
+
+def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
+    values = {
+        ("sac", "paper"): {"tau": 3e-4, "learning_starts": 1000, "batch_size": 256},
+        ("sac", "release"): {"tau": 0.005, "learning_starts": 2500, "gradient_steps": -1},
+        ("td3", "release"): {"learning_starts": 2500, "policy_delay": 2, "target_policy_noise": 0.2},
+        ("ppo", "paper"): {"n_steps": 1024, "batch_size": 64, "ent_coef": 0.0, "vf_coef": 0.5},
+        ("ppo", "release"): {"n_steps": 1250, "batch_size": 79, "ent_coef": 0.01, "vf_coef": 0.25},
+    }
+    for (method, profile), expected in values.items():
+        cfg = load_config([*COARSE, f"method={method}", f"method.profile={profile}"])
+        model = trainer_of(cfg, tmp_path).model
+        assert {name: getattr(model, name) for name in expected} == expected, (method, profile)
+    cfg = load_config([*COARSE, "method=sac", "method.profile=paper", "method.tau=0.25"])
+    model = trainer_of(cfg, tmp_path).model
+    assert (model.tau, model.learning_starts) == (0.25, 1000)
+
+
+def trainer_of(cfg: Config, folder: Path) -> Trainer:
+    batch, _ = kept_batches(cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
+    return Trainer(cfg, batch, folder / "replay", None)
+
+
+def test_learning_rate_falls_to_zero_over_the_run() -> None:
+    decay = LinearDecay(0.5)
+    assert decay(0.0) == 0.5
+    decay.remaining = 0.25
+    assert decay(1.0) == 0.125
+
+
+def test_an_update_is_the_unit_of_ppo_a_batch_of_episodes_that_of_the_others(tmp_path: Path) -> None:
+    assert cycle_steps(make_config(tmp_path, "sac").method, HORIZON) == 8
+    assert cycle_steps(make_config(tmp_path, "ppo", "method.steps_per_update=11").method, HORIZON) == 12
+
+
+# ---------------------------------------------------------------- interruptions, failures
+
+
+def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseException) -> None:
+    """Let the run break off in the training that follows some evaluations."""
+    looked, intact = rl.Evaluator.episode, Trainer.note_step
+    counts = {"evaluations": 0, "steps": 0}
+
+    def episode(self, trainer):
+        counts["evaluations"] += 1
+        return looked(self, trainer)
+
+    def note_step(self, actions, infos):
+        counts["steps"] += counts["evaluations"] >= evaluations
+        if counts["steps"] > 7:
+            raise error
+        return intact(self, actions, infos)
+
+    monkeypatch.setattr(rl.Evaluator, "episode", episode)
+    monkeypatch.setattr(Trainer, "note_step", note_step)
+
+
+@pytest.mark.parametrize(
+    ("method", "evaluations"),
+    # After its third evaluation ppo is left with an update that is too short to break off in.
+    [(method, evaluations) for method in METHODS for evaluations in (1, 2, 3)][:-1],
+)
+def test_resumed_run_equals_an_uninterrupted_one(
+    tmp_path, finished, monkeypatch, method, evaluations
+) -> None:
+    cfg = make_config(tmp_path, method)
+    with monkeypatch.context() as patch:
+        break_after(patch, evaluations, OSError("gone"))
+        with pytest.raises(OSError, match="gone"):
+            run_config(cfg)
+    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", evaluations)
+    resumed = run(cfg)
+    assert_same_numbers(resumed, finished[method])
+    assert resumed.provenance["resumed"] == 1
+    assert [path.name for path in resumed.path.parent.iterdir()] == [resumed.path.name]
+
+
+def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
+    tmp_path, finished, monkeypatch
+) -> None:
+    cfg = make_config(tmp_path, "sac")
+    with monkeypatch.context() as patch:
+        patch.setattr(rl.Evaluator, "judge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            run_config(cfg)
+    assert not result_path(cfg).with_suffix(".replay").exists()
+    assert_same_numbers(run(cfg), finished["sac"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, finished, method) -> None:
+    cfg = make_config(tmp_path, method)
+    partial = result_path(cfg).with_suffix(".partial.h5")
+    arguments = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={tmp_path}"]
+    command = [sys.executable, "-m", "plab.run", *arguments]
+    process = subprocess.Popen(command)
+    try:
+        while not partial.exists() and process.poll() is None:
+            time.sleep(0.001)
+        # The first step of training compiles, which takes some seconds.
+        time.sleep(np.random.default_rng().uniform(0.0, 15.0))
+    finally:
+        process.kill()
+        process.wait()
+    subprocess.run(command, check=True)
+    assert_same_numbers(read(result_path(cfg)), finished[method])
+
+
+def test_a_state_that_is_not_finite_ends_the_run(tmp_path: Path, monkeypatch) -> None:
+    cfg = make_config(tmp_path, "sac")
+    break_after(monkeypatch, 2, SimulationError("environment 0, step 2: position is nan"))
+    with pytest.raises(RunError, match="position is nan"):
+        run_config(cfg)
+    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    assert (left.status, len(left.iterations)) == ("failed", 2)
+    assert left.best_actions is not None
+
+
+def test_a_lost_replay_buffer_is_said(tmp_path: Path, monkeypatch) -> None:
+    cfg = make_config(tmp_path, "sac")
+    with monkeypatch.context() as patch:
+        break_after(patch, 2, OSError("gone"))
+        with pytest.raises(OSError, match="gone"):
+            run_config(cfg)
+    result_path(cfg).with_suffix(".replay").unlink()
+    with pytest.raises(ResultsError, match=r"replay, the replay buffer of the run, is gone: .*force=true"):
+        run_config(cfg)
+    assert result_path(cfg).with_suffix(".partial.h5").exists()
+    run(replace(cfg, force=True))
+
+
+def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> None:
+    def full(descriptor: int, start: int, size: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    cfg = make_config(tmp_path, "td3")
+    with pytest.raises(
+        ResultsError, match=r"cannot reserve .* GB for the replay buffer at .*: No space left"
+    ):
+        run_config(cfg)
+    assert not list(tmp_path.rglob("*.replay"))
+
+
+def test_what_is_not_installed_is_said_before_anything_is_built(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(rl, "kept_batches", None)
+    monkeypatch.setattr(rl.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"TensorBoard: pip install 'plab\[tensorboard\]'"):
+        run_config(make_config(tmp_path, "ppo", "method.tensorboard=true"))
+    monkeypatch.setattr(rl.torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match=r"choose method\.torch_device=cpu"):
+        run_config(make_config(tmp_path, "ppo", "method.torch_device=cuda"))
+
+
+def test_tensorboard_is_no_part_of_the_hash(tmp_path: Path) -> None:
+    plain, logged = (make_config(tmp_path, "ppo", f"method.tensorboard={v}") for v in ("false", "true"))
+    assert result_path(plain) == result_path(logged)
+
+
+def test_tensorboard_files_are_beside_the_result(tmp_path: Path, finished) -> None:
+    pytest.importorskip("tensorboard")
+    result = run(make_config(tmp_path, "ppo", "method.tensorboard=true"))
+    assert list(result.path.with_suffix(".tensorboard").glob("events.*"))
+    assert_same_numbers(result, finished["ppo"])
+
+
+def test_progress_counts_episodes(tmp_path: Path, capsys) -> None:
+    run_config(replace(make_config(tmp_path, "sac"), progress=True))
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Move-v1")]
+    assert [line.split()[4].rstrip(",") for line in lines] == ["2/16", "6/16", "12/16", "16/16"]
+    assert "steps/s reward" in lines[-1] and " score " in lines[-1] and " left, " in lines[-1]
+
+
+# ---------------------------------------------------------------- replay buffer
+
+
+@pytest.mark.parametrize("buffer_size", [10_000, 24])
+def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size: int) -> None:
+    """The same transitions as Stable-Baselines3's buffer, which keeps next observations of their own."""
+    observations, actions = Box(-1, 1, (3,), np.float32), Box(-1, 1, (2,), np.float32)
+    steps, envs, horizon = 40, 2, 4
+    own = EpisodeReplay(
+        buffer_size,
+        observations,
+        actions,
+        n_envs=envs,
+        path=str(tmp_path / "replay"),
+        horizon=horizon,
+        total_steps=steps,
+        spare_steps=horizon,
+        added=0,
+    )
+    plain = ReplayBuffer(min(buffer_size, steps * envs), observations, actions, "cpu", n_envs=envs)
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=(envs, 3)).astype(np.float32)
+    for step in range(steps):
+        after, action = rng.normal(size=(envs, 3)).astype(np.float32), rng.normal(size=(envs, 2))
+        reward, done = rng.normal(size=envs), np.full(envs, (step + 1) % horizon == 0)
+        infos = [{"TimeLimit.truncated": bool(over)} for over in done]
+        for buffer in (own, plain):
+            buffer.add(state, after, action, reward, done, infos)
+        state = rng.normal(size=(envs, 3)).astype(np.float32) if done[0] else after
+    assert own.size() == plain.size()
+    sets = []
+    for buffer in (own, plain):
+        sample = buffer.sample(4000)
+        rows = np.concatenate([np.asarray(part) for part in sample[:5]], axis=1)
+        sets.append(np.unique(rows, axis=0))
+    # Every transition is drawn, and nothing else.
+    assert len(sets[0]) == plain.size() * envs
+    assert np.array_equal(*sets)
+
+
+def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
+    assert {make_config(tmp_path, method).method.algorithm for method in METHODS} == set(ALGORITHMS)
+
+
+# ---------------------------------------------------------------- learning, speed
+
+
+@pytest.mark.slow
+def test_ppo_learns_to_flatten_dough(tmp_path: Path) -> None:
+    """On RollingPin, coarse: within 300 episodes better than any of 32 random ones."""
+    fast = ("sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10", "sim.particles_scale=0.2")
+    training = ("method.num_envs=10", "method.episodes=300", "method.steps_per_update=500")
+    updates = ("method.minibatches=8", "method.lr=1e-3", "method.lr_decay=false", "method.evaluate_every=20")
+    folder = f"results_dir={tmp_path}"
+    cfg = load_config(["task=RollingPin", "method=ppo", "progress=false", *fast, *training, *updates, folder])
+    result = run(cfg)
+    episodes = EpisodeBatch([cfg] * 32)
+    episodes.reset()
+    rng, reward = np.random.default_rng(0), np.zeros(32)
+    for _ in range(cfg.sim.horizon):
+        step = episodes.step(rng.uniform(-1, 1, (32, 3)))
+        reward += step.reward
+    print(reward.mean(), reward.max(), step.info["score"].mean(), step.info["score"].max())
+    print(result.iterations[["episodes", "reward", "score", "train_reward", "train_score"]].to_string())
+    assert result.iterations["reward"].max() > reward.max()
+    assert result.iterations["train_reward"].iloc[-1] > reward.mean()
+
+
+def test_benchmark_measures_every_part(tmp_path: Path, capsys) -> None:
+    table = tmp_path / "rl.csv"
+    overrides = COARSE[:-4]
+    bench.main([*overrides, "--methods", "sac", "--envs", "2", "--batches", "1", "--csv", str(table)])
+    (row,) = pd.read_csv(table).to_dict("records")
+    assert (row["method"], row["num_envs"]) == ("sac", 2)
+    parts = [row[f"{part}_ms"] for part in bench.PARTS]
+    assert min(parts) > 0
+    # Of 4 steps of 2 environments.
+    assert sum(parts) == pytest.approx(2 / row["steps_per_s"] * 1e3, rel=0.05)
+    assert "steps_per_s" in capsys.readouterr().out

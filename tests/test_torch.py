@@ -1,0 +1,179 @@
+"""Trajectory losses in torch's autograd, and the policy network that is trained by them: a coarse scene."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from plab.config import Config, load_config
+from plab.objective import scores
+from plab.problem import Problem
+from plab.results import RunResult, read, result_path
+from plab.runners import apg, run_config
+from plab.runners.common import COLUMNS
+from plab.torch import rollout
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "rl.md"
+HORIZON = 3
+COARSE = [
+    "task=Rope",
+    "sim.grid_size=16",
+    f"sim.horizon={HORIZON}",
+    "sim.substeps=5",
+    "sim.dt=4e-4",
+    "sim.particles_scale=0.03",
+    "task.manipulators.left.size=[0.06]",
+    "task.manipulators.left.position=[0.25,0.0625,0.75]",
+]
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """Two environments of which the second has a softer rope."""
+    first = load_config([*COARSE, "sim=reference"])
+    return Problem([first, load_config([*COARSE, "sim=reference", "task.yield_stress=20"])])
+
+
+def draw(seed: int, **options) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    unit = torch.rand((2, HORIZON, 6), generator=generator, dtype=torch.float64)
+    return (1.6 * unit - 0.8).to(**options).requires_grad_()
+
+
+def test_losses_and_gradients_are_the_simulators(problem: Problem) -> None:
+    actions = draw(0)
+    losses = rollout(problem, actions)
+    losses.sum().backward()
+    expected = problem.rollout(actions.detach().numpy(), gradient=True)
+    np.testing.assert_array_equal(losses.detach().numpy(), expected.loss.sum(axis=1))
+    np.testing.assert_array_equal(actions.grad.numpy(), expected.gradient)
+
+
+def test_each_environments_loss_is_weighed_on_its_own(problem: Problem) -> None:
+    actions = draw(1)
+    losses = rollout(problem, actions)
+    (whole,) = torch.autograd.grad(losses.sum(), actions, retain_graph=True)
+    (weighed,) = torch.autograd.grad(losses @ torch.tensor([0.0, 3.0], dtype=torch.float64), actions)
+    assert torch.count_nonzero(weighed[0]) == 0
+    torch.testing.assert_close(weighed[1], 3.0 * whole[1])
+
+
+def test_gradient_agrees_with_differences(problem: Problem) -> None:
+    actions, direction = draw(2), draw(3).detach()
+    (gradient,) = torch.autograd.grad(rollout(problem, actions).sum(), actions)
+    step = 1e-5
+    with torch.no_grad():
+        ahead, behind = (rollout(problem, actions + sign * step * direction).sum() for sign in (1, -1))
+    assert float((gradient * direction).sum()) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-4)
+
+
+def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem) -> None:
+    scale = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    actions = draw(4).detach()
+    rollout(problem, scale * actions).sum().backward()
+    fixed = (0.5 * actions).requires_grad_()
+    rollout(problem, fixed).sum().backward()
+    assert float(scale.grad) == pytest.approx(float((fixed.grad * actions).sum()), rel=1e-12)
+
+
+def test_beyond_its_bounds_an_action_has_no_gradient(problem: Problem) -> None:
+    actions = draw(5).detach()
+    actions[:, 1] = 1.5
+    actions.requires_grad_()
+    rollout(problem, actions).sum().backward()
+    assert torch.count_nonzero(actions.grad[:, 1]) == 0 and torch.count_nonzero(actions.grad[:, 0]) > 0
+
+
+def test_type_is_kept_and_no_gradient_is_computed_in_vain(problem: Problem, monkeypatch) -> None:
+    actions = draw(6, dtype=torch.float32).detach().requires_grad_()
+    losses = rollout(problem, actions)
+    losses.sum().backward()
+    assert losses.dtype == actions.grad.dtype == torch.float32
+    wanted, intact = [], Problem.rollout
+    monkeypatch.setattr(
+        Problem,
+        "rollout",
+        lambda self, a, *, gradient: (wanted.append(gradient), intact(self, a, gradient=gradient))[1],
+    )
+    assert not rollout(problem, actions.detach()).requires_grad
+    with torch.no_grad():
+        rollout(problem, actions)
+    assert wanted[0] is False
+
+
+def test_there_is_no_second_derivative(problem: Problem) -> None:
+    actions = draw(7)
+    (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_example_of_the_page_runs(capsys) -> None:
+    (example,) = (
+        block
+        for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+        if "plab.torch" in block
+    )
+    coarse = '"sim.grid_size=32", "sim.substeps=5", "sim.particles_scale=0.03"'
+    shorter = example.replace('["task=Move"]', f'["task=Move", {coarse}]').replace("50, 6", f"{HORIZON}, 6")
+    assert shorter != example and len(example.splitlines()) <= 15
+    exec(compile(shorter, str(PAGE), "exec"), {})
+    losses = [float(line) for line in capsys.readouterr().out.split()]
+    assert len(losses) > 1 and losses[-1] < losses[0]
+
+
+# ---------------------------------------------------------------- method=apg
+
+
+ITERATIONS = 4
+APG = [*COARSE, "method=apg", f"method.iterations={ITERATIONS}", "method.hidden=[16,16]", "progress=false"]
+
+
+def make_config(folder: Path, *overrides: str) -> Config:
+    return load_config([*APG, f"results_dir={folder}", *overrides])
+
+
+def run(cfg: Config) -> RunResult:
+    run_config(cfg)
+    return read(result_path(cfg))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """An uninterrupted run."""
+    return run(make_config(tmp_path_factory.mktemp("results"), "method.lr=0.01"))
+
+
+def test_apg_lowers_the_loss(finished: RunResult) -> None:
+    rows = finished.iterations
+    assert rows["steps"].tolist() == [HORIZON * i for i in range(ITERATIONS)]
+    assert set(COLUMNS) | {"iteration", "episodes", "steps", "gradient_norm", "seconds"} == set(rows.columns)
+    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and (rows["gradient_norm"] > 0).all()
+    assert finished.best_loss == rows["loss"].min()
+    judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
+    assert finished.evaluation["score"] == judged.score
+
+
+def test_apg_resumes_to_the_same_numbers(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
+    cfg = make_config(tmp_path, "method.lr=0.01")
+    intact, calls = apg.rollout, iter(range(100))
+
+    def broken(*arguments):
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        return intact(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(apg, "rollout", broken)
+        with pytest.raises(KeyboardInterrupt):
+            run_config(cfg)
+    assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
+    again = run(cfg)
+    rows = [result.iterations.drop(columns=["seconds"]) for result in (again, finished)]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+    assert again.evaluation == finished.evaluation and again.provenance["resumed"] == 1
