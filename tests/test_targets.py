@@ -309,5 +309,5 @@ def test_a_folder_of_release_files_has_none_for_random_variants(tmp_path):
 
 def test_a_target_of_too_few_particles_is_told(device):
     overrides = ("task=Rope", *COARSE[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
-    with pytest.raises(TargetError, match="the target is empty: .*raise sim.particles_scale"):
+    with pytest.raises(TargetError, match=r"the target is empty: .*raise sim.particles_scale"):
         Problem([load_config(overrides)])
