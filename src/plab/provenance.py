@@ -18,6 +18,8 @@ _PACKAGES = {
     "taichi": "taichi",
     "torch": "torch",
     "numpy": "numpy",
+    "gymnasium": "gymnasium",
+    "stable_baselines3": "stable-baselines3",
     "h5py": "h5py",
     "hydra": "hydra-core",
 }
