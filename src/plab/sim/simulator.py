@@ -366,8 +366,11 @@ class Simulator:
         overlap, peak = values[..., 3], values[..., 4]
         target_sum, target_peak = self._target_scale
         total = self.scenes[0].particle_mass * self.particle_count
-        both = overlap / (peak * target_peak)
-        return Measures(values[..., :3], both / (total / peak + target_sum / target_peak - both))
+        # Without a target there is no IoU: NaN.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            both = overlap / (peak * target_peak)
+            iou = both / (total / peak + target_sum / target_peak - both)
+        return Measures(values[..., :3], iou)
 
     def _allocate_observation(self, stride: int) -> tuple[ti.Ndarray, ti.Ndarray]:
         """Places of the observed particles in the tiles' order, and room for what is observed of them."""
