@@ -11,7 +11,6 @@ episodes for ppo, in minibatches of the profile's size.
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 import time
 from collections import defaultdict
@@ -23,6 +22,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
+from plab.bench.table import report
 from plab.config import Config, PpoConfig, load_config
 from plab.config_types import OffPolicyConfig
 from plab.envs.core import EpisodeBatch
@@ -129,18 +129,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--batches", type=int, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
-    print("  ".join(f"{name:>11s}" for name in COLUMNS))
-    table = []
-    for num_envs in options.envs:
-        for method in options.methods:
-            row = measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
-            print("  ".join(f"{row[name]!s:>11s}" for name in COLUMNS), flush=True)
-            table.append(row)
-    if options.csv:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(table)
+    table = (
+        measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
+        for num_envs in options.envs
+        for method in options.methods
+    )
+    report(COLUMNS, table, options.csv)
 
 
 if __name__ == "__main__":

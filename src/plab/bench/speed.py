@@ -9,13 +9,13 @@ it.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from plab.bench.table import report
 from plab.config import load_config
 from plab.problem import Problem
 
@@ -96,17 +96,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=5, help="timed rollouts after the first")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
-    print("  ".join(f"{name:>12s}" for name in COLUMNS))
-    table = []
-    for batch in options.batch:
-        for row in rows(options.overrides, batch, options.steps, options.repeats):
-            print("  ".join(f"{row[name]!s:>12s}" for name in COLUMNS), flush=True)
-            table.append(row)
-    if options.csv:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(table)
+    table = (
+        row
+        for batch in options.batch
+        for row in rows(options.overrides, batch, options.steps, options.repeats)
+    )
+    report(COLUMNS, table, options.csv)
 
 
 if __name__ == "__main__":

@@ -16,11 +16,11 @@ import pandas as pd
 from plab.config import Config, build_scene
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.targets import demonstration
+from plab.targets.scripted import DECIMALS
 
 __all__ = ["action_names", "known_actions", "load_actions", "recorded_scores", "save_actions"]
 
 FOLDER = Path(__file__).parent
-DECIMALS = 4
 SCORES = "scores.csv"
 
 

@@ -16,12 +16,12 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from plab.config import Config, build_scene
-from plab.demonstrations import DECIMALS, known_actions
+from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.runners.progress import show_progress
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.targets import EPISODE_STEPS, BodiesTarget, make_recipe
-from plab.targets.scripted import Track
+from plab.targets.scripted import DECIMALS, Track
 
 __all__ = ["Found", "search"]
 

@@ -18,6 +18,7 @@ from plab.scene import ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipe import EPISODE_STEPS, TargetError
 
 __all__ = [
+    "DECIMALS",
     "CarryTarget",
     "DentTarget",
     "DrawTarget",
