@@ -14,7 +14,7 @@ import sys
 
 import taichi as ti
 
-from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
+from plab.sim.cuda_phases import NEAREST_GROUPS, PLANE_STRIDE, SCATTER_BLOCK, CudaPhases
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.storage import BLOCK, BLOCK_BITS, MEASURES, STATE
 from plab.sim.transfer import spline
@@ -27,7 +27,7 @@ NODE_MASK = (1 << NODE_BITS) - 1
 THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 
-RESIDENT_BLOCK = 128
+RESIDENT_BLOCK = SCATTER_BLOCK
 """Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
 resident whatever their registers."""
 
@@ -108,14 +108,18 @@ class CudaEngine(CudaPhases):
         lane = self.sorted_lane(state, source, tile, particle % self.lanes)
         base, fx = self.stencil(self.vector(state, source, lane))
         node = self.scatter_node(e, tile * self.lanes + lane, base)
-        run, first, doublings = self.run_of(node, particle % self.lanes)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
         if node >= 0:
             self.material_particle(state, source, self.tile_entry(after, e, tile), entry9, lane, e, True)
-        first = first and node >= 0
         if first:
             self.mark_shared(e, base, stamp)
-        q4 = self.momentum_field(state, source, entry9, lane, fx)
-        self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+        sums = ti.simt.block.SharedArray(SCATTER_BLOCK * PLANE_STRIDE, self.real)
+        heads = ti.simt.block.SharedArray(SCATTER_BLOCK, ti.i32)
+        self.share_heads(heads, q, node, first, rank)
+        field = self.momentum_field(state, source, entry9, lane, fx)
+        self.scatter_runs(
+            self.momentum, sums, heads, q, spline(fx), field, run, first, rank, total, doublings
+        )
 
     @ti.func
     def grid_thread(self, q, s):
@@ -238,6 +242,7 @@ class CudaEngine(CudaPhases):
         stamp: ti.i32,
     ):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
+        ti.loop_config(block_dim=SCATTER_BLOCK)
         for q in range(self.particle_threads):
             self.scatter_thread(state, before, after, q, stamp)
         for w in range(self.node_threads):
@@ -314,8 +319,7 @@ class CudaEngine(CudaPhases):
             x = self.vector(state, source, lane)
             base, fx = self.stencil(x)
             node = self.scatter_node(e, tile * self.lanes + lane, base)
-            run, first, doublings = self.run_of(node, particle % self.lanes)
-            first = first and node >= 0
+            run, first, _rank, _total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)
@@ -381,6 +385,7 @@ class CudaEngine(CudaPhases):
         stamp: ti.i32,
     ):
         """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
+        ti.loop_config(block_dim=SCATTER_BLOCK)
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             tile = particle // self.lanes
@@ -391,16 +396,19 @@ class CudaEngine(CudaPhases):
             x = self.vector(state, source, lane)
             base, fx = self.stencil(x)
             node = self.scatter_node(e, tile * self.lanes + lane, base)
-            run, first, doublings = self.run_of(node, particle % self.lanes)
+            run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
             if node >= 0:
                 self.material_particle(state, source, target, entry9, lane, e, False)
-            first = first and node >= 0
             if first:
                 self.mark_shared(e, base, stamp)
-            q4 = self.momentum_field(state, source, entry9, lane, fx)
-            self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+            sums = ti.simt.block.SharedArray(SCATTER_BLOCK * PLANE_STRIDE, self.real)
+            heads = ti.simt.block.SharedArray(SCATTER_BLOCK, ti.i32)
+            self.share_heads(heads, q, node, first, rank)
+            field = self.momentum_field(state, source, entry9, lane, fx)
+            w = spline(fx)
+            self.scatter_runs(self.momentum, sums, heads, q, w, field, run, first, rank, total, doublings)
             h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
-            self.scatter_run(self.velocity_bar, node, spline(fx), h, run, first, doublings)
+            self.scatter_runs(self.velocity_bar, sums, heads, q, w, h, run, first, rank, total, doublings)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
                 e, i = self.node_of(w + turn * self.node_threads)

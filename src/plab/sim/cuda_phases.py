@@ -25,6 +25,18 @@ ALL_LANES = 0xFFFFFFFF
 RUN_BITS = 5
 """A run of particles in one cell is as long as a warp at most, 2^5."""
 
+WARP = 32
+"""Threads of a warp."""
+
+SCATTER_BLOCK = 128
+"""Threads of a block in loops that scatter."""
+
+PLANE = 36
+"""Numbers that a particle adds to one of the three planes of its stencil: 9 nodes, 4 components."""
+
+PLANE_STRIDE = PLANE + 1
+"""Distance of the runs' sums in shared memory: odd, so that lanes meet different banks."""
+
 FAR = 1e9
 """Distance of the nearest particle before any was looked at."""
 
@@ -244,9 +256,19 @@ class CudaPhases(Phases):
         return out
 
     @ti.func
-    def run_of(self, key, lane):
-        """Lanes from this one on that hold the same key, whether this is the first of them, and the number
-        of doublings that the warp's longest run needs."""
+    def run_of(self, key, taking_part, lane):
+        """The runs of lanes with the same key in a warp.
+
+        Args:
+            key: Equal for the lanes of a run, which are neighbours.
+            taking_part: Whether the lane's run counts; the same for all lanes of a run.
+            lane: Number of the lane in its warp.
+
+        Returns:
+            Lanes from this one on that hold the same key; whether this is the first lane of a run that
+            counts; how many of these come before it; how many there are; and the number of doublings that
+            the longest run needs.
+        """
         run = 1
         for k in ti.static(range(RUN_BITS)):
             above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), run, 1 << k)
@@ -254,32 +276,55 @@ class CudaPhases(Phases):
             if run == (1 << k) and lane + (1 << k) < self.lanes and key_above == key:
                 run += above
         key_below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), key, 1)
+        first = taking_part and (lane == 0 or key_below != key)
         doublings = 0
         for k in ti.static(range(RUN_BITS)):
             if ti.simt.warp.any_nonzero(ti.u32(ALL_LANES), ti.cast(run > (1 << k), ti.i32)):
                 doublings = k + 1
-        return run, lane == 0 or key_below != key, doublings
+        upto = ti.cast(first, ti.i32)
+        for k in ti.static(range(RUN_BITS)):
+            below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
+            if lane >= (1 << k):
+                upto += below
+        total = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), upto, WARP - 1)
+        return run, first, upto - ti.cast(first, ti.i32), total, doublings
 
     @ti.func
-    def scatter_run(
-        self, grid: ti.template(), node, w: ti.template(), q: ti.template(), run, first, doublings
+    def scatter_runs(
+        self,
+        grid: ti.template(),
+        sums: ti.template(),
+        heads: ti.template(),
+        q,
+        w: ti.template(),
+        field: ti.template(),
+        run,
+        first,
+        rank,
+        total,
+        doublings,
     ):
         """Scatter an affine field as :meth:`scatter` does; every lane of the warp must take part.
 
+        The first lane of each run sums the run's shares in registers. Then the lanes add the sums of all runs
+        to the grid together, neighbours to neighbouring numbers: the device takes up to 8 of them at once.
+
         Args:
             grid: Field of 4-vectors.
-            node: Index of the base node; what other lanes of the run have is not looked at.
+            sums: Shared memory of the block, ``SCATTER_BLOCK * PLANE_STRIDE`` numbers.
+            heads: Base node of each run of the block in shared memory, filled by :meth:`share_heads`.
+            q: Number of the thread.
             w: Spline weights.
-            q: Value at the base node and increments along x, y, z, 4-vectors.
-            run: See :meth:`run_of`.
-            first: Whether this lane does the run's atomics.
-            doublings: See :meth:`run_of`.
+            field: Value at the base node and increments along x, y, z, 4-vectors.
+            run: This and what follows: see :meth:`run_of`.
         """
+        lane = q % WARP
+        corner = q % SCATTER_BLOCK - lane
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
                 wij = w[i][0] * w[j][1]
-                r = wij * (q[0] + float(i) * q[1] + float(j) * q[2])
-                z = wij * q[3]
+                r = wij * (field[0] + float(i) * field[1] + float(j) * field[2])
+                z = wij * field[3]
                 r0 = w[0][2] * r
                 r1 = w[1][2] * r + w[1][2] * z
                 r2 = w[2][2] * r + (2.0 * w[2][2]) * z
@@ -295,10 +340,27 @@ class CudaPhases(Phases):
                             r1[c] += a1
                             r2[c] += a2
                 if first:
-                    row = node + (i * self.axis + j) * self.axis
-                    ti.atomic_add(grid[row], r0)
-                    ti.atomic_add(grid[row + 1], r1)
-                    ti.atomic_add(grid[row + 2], r2)
+                    at = (corner + rank) * PLANE_STRIDE + 12 * j
+                    for c in ti.static(range(4)):
+                        sums[at + c] = r0[c]
+                        sums[at + 4 + c] = r1[c]
+                        sums[at + 8 + c] = r2[c]
+            ti.simt.warp.sync(ti.u32(ALL_LANES))
+            for turn in range((total * PLANE + WARP - 1) // WARP):
+                number = turn * WARP + lane
+                if number < total * PLANE:
+                    owner = number // PLANE
+                    part = number - owner * PLANE
+                    node = heads[corner + owner] + (i * self.axis + part // 12) * self.axis + part % 12 // 4
+                    ti.atomic_add(grid[node][part % 4], sums[(corner + owner) * PLANE_STRIDE + part])
+            ti.simt.warp.sync(ti.u32(ALL_LANES))
+
+    @ti.func
+    def share_heads(self, heads: ti.template(), q, node, first, rank):
+        """Write the base nodes of a warp's runs to shared memory, for :meth:`scatter_runs`."""
+        if first:
+            heads[q % SCATTER_BLOCK - q % WARP + rank] = node
+        ti.simt.warp.sync(ti.u32(ALL_LANES))
 
     @ti.func
     def scatter_mass_run(self, e, base, fx, run, first, doublings):
