@@ -176,45 +176,23 @@ class ParticlePhases(Storage):
                         state[target + 15 + i] = self.stage[at + i]
         else:
             for lane in range(self.lanes):
-                self.spectral_material(state, source, target, entry9, lane, e, update)
+                a = self.spectral_material(state, source, target, lane, e, update)
+                for i in ti.static(range(9)):
+                    self.affine[entry9 + i][lane] = a[i]
 
     @ti.func
-    def spectral_material(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle, by singular values."""
+    def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
+        """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.material[e]
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
+        out = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(9)):
             if ti.static(update):
                 state[target + 15 + i][lane] = f_new[i // 3, i % 3]
-            self.affine[entry9 + i][lane] = (
-                self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
-            )
-
-    @ti.func
-    def material_particle(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle on CUDA."""
-        p = self.material[e]
-        c = self.load(state, source + 6, lane, 9)
-        g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
-        j = det(g)
-        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
-        _q, _det, _norm, k = yield_factor(d, p[2])
-        if self.served(z2, j):
-            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
-            for i in ti.static(range(9)):
-                self.affine[entry9 + i][lane] = a[i]
-            if ti.static(update):
-                if k < 1.0:
-                    f_new = flow(d, g, p[2], self.series)
-                    for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = f_new[i]
-                else:
-                    for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = g[i]
-        else:
-            self.spectral_material(state, source, target, entry9, lane, e, update)
+            out[i] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
+        return out
 
     @ti.func
     def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
@@ -236,7 +214,8 @@ class ParticlePhases(Storage):
             self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
         else:
             for lane in range(self.lanes):
-                self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
+                a_bar = self.load(self.affine, entry9, lane, 9)
+                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e)
 
     @ti.func
     def strain_tile(self, state: ti.template(), source, at):
@@ -337,14 +316,14 @@ class ParticlePhases(Storage):
 
     @ti.func
     def spectral_material_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
+        self, state: ti.template(), source, bar: ti.template(), target, a_bar9: ti.template(), lane, e
     ):
-        """:meth:`material_tile_adjoint` for one particle, by singular values."""
+        """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
         p = self.material[e]
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
-        a_bar = as_matrix(self.load(self.affine, entry9, lane, 9))
+        a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
         g_bar = spectral_return_map_adjoint(f + self.dt * (c @ f), f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
@@ -353,38 +332,6 @@ class ParticlePhases(Storage):
         for i in ti.static(range(9)):
             bar[target + 6 + i][lane] = c_bar[i // 3, i % 3]
             bar[target + 15 + i][lane] = f_bar[i // 3, i % 3]
-
-    @ti.func
-    def material_particle_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
-    ):
-        """:meth:`material_tile_adjoint` for one particle on CUDA."""
-        p = self.material[e]
-        c = self.load(state, source + 6, lane, 9)
-        f = self.load(state, source + 15, lane, 9)
-        g_bar = self.load(bar, target + 15, lane, 9)
-        a_bar = self.load(self.affine, entry9, lane, 9)
-        g = trial_gradient(c, f, self.dt)
-        j = det(g)
-        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
-        if self.served(z2, j):
-            tau_bar = self.stress_symmetric(a_bar)
-            d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
-            _q, _det, _norm, k = yield_factor(d, p[2])
-            if k < 1.0:
-                d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
-                k_bar += k_flow
-                for i in ti.static(range(6)):
-                    d_bar[i] += d_flow[i]
-                for i in ti.static(range(9)):
-                    g_bar[i] = g_flow[i]
-            z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
-            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
-            for i in ti.static(range(9)):
-                bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
-                bar[target + 15 + i][lane] = f_out[i]
-        else:
-            self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
 
     # -- transfers ----------------------------------------------------------------------------------
 

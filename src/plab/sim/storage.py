@@ -141,7 +141,7 @@ class Storage:
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
-        self.velocity = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.velocity = self.gathered_grid(b * self.nodes)
         self._allocate_blocks(grids)
         self.target = ti.field(real, shape=b * self.n**3)
         self.target_sdf = ti.field(real, shape=b * self.n**3)
@@ -153,6 +153,10 @@ class Storage:
         self.once = ti.field(ti.i32, shape=())
         self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
+
+    def gathered_grid(self, nodes: int) -> ti.Field:
+        """Allocate a grid of 4-vectors that particles gather from."""
+        return ti.Vector.field(4, self.real, shape=nodes)
 
     def _allocate_blocks(self, grids: int) -> None:
         b = self.batch
@@ -176,7 +180,7 @@ class Storage:
             return
         real, b, m = self.real, self.batch, max(1, self.manipulators)
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
-        self.momentum_bar = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
 
