@@ -15,7 +15,7 @@ import sys
 import taichi as ti
 
 from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
-from plab.sim.cuda_warp import NODE_BITS, NODE_MASK, NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
+from plab.sim.cuda_warp import NODE_BITS, NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.storage import MEASURES, STATE
 from plab.sim.transfer import spline, widen
@@ -61,13 +61,18 @@ class CudaEngine(CudaPhases):
         self.resident_threads = multiprocessors() * RESIDENT_BLOCK
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
 
-    # -- threads ------------------------------------------------------------------------------------
+    @property
+    def resident(self) -> bool:
+        """Whether a step is one launch."""
+        return self.particle_threads <= RESIDENT_TURNS * self.resident_threads
 
-    @ti.func
-    def particle_of(self, q):
-        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
-        e = q // (self.tiles * self.lanes)
-        return e, q - e * (self.tiles * self.lanes)
+    @property
+    def sorts(self) -> bool:
+        """Whether particles are put into the order of their cells before each step: where there are so many
+        that atomics, not launches, take the time."""
+        return not self.resident
+
+    # -- threads ------------------------------------------------------------------------------------
 
     @ti.func
     def scatter_node(self, e, particle, base):
@@ -183,18 +188,6 @@ class CudaEngine(CudaPhases):
             target = self.tile_entry(after, e, tile)
             self.gather_particle(state, source, target, particle % self.lanes, e, time)
 
-    @ti.func
-    def turns_of(self, w, total):
-        """How many of ``total`` items thread w of a loop over nodes works on."""
-        return (total - w + self.node_threads - 1) // self.node_threads
-
-    @ti.func
-    def node_of(self, q):
-        """Environment, block and number in the block of node q of the active blocks."""
-        entry = self.block_list[q >> NODE_BITS]
-        e = entry // self.blocks
-        return e, entry - e * self.blocks, q & NODE_MASK
-
     # -- public methods -----------------------------------------------------------------------------
 
     def step(
@@ -210,7 +203,7 @@ class CudaEngine(CudaPhases):
         stamp: int,
     ) -> None:
         """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
-        if self.particle_threads <= RESIDENT_TURNS * self.resident_threads:
+        if self.resident:
             self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
             return
         self.advance_kernel(poses, actions, t, pose_before, pose_after)

@@ -8,7 +8,7 @@ on timing.
 
 import taichi as ti
 
-from plab.sim.cuda_warp import WarpPhases
+from plab.sim.cuda_order import OrderPhases
 from plab.sim.linalg import det
 from plab.sim.material import (
     flow,
@@ -36,7 +36,7 @@ FAR = 1e9
 """Distance of the nearest particle before any was looked at."""
 
 
-class CudaPhases(WarpPhases, PosePhases):
+class CudaPhases(OrderPhases, PosePhases):
     """Phases that differ from the CPU's."""
 
     def _allocate(self) -> None:

@@ -90,6 +90,18 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
             out = grid[node][3]
         return out
 
+    @ti.func
+    def turns_of(self, w, total):
+        """How many of ``total`` items thread w of a loop over nodes works on."""
+        return (total - w + self.node_threads - 1) // self.node_threads
+
+    @ti.func
+    def node_of(self, q):
+        """Environment, block and number in the block of node q of the active blocks."""
+        entry = self.block_list[q >> NODE_BITS]
+        e = entry // self.blocks
+        return e, entry - e * self.blocks, q & NODE_MASK
+
     # -- blocks of the grid -------------------------------------------------------------------------
 
     @ti.func

@@ -66,18 +66,20 @@ class ParticlePhases(Storage):
     def observe(
         self,
         state: ti.types.ndarray(ndim=1),
-        places: ti.types.ndarray(ndim=1),
-        count: ti.i32,
+        order: ti.types.ndarray(ndim=1),
+        stride: ti.i32,
         out: ti.types.ndarray(ndim=1),
     ):
-        """Write position and velocity of ``count`` particles per environment, at their places in the tiles'
-        order."""
-        for q in range(self.batch * count):
-            tile = places[q] // self.lanes
-            lane = places[q] % self.lanes
-            entry = self.tile_entry(0, q // count, tile)
-            for i in ti.static(range(6)):
-                out[q * 6 + i] = state[entry + i][lane]
+        """Write position and velocity of every ``stride``-th particle, as ``order`` numbers them."""
+        for q in range(self.batch * self.tiles * self.lanes):
+            e = q // (self.tiles * self.lanes)
+            place = q - e * (self.tiles * self.lanes)
+            number = order[q]
+            if place < self.particles and number % stride == 0:
+                entry = self.tile_entry(0, e, place // self.lanes)
+                row = e * ((self.particles + stride - 1) // stride) + number // stride
+                for i in ti.static(range(6)):
+                    out[row * 6 + i] = state[entry + i][place % self.lanes]
 
     @ti.func
     def stencil(self, x):
@@ -526,7 +528,11 @@ class ParticlePhases(Storage):
         block, crossing = self.block_of(base)
         for corner in ti.static(range(8)):
             if (crossing & corner) == corner:
-                entry = e * self.blocks + self.neighbour(block, corner)
-                if self.block_stamp[entry] < stamp:
-                    if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
-                        self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry
+                self.list_block(e * self.blocks + self.neighbour(block, corner), stamp)
+
+    @ti.func
+    def list_block(self, entry, stamp):
+        """Take a block into the list on CUDA, unless it is in it."""
+        if self.block_stamp[entry] < stamp:
+            if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
+                self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry

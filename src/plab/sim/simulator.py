@@ -10,7 +10,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
-from plab.sim.order import curve_order
+from plab.sim.order import ParticleOrder
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
 
@@ -125,14 +125,17 @@ class Simulator:
         self._history: ti.Ndarray | None = None
         self._checkpoints: ti.Ndarray | None = None
         self._bar: ti.Ndarray | None = None
+        self._spare_bar: ti.Ndarray | None = None
         self._current = self._state_array(1)
+        # Where the current state goes when its particles are put into another order.
+        self._spare = self._state_array(1) if self._engine.sorts else None
         self._initial = self._state_array(1)
         self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
-        self._observed: dict[int, tuple[ti.Ndarray, ti.Ndarray]] = {}
+        self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._order = np.stack([curve_order(x, scenes[0].grid_size) for x in positions])
+        self._order = ParticleOrder(self._engine, positions)
         self._initial_poses = np.array(
             [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
             dtype=np.float64,
@@ -234,6 +237,7 @@ class Simulator:
         """Put all environments into their initial states."""
         self._require_runtime()
         self._engine.copy_slot(self._initial, 0, self._current, 0)
+        self._order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
 
@@ -249,6 +253,7 @@ class Simulator:
         """
         self._require_runtime()
         array = self._action_array(np.asarray(actions, np.float64)[:, None])
+        self._sort_current()
         self._engine.step(self._current, self._pose, array, 0, 0, 0, 0, 0, self._take_stamps(self.substeps))
         _require_none(self._faults())
 
@@ -278,14 +283,14 @@ class Simulator:
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
         self._losses(self._current, 0, terms, 0)
-        self._run_forward(array, poses, terms, steps, plan)
+        moves = self._run_forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
         failures = _bad_terms(values) | self._faults()
         if strict:
             _require_none(failures)
         actions_bar = None
         if plan is not None:
-            actions_bar = self._run_backward(array, poses, steps, plan)
+            actions_bar = self._run_backward(array, poses, steps, plan, moves)
             failures = _bad_gradients(actions_bar) | failures
             if strict:
                 _require_none(failures)
@@ -332,11 +337,11 @@ class Simulator:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
         """
         self._require_runtime()
+        count = -(-self.particle_count // stride)
         if stride not in self._observed:
-            self._observed[stride] = self._allocate_observation(stride)
-        places, out = self._observed[stride]
-        count = places.shape[0] // self.batch
-        self._engine.observe(self._current, places, count, out)
+            self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
+        out = self._observed[stride]
+        self._engine.observe(self._current, self._order.numbers, stride, out)
         return out.to_numpy().reshape(self.batch, count, 6)
 
     def poses(self) -> np.ndarray:
@@ -363,6 +368,7 @@ class Simulator:
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
         self._current.from_numpy(self._pack(state))
+        self._order.reset()
         self._place(np.asarray(state.poses, np.float64))
         self._engine.fault.fill(0)
 
@@ -386,13 +392,6 @@ class Simulator:
             iou = both / (total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
 
-    def _allocate_observation(self, stride: int) -> tuple[ti.Ndarray, ti.Ndarray]:
-        """Places of the observed particles in the tiles' order, and room for what is observed of them."""
-        where = np.argsort(self._order, axis=1)[:, ::stride]
-        places = ti.ndarray(ti.i32, shape=where.size)
-        places.from_numpy(where.astype(np.int32).reshape(-1))
-        return places, ti.ndarray(self._runtime.real, shape=where.size * 6)
-
     def _state_array(self, slots: int) -> ti.Ndarray:
         engine = self._engine
         return ti.ndarray(engine.lane_type, shape=slots * self.batch * engine.tiles * STATE)
@@ -405,17 +404,19 @@ class Simulator:
         """Environment steps per segment whose every state is kept, so that all fits into the memory
         budget."""
         budget = self.memory_mb * 1e6
+        moved = 4 * steps * self._order.places if self._engine.sorts else 0
 
         def cost(length: int) -> int:
             segments = -(-steps // length)
-            return (length * self.substeps + 2 + (segments if segments > 1 else 0)) * self._slot_bytes()
+            slots = length * self._slots_per_step + 2 + (segments if segments > 1 else 0)
+            return (slots + (1 if self._engine.sorts else 0)) * self._slot_bytes() + moved
 
         # Taichi counts the entries of an array in 32 bits.
         slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
         fitting = [
             length
             for length in range(1, steps + 1)
-            if cost(length) <= budget and max(length * self.substeps + 1, -(-steps // length)) <= slots
+            if cost(length) <= budget and max(length * self._slots_per_step + 1, -(-steps // length)) <= slots
         ]
         if not fitting:
             need = min(cost(length) for length in range(1, steps + 1)) / 1e6
@@ -430,7 +431,7 @@ class Simulator:
 
     def _allocate_gradient(self, length: int, segments: int) -> None:
         self._engine.allocate_adjoint()
-        slots = length * self.substeps + 1
+        slots = length * self._slots_per_step + 1
         size = slots * self._current.shape[0]
         if self._history is None or self._history.shape[0] < size:
             self._history = None
@@ -441,15 +442,47 @@ class Simulator:
             self._checkpoints = self._state_array(segments)
         if self._bar is None:
             self._bar = self._state_array(1)
+            self._spare_bar = self._state_array(1) if self._engine.sorts else None
 
-    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> None:
+    @property
+    def _slots_per_step(self) -> int:
+        """Time slots of an environment step in the history. Where particles are put into another order, a
+        step's start is kept in its own order and in that of the step before."""
+        return self.substeps + (1 if self._engine.sorts else 0)
+
+    def _sort_current(self, t: int = 0, moves: ti.Ndarray | None = None) -> None:
+        """Put the particles of the current state into the order of their cells, where that pays."""
+        if self._engine.sorts:
+            moves = self._order.find(self._current, 0, t, self._take_stamps(1), moves)
+            self._engine.move(self._current, 0, self._spare, 0, moves, t)
+            self._current, self._spare = self._spare, self._current
+
+    def _enter_step(self, t: int, slot: int, moves: ti.Ndarray | None, *, known: bool) -> None:
+        """Fill the history's slot in which step t starts from the one before it, in the step's own order.
+
+        Args:
+            t: Environment step.
+            slot: The step's first slot.
+            moves: The orders of all steps.
+            known: Whether the step's order is in ``moves`` already.
+        """
+        if self._engine.sorts:
+            if not known:
+                self._order.find(self._history, slot - 1, t, self._take_stamps(1), moves)
+            self._engine.move(self._history, slot - 1, self._history, slot, moves, t)
+
+    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> ti.Ndarray | None:
+        """Run all steps and keep what the gradient needs; returns the orders of all steps if they change."""
         if length is None:
             for t in range(steps):
+                self._sort_current()
                 self._advance(self._current, 0, 0, t, actions, poses)
                 self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-            return
+            return None
         segments = -(-steps // length)
         self._allocate_gradient(length, segments)
+        moves = self._order.allocate(steps) if self._engine.sorts else None
+        first = 1 if self._engine.sorts else 0
         for k in range(segments):
             if segments > 1:
                 self._engine.copy_slot(self._current, 0, self._checkpoints, k)
@@ -458,30 +491,35 @@ class Simulator:
                 self._engine.copy_slot(self._current, 0, self._history, 0)
             for t in range(k * length, min(steps, (k + 1) * length)):
                 if last:
-                    slot = (t - k * length) * self.substeps
+                    slot = first + (t - k * length) * self._slots_per_step
+                    self._enter_step(t, slot, moves, known=False)
                     self._advance(self._history, slot, 1, t, actions, poses)
                     self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * MEASURES)
                 else:
+                    self._sort_current(t, moves)
                     self._advance(self._current, 0, 0, t, actions, poses)
                     self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-        end = (steps - (segments - 1) * length) * self.substeps
+        end = (steps - (segments - 1) * length) * self._slots_per_step
         self._engine.copy_slot(self._history, end, self._current, 0)
+        return moves
 
-    def _run_backward(self, actions, poses, steps: int, length: int) -> np.ndarray:
+    def _run_backward(self, actions, poses, steps: int, length: int, moves: ti.Ndarray | None) -> np.ndarray:
         segments = -(-steps // length)
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
         actions_bar.fill(0.0)
         self._bar.fill(0.0)
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
+        first = 1 if self._engine.sorts else 0
         for k in reversed(range(segments)):
             stop = min(steps, (k + 1) * length)
             if k < segments - 1:
                 self._engine.copy_slot(self._checkpoints, k, self._history, 0)
                 for t in range(k * length, stop):
-                    self._advance(self._history, (t - k * length) * self.substeps, 1, t, actions, poses)
+                    slot = first + (t - k * length) * self._slots_per_step
+                    self._enter_step(t, slot, moves, known=True)
+                    self._advance(self._history, slot, 1, t, actions, poses)
             for t in reversed(range(k * length, stop)):
-                slot = (t - k * length) * self.substeps
                 self._engine.step_adjoint(
                     self._history,
                     self._bar,
@@ -489,10 +527,13 @@ class Simulator:
                     actions,
                     actions_bar,
                     self._scratch_terms,
-                    slot,
+                    first + (t - k * length) * self._slots_per_step,
                     t,
                     self._take_stamps(self.substeps + 1),
                 )
+                if self._engine.sorts:
+                    self._engine.move_back(self._bar, self._spare_bar, moves, t)
+                    self._bar, self._spare_bar = self._spare_bar, self._bar
         gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
         return gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
 
@@ -531,7 +572,10 @@ class Simulator:
 
     def _faults(self) -> dict[int, str]:
         """Environments whose state is broken, and since when."""
-        faults, what = self._engine.fault.to_numpy(), "the state is not finite or a particle crosses the domain"
+        faults, what = (
+            self._engine.fault.to_numpy(),
+            "the state is not finite or a particle crosses the domain",
+        )
         failures = {}
         for e in np.flatnonzero(faults):
             step, substep = divmod(int(faults[e]) - 1, self.substeps)
@@ -554,7 +598,7 @@ class Simulator:
         flat[:, :, [15, 19, 23]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self._order[:, :, None], axis=1)
+        flat[:, :n] = np.take_along_axis(values, self._order.initial[:, :, None], axis=1)
         tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
@@ -567,7 +611,7 @@ class Simulator:
             .reshape(b, -1, STATE)[:, :n]
         )
         values = np.empty((b, n, STATE))
-        np.put_along_axis(values, self._order[:, :, None], flat.astype(np.float64), axis=1)
+        np.put_along_axis(values, self._order.current()[:, :, None], flat.astype(np.float64), axis=1)
         shape = (b, n, 3, 3)
         return State(
             values[..., 0:3],
