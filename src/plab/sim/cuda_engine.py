@@ -328,7 +328,8 @@ class CudaEngine(CudaPhases):
                 for turn in range(self.resident_turns(w, self.particle_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, t * self.substeps + s)
-                meetings = self.meet(w, meetings)
+                # A warp scatters what it has gathered itself, so that the others need not wait.
+                self.wait_for_warp()
 
     @ti.kernel
     def losses_kernel(
