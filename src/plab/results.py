@@ -1,8 +1,8 @@
 """Result files: one HDF5 file per run, replaced atomically while it runs, loaded into pandas afterwards.
 
 The layout is described in docs/results.md. A run that is under way keeps its state in ``<name>.partial.h5``,
-rewritten as a whole after every iteration: a process killed at any moment leaves the previous, readable
-version behind, from which the same command resumes. This module imports neither torch nor taichi, so that
+rewritten as a whole now and then: a process killed at any moment leaves the previous, readable version
+behind, from which the same command resumes. This module imports neither torch nor taichi, so that
 reading results is quick.
 """
 
@@ -13,6 +13,7 @@ import hashlib
 import itertools
 import json
 import logging
+import math
 import os
 import time
 import warnings
@@ -25,11 +26,14 @@ import h5py
 import numpy as np
 import pandas as pd
 
+from plab.locks import Lock, acquire
 from plab.provenance import provenance, version_changes
 
 __all__ = [
     "SCHEMA_VERSION",
+    "NewerSchemaError",
     "ResultsError",
+    "RunBusyError",
     "RunFile",
     "RunResult",
     "config_dict",
@@ -45,7 +49,7 @@ SCHEMA_VERSION = 1
 
 STATUSES = ("running", "finished", "failed", "stopped")
 
-_NO_EFFECT = ("results_dir", "progress", "force")
+_NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
 _PROBE_BYTES = 4 << 20
@@ -57,6 +61,14 @@ _images = itertools.count()
 
 class ResultsError(RuntimeError):
     """A result file that cannot be read or written; the message names the file and the reason."""
+
+
+class NewerSchemaError(ResultsError):
+    """A result file of a later schema version than this plab knows: it is never moved or replaced."""
+
+
+class RunBusyError(ResultsError):
+    """A run that somebody else computes at this moment."""
 
 
 @dataclasses.dataclass
@@ -213,33 +225,68 @@ def load(folder: str | Path = "results", keys: Sequence[str] = ()) -> pd.DataFra
 class RunFile:
     """The result file of one run while it runs: finds what an earlier process left, records, finishes.
 
+    Unless the run is complete already, it holds the run's lock until it is closed, finished or released.
+
     Attributes:
         path: Final file.
         partial_path: File that carries the state of the run while it is under way.
-        result: What is known so far; from an earlier process where there was one.
     """
 
     def __init__(self, cfg: Any) -> None:
         """Open the file of a configuration's run.
 
         Raises:
+            RunBusyError: If somebody else computes the run.
+            NewerSchemaError: If a later plab has written a file of the run.
             ResultsError: If the folder cannot be written or has no room, before anything is computed.
         """
         config = config_dict(cfg)
         self.path = result_path(config)
         self.partial_path = self.path.with_suffix(".partial.h5")
-        self.result = RunResult(config, config_hash(config), provenance=provenance(config))
-        if not config["force"]:
-            self._take_up_earlier()
-        if not self.finished:
+        # Rows not yet in the table, the last one first: ``(row, (row before, ...))``. One object with
+        # the result: an interrupt may arrive between any two assignments.
+        self._state = RunResult(config, config_hash(config), provenance=provenance(config)), ()
+        self._every, self._written = config["checkpoint_seconds"], -math.inf
+        self._lock: Lock | None = None
+        _refuse_newer(self.path, self.partial_path)
+        if config["force"] or not self._is_finished():
             _probe(self.path.parent)
-            for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
-                leftover.unlink(missing_ok=True)
+            self._lock_and_look(config["force"])
+
+    def _lock_and_look(self, force: bool) -> None:
+        """Take the run's lock, then see what there is: whoever had it before may have changed everything."""
+        self._lock = acquire(self.path)
+        if self._lock is None:
+            raise RunBusyError(f"{self.path} is being computed by another process")
+        if not force and not self._is_finished():
+            self._take_up_earlier()
+        for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
+            leftover.unlink(missing_ok=True)
+        if self.finished:
+            self.release()
+
+    @property
+    def result(self) -> RunResult:
+        """What is known so far; from an earlier process where there was one."""
+        known, pending = self._state
+        rows = []
+        while pending:
+            row, pending = pending
+            rows.insert(0, row)
+        if rows:
+            table = pd.concat([known.iterations, pd.DataFrame(rows)], ignore_index=True)
+            self._state = dataclasses.replace(known, iterations=table), ()
+        return self._state[0]
 
     @property
     def finished(self) -> bool:
         """Whether the run is complete, by this process or an earlier one."""
-        return self.result.status == "finished"
+        return self._state[0].status == "finished"
+
+    def release(self) -> None:
+        """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
+        if self._lock is not None:
+            self._lock.release(remove=self.finished)
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -248,27 +295,41 @@ class RunFile:
         try:
             yield
         finally:
-            seconds = time.perf_counter() - start
-            self.result.wall_time[name] = self.result.wall_time.get(name, 0.0) + seconds
+            self.spend(name, time.perf_counter() - start)
 
-    def record(self, row: Mapping[str, float], resume: Mapping[str, Any], **changes: Any) -> None:
-        """Append a row to the iterations and rewrite the partial file.
+    def spend(self, name: str, seconds: float) -> None:
+        """Add to the wall time of a phase."""
+        times = self._state[0].wall_time
+        times[name] = times.get(name, 0.0) + seconds
+
+    def record(
+        self, row: Mapping[str, float], resume: Mapping[str, Any], *, keep: bool = False, **changes: Any
+    ) -> None:
+        """Append a row to the iterations, and rewrite the partial file if ``checkpoint_seconds`` are over.
 
         Args:
             row: Column name to number; the same columns in every call.
             resume: State from which the next iteration starts: nested dictionaries of arrays, numbers and
                 strings.
+            keep: Write the partial file in any case.
             changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
         """
-        table = pd.concat([self.result.iterations, pd.DataFrame([dict(row)])], ignore_index=True)
-        # One assignment: an interrupt arrives before it or after it, never between the row and its state.
-        self.result = dataclasses.replace(self.result, iterations=table, resume=dict(resume), **changes)
-        write(self.result, self.partial_path)
+        known, pending = self._state
+        self._state = dataclasses.replace(known, resume=dict(resume), **changes), (dict(row), pending)
+        if keep or time.monotonic() - self._written >= self._every:
+            self._write()
 
     def close(self, status: str, message: str) -> None:
         """Mark an unfinished run ``failed`` or ``stopped``, keeping what it computed in the partial file."""
-        self.result = dataclasses.replace(self.result, status=status, message=message)
+        self._state = dataclasses.replace(self.result, status=status, message=message), ()
+        try:
+            self._write()
+        finally:
+            self.release()
+
+    def _write(self) -> None:
         write(self.result, self.partial_path)
+        self._written = time.monotonic()
 
     def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
         """Write the final file and remove the partial one.
@@ -287,8 +348,20 @@ class RunFile:
             path=self.path,
         )
         write(result, self.path, compress=True)
-        self.result = result
+        self._state = result, ()
         self.partial_path.unlink(missing_ok=True)
+        self.release()
+
+    def _is_finished(self) -> bool:
+        """Look whether there is a complete result, and take it."""
+        try:
+            earlier = read(self.path)
+        except ResultsError:
+            return False
+        if earlier.status != "finished" or earlier.config_hash != self.result.config_hash:
+            return False
+        self._state = earlier, ()
+        return True
 
     def _take_up_earlier(self) -> None:
         """Continue from what an earlier process left; files that cannot be used are moved aside."""
@@ -302,9 +375,6 @@ class RunFile:
             except ResultsError as error:
                 _move_aside(path, error)
                 continue
-            if earlier.status == "finished":
-                self.result = earlier
-                return
             if earlier.resume is not None:
                 self._resume(earlier)
 
@@ -313,7 +383,10 @@ class RunFile:
         if changes:
             _log.warning("resuming %s, begun with other versions: %s", self.partial_path, ", ".join(changes))
         first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
-        self.result = dataclasses.replace(earlier, status="running", message="", provenance=first, path=None)
+        self._state = (
+            dataclasses.replace(earlier, status="running", message="", provenance=first, path=None),
+            (),
+        )
 
 
 # ---------------------------------------------------------------------------------------------------- details
@@ -358,6 +431,11 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             if file.attrs.get("format") != "plab-run":
                 raise ResultsError(f"{path} is not a plab result file")
             version = file.attrs["schema_version"]
+            if version > SCHEMA_VERSION:
+                raise NewerSchemaError(
+                    f"{path} was written by a newer plab (schema version {version}, this one knows "
+                    f"{SCHEMA_VERSION}): install that, or choose another results_dir"
+                )
             if version != SCHEMA_VERSION:
                 raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
             yield file
@@ -476,12 +554,26 @@ def _lookup(config: Mapping[str, Any], key: str) -> Any:
 
 
 def _move_aside(path: Path, reason: ResultsError) -> None:
-    aside = path.with_name(f"{path.name}.bad")
+    names = (f"{path.name}.bad{number or ''}" for number in itertools.count())
+    aside = next(aside for name in names if not (aside := path.with_name(name)).exists())
     try:
         os.replace(path, aside)
     except OSError as error:
         raise ResultsError(f"{reason}, and cannot be moved: {error.strerror or error}") from error
     _log.warning("%s; moved to %s, starting afresh", reason, aside.name)
+
+
+def _refuse_newer(*paths: Path) -> None:
+    """Raise NewerSchemaError if one of the files has been written by a later plab."""
+    for path in paths:
+        try:
+            with _opened(path):
+                pass
+        except NewerSchemaError:
+            raise
+        except ResultsError:
+            # Missing or damaged: what is done about it depends on what it was.
+            pass
 
 
 def _probe(folder: Path) -> None:

@@ -10,6 +10,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
+from plab.sim.memory import ENTRIES_MAX, kept_states
 from plab.sim.order import ParticleOrder
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
@@ -407,12 +408,10 @@ class Simulator:
         moved = 4 * steps * self._order.places if self._engine.sorts else 0
 
         def cost(length: int) -> int:
-            segments = -(-steps // length)
-            slots = length * self._slots_per_step + 2 + (segments if segments > 1 else 0)
-            return (slots + (1 if self._engine.sorts else 0)) * self._slot_bytes() + moved
+            states = kept_states(steps, self._slots_per_step, length) + (1 if self._engine.sorts else 0)
+            return states * self._slot_bytes() + moved
 
-        # Taichi counts the entries of an array in 32 bits.
-        slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
+        slots = ENTRIES_MAX // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
         fitting = [
             length
             for length in range(1, steps + 1)
