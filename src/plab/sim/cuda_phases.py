@@ -343,7 +343,7 @@ class CudaPhases(Phases):
             for m in range(start, stop):
                 p = self.frame_rotation[e, s, m].transpose() @ (x - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-                if self.strength(d) > 0.0:
+                if self.strength(e, d) > 0.0:
                     mask = mask | (1 << m)
         return mask
 

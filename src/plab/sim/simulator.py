@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import taichi as ti
@@ -65,6 +65,8 @@ class Rollout:
         step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
             [batch, T, action], or None if it was not asked for.
+        failures: Environments whose state, loss or gradient stopped being finite, and when and why; their
+            numbers mean nothing, those of the others are what they would be without them.
     """
 
     initial_terms: np.ndarray
@@ -72,6 +74,7 @@ class Rollout:
     initial_iou: np.ndarray
     step_iou: np.ndarray
     gradient: np.ndarray | None
+    failures: dict[int, str] = field(default_factory=dict)
 
 
 class Simulator:
@@ -183,18 +186,22 @@ class Simulator:
 
     # -- settings -----------------------------------------------------------------------------------
 
-    def set_contact(self, model: str, softness: float = 666.0) -> None:
+    def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
         """Choose the contact model; nothing is compiled anew.
 
         Args:
-            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``.
-            softness: Decay rate of the soft model [1 / domain unit].
+            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one for all
+                environments, or one for each.
+            softness: Decay rate of the soft model [1 / domain unit]; one for all, or one for each.
         """
-        if model not in CONTACT_MODELS:
-            raise ValueError(f"contact '{model}' is not one of {', '.join(CONTACT_MODELS)}")
-        if model == "soft" and not softness > 0:
-            raise ValueError(f"softness {softness:g} must be positive")
-        self._engine.alpha[None] = softness if model == "soft" else 0.0
+        models = np.broadcast_to(model, self.batch)
+        decay = np.broadcast_to(np.asarray(softness, float), self.batch)
+        for name, rate in zip(models, decay, strict=True):
+            if name not in CONTACT_MODELS:
+                raise ValueError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
+            if name == "soft" and not rate > 0:
+                raise ValueError(f"softness {rate:g} must be positive")
+        self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
         """Set the weights of the three loss terms in the trajectory loss and its gradient."""
@@ -243,21 +250,22 @@ class Simulator:
         self._require_runtime()
         array = self._action_array(np.asarray(actions, np.float64)[:, None])
         self._engine.step(self._current, self._pose, array, 0, 0, 0, 0, 0, self._take_stamps(self.substeps))
-        self._check_fault()
+        _require_none(self._faults())
 
-    def rollout(self, actions: np.ndarray, gradient: bool = True) -> Rollout:
+    def rollout(self, actions: np.ndarray, gradient: bool = True, *, strict: bool = True) -> Rollout:
         """Run environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
             actions: Actions, shape [batch, T, action]; clipped to [-1, 1].
             gradient: Whether to compute the gradient.
+            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
 
         Returns:
             Loss terms per step and the gradient; the simulator is left in the final state.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            SimulationError: If state, loss or gradient stop being finite.
+            SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         self.reset()
@@ -272,13 +280,19 @@ class Simulator:
         self._losses(self._current, 0, terms, 0)
         self._run_forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
-        self._check_fault()
-        self._check_terms(values)
-        actions_bar = self._run_backward(array, poses, steps, plan) if plan is not None else None
+        failures = _bad_terms(values) | self._faults()
+        if strict:
+            _require_none(failures)
+        actions_bar = None
+        if plan is not None:
+            actions_bar = self._run_backward(array, poses, steps, plan)
+            failures = _bad_gradients(actions_bar) | failures
+            if strict:
+                _require_none(failures)
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
-        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar)
+        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
     def measure(self) -> Measures:
         """Loss terms and soft IoU of the current state."""
@@ -480,14 +494,7 @@ class Simulator:
                     self._take_stamps(self.substeps + 1),
                 )
         gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
-        gradient = gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
-        for t in reversed(range(steps)):
-            bad = np.flatnonzero(~np.isfinite(gradient[:, t]).all(axis=1))
-            if bad.size:
-                raise SimulationError(
-                    f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}"
-                )
-        return gradient
+        return gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
 
     def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
         self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
@@ -522,22 +529,14 @@ class Simulator:
             array.from_numpy(flat)
         return array
 
-    def _check_fault(self) -> None:
-        faults = self._engine.fault.to_numpy()
-        bad = np.flatnonzero(faults)
-        if bad.size:
-            step, substep = divmod(int(faults[bad[0]]) - 1, self.substeps)
-            raise SimulationError(
-                f"the state is not finite or a particle crosses the domain in one substep: "
-                f"environment {bad[0]}, "
-                f"environment step {step + 1}, substep {substep + 1}"
-            )
-
-    def _check_terms(self, terms: np.ndarray) -> None:
-        bad = np.argwhere(~np.isfinite(terms))
-        if bad.size:
-            when = f"after environment step {bad[0][0]}" if bad[0][0] else "at the start"
-            raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, {when}")
+    def _faults(self) -> dict[int, str]:
+        """Environments whose state is broken, and since when."""
+        faults, what = self._engine.fault.to_numpy(), "the state is not finite or a particle crosses the domain"
+        failures = {}
+        for e in np.flatnonzero(faults):
+            step, substep = divmod(int(faults[e]) - 1, self.substeps)
+            failures[int(e)] = f"environment step {step + 1}, substep {substep + 1}: {what} in one substep"
+        return failures
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
@@ -577,6 +576,31 @@ class Simulator:
             values[..., 15:24].reshape(shape),
             poses,
         )
+
+
+def _bad_terms(values: np.ndarray) -> dict[int, str]:
+    """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
+    5]."""
+    broken = ~np.isfinite(values).all(axis=2)
+    first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
+    when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
+    return {e: f"{text}: the loss is not finite" for e, text in when.items()}
+
+
+def _bad_gradients(gradient: np.ndarray) -> dict[int, str]:
+    """Environments with a gradient that is not finite, and since which step, going backwards; gradient of
+    shape [batch, T, action]."""
+    broken = ~np.isfinite(gradient).all(axis=2)
+    last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
+    return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
+
+
+def _require_none(failures: Mapping[int, str]) -> None:
+    """Raise SimulationError if an environment has broken off; the first is named."""
+    if failures:
+        first = min(failures)
+        more = f" (and {len(failures) - 1} more environments)" if len(failures) > 1 else ""
+        raise SimulationError(f"environment {first}, {failures[first]}{more}", failures)
 
 
 def _engine_class(device: str) -> type:

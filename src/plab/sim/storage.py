@@ -126,7 +126,8 @@ class Storage:
         self.low = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.high = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.minimal_gap = ti.field(ti.f64, shape=(b, m))
-        self.alpha = ti.field(real, shape=())
+        # Decay rate of the soft contact model; 0 is the hard one.
+        self.alpha = ti.field(real, shape=b)
         self.loss_weights = ti.Vector.field(3, real, shape=())
         # Poses of one environment step, and what contact needs of them.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
