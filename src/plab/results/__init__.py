@@ -10,7 +10,7 @@ reading results is quick.
 from plab.results.archive import pack, unpack
 from plab.results.checking import Problem, check
 from plab.results.files import read, write
-from plab.results.loading import Row, load, rows
+from plab.results.loading import Row, load, lookup, rows
 from plab.results.running import RunFile
 from plab.results.schema import (
     SCHEMA_VERSION,
@@ -34,6 +34,7 @@ __all__ = [
     "config_dict",
     "config_hash",
     "load",
+    "lookup",
     "pack",
     "read",
     "result_path",

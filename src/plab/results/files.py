@@ -141,7 +141,7 @@ def split_archive(path: Path) -> tuple[Path, str] | None:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open a run of this schema version for reading, turning whatever is wrong with it into a ResultsError."""
+    """Open a run of this schema version, turning whatever is wrong with it into a ResultsError."""
     inside = split_archive(path)
     with _explained(path):
         if inside is None:

@@ -26,7 +26,7 @@ _FORMAT = f"plab-index 1.{SCHEMA_VERSION}"
 """To be raised when rows hold other columns."""
 
 _SETTLED = 2.0
-"""Seconds since a file's last change after which another change must show in its times, on any file system."""
+"""Seconds after a change of a file from which on another one must show in its times, on any file system."""
 
 Entry = tuple[str | Path, dict[str, Any], dict[str, Any]]
 """Member of an archive ("" or "." for a file of its own), values of the columns, configuration."""
@@ -73,9 +73,7 @@ class Index:
         Where the folder cannot be written, or is full, nothing happens. Of two processes that save at once
         the later one's entries stay.
         """
-        if self._used.keys() == self._files.keys() and all(
-            self._used[k] is self._files[k] for k in self._used
-        ):
+        if self._used == self._files:
             return
         parts = [entry[2] for _, entries in self._used.values() for entry in entries]
         needed = {value["section"] for part in parts for value in part.values() if isinstance(value, dict)}
@@ -91,7 +89,8 @@ class Index:
         if head.decode() != f"{_FORMAT} {hashlib.sha256(body).hexdigest()}":
             return
         content = json.loads(body)
-        self._sections, self._files = content["sections"], content["files"]
+        if isinstance(content["sections"], dict) and isinstance(content["files"], dict):
+            self._sections, self._files = content["sections"], content["files"]
 
     def _key(self, path: Path) -> str:
         return str(path.relative_to(self._root))
@@ -117,4 +116,5 @@ def _identity(stat: os.stat_result) -> list[int]:
 
 
 def _pathless(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if name != "path"}
+    # The same folder may be given by another path next time. The column keeps its place.
+    return values | {"path": ""}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ __all__ = [
     "config_hash",
     "final_path",
     "member_name",
+    "parse_member",
     "result_path",
 ]
 
@@ -134,3 +136,16 @@ def member_name(config: Mapping[str, Any], digest: str) -> Path:
 def final_path(partial: Path) -> Path:
     """Return the file that takes the place of a partial one when its run ends."""
     return partial.with_name(partial.name.removesuffix(PARTIAL_SUFFIX) + SUFFIX)
+
+
+def parse_member(path: Path) -> dict[str, str] | None:
+    """Return task, variant, method and seed that a path made by :func:`member_name` tells, None for others.
+
+    Args:
+        path: Path of a result file, or of a file beside it with the same stem.
+    """
+    found = re.fullmatch(
+        r"(?P<task>.+)-v(?P<variant>[^/]+)/(?P<method>[^/]+)/seed(?P<seed>\d+)-[0-9a-f]{8}\..+",
+        "/".join(path.parts[-3:]),
+    )
+    return None if found is None else found.groupdict()
