@@ -15,7 +15,9 @@ from plab.results.running import RunFile
 from plab.results.schema import (
     SCHEMA_VERSION,
     STATUSES,
+    NewerSchemaError,
     ResultsError,
+    RunBusyError,
     RunResult,
     config_dict,
     config_hash,
@@ -25,9 +27,11 @@ from plab.results.schema import (
 __all__ = [
     "SCHEMA_VERSION",
     "STATUSES",
+    "NewerSchemaError",
     "Problem",
     "ResultsError",
     "Row",
+    "RunBusyError",
     "RunFile",
     "RunResult",
     "check",

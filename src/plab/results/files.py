@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, ResultsError, RunResult
+from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, NewerSchemaError, ResultsError, RunResult
 
 __all__ = ["attributes", "encode", "opened", "opened_image", "read", "replace_file", "split_archive", "write"]
 
@@ -183,6 +183,11 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     if file.attrs.get("format") != "plab-run":
         raise ResultsError(f"{path} is not a plab result file")
     version = file.attrs["schema_version"]
+    if version > SCHEMA_VERSION:
+        raise NewerSchemaError(
+            f"{path} was written by a newer plab (schema version {version}, this one knows "
+            f"{SCHEMA_VERSION}): install that, or choose another results_dir"
+        )
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
     return file

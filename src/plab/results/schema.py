@@ -23,7 +23,9 @@ __all__ = [
     "SCHEMA_VERSION",
     "STATUSES",
     "SUFFIX",
+    "NewerSchemaError",
     "ResultsError",
+    "RunBusyError",
     "RunResult",
     "config_dict",
     "config_hash",
@@ -61,12 +63,20 @@ MAY_BE_NAN = ("train_reward", "train_score")
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation."""
 
-_NO_EFFECT = ("results_dir", "progress", "force")
+_NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
 
 class ResultsError(RuntimeError):
     """A result file that cannot be read or written; the message names the file and the reason."""
+
+
+class NewerSchemaError(ResultsError):
+    """A result file of a later schema version than this plab knows: it is never moved or replaced."""
+
+
+class RunBusyError(ResultsError):
+    """A run that somebody else computes at this moment."""
 
 
 @dataclasses.dataclass

@@ -10,6 +10,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
+from plab.sim.memory import ENTRIES_MAX, kept_states
 from plab.sim.order import curve_order
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
@@ -407,11 +408,9 @@ class Simulator:
         budget = self.memory_mb * 1e6
 
         def cost(length: int) -> int:
-            segments = -(-steps // length)
-            return (length * self.substeps + 2 + (segments if segments > 1 else 0)) * self._slot_bytes()
+            return kept_states(steps, self.substeps, length) * self._slot_bytes()
 
-        # Taichi counts the entries of an array in 32 bits.
-        slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
+        slots = ENTRIES_MAX // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
         fitting = [
             length
             for length in range(1, steps + 1)
@@ -531,7 +530,10 @@ class Simulator:
 
     def _faults(self) -> dict[int, str]:
         """Environments whose state is broken, and since when."""
-        faults, what = self._engine.fault.to_numpy(), "the state is not finite or a particle crosses the domain"
+        faults, what = (
+            self._engine.fault.to_numpy(),
+            "the state is not finite or a particle crosses the domain",
+        )
         failures = {}
         for e in np.flatnonzero(faults):
             step, substep = divmod(int(faults[e]) - 1, self.substeps)
