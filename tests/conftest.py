@@ -36,6 +36,13 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     return configs
 
 
+@pytest.fixture(autouse=True)
+def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep indices of the tests' results out of the user's cache folder."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_is_usable():

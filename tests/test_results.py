@@ -256,7 +256,7 @@ def test_a_run_is_computed_by_one_at_a_time(tmp_path: Path, rng) -> None:
 
 def test_partial_is_written_when_checkpoint_seconds_are_over(tmp_path: Path, rng, monkeypatch) -> None:
     now = 100.0
-    monkeypatch.setattr(results.time, "monotonic", lambda: now)
+    monkeypatch.setattr(time, "monotonic", lambda: now)
     run = RunFile(make_config(tmp_path, checkpoint_seconds=5.0))
     written = []
     for k in range(12):
@@ -313,12 +313,12 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results.os, "replace", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(ResultsError, match=r"cannot write .*: No space left on device"):
         run.record(make_row(1), make_state(rng))
     assert run.partial_path.read_bytes() == before
     assert not list(run.path.parent.glob("*.tmp"))
-    monkeypatch.setattr(results.Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(ResultsError, match=r"cannot write results to .*No space left"):
         RunFile(make_config(tmp_path))
 
