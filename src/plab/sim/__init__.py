@@ -2,6 +2,7 @@
 
 from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
 from plab.sim.simulator import CONTACT_MODELS, Measures, Rollout, Simulator, State
+from plab.sim.skips import Skips
 
 __all__ = [
     "CONTACT_MODELS",
@@ -12,5 +13,6 @@ __all__ = [
     "Rollout",
     "SimulationError",
     "Simulator",
+    "Skips",
     "State",
 ]

@@ -143,9 +143,19 @@ class CudaEngine(CudaPhases):
         return (total - w + self.node_threads - 1) // self.node_threads
 
     @ti.func
+    def active_nodes(self):
+        """Nodes of the active blocks of all environments."""
+        count = self.block_count[0]
+        if ti.static(not self.skips.empty_blocks):
+            count = self.batch * self.blocks
+        return count << NODE_BITS
+
+    @ti.func
     def node_of(self, q):
         """Environment and array index (3) of node q of the active blocks."""
-        entry = self.block_list[q >> NODE_BITS]
+        entry = q >> NODE_BITS
+        if ti.static(self.skips.empty_blocks):
+            entry = self.block_list[entry]
         e = entry // self.blocks
         return e, self.node_of_block(entry - e * self.blocks, q & NODE_MASK)
 
@@ -164,7 +174,8 @@ class CudaEngine(CudaPhases):
         stamp: int,
     ) -> None:
         """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
-        if self.particle_threads <= RESIDENT_TURNS * self.resident_threads:
+        few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
+        if few and self.skips.launches:
             self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
             return
         self.advance_kernel(poses, actions, t, pose_before, pose_after)
@@ -187,17 +198,19 @@ class CudaEngine(CudaPhases):
         slot: int,
         t: int,
         stamp: int,
+        contact: int,
     ) -> None:
         """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and its loss.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
-        likewise.
+        likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does not matter and
+        does not hold the adjoint.
         """
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
         self.losses_kernel(state, end, terms, 0, stamp)
         self.loss_gradient_kernel(state, end, bar)
-        for back in range(self.substeps):
+        for back in range(self.substeps if contact else 0):
             s = self.substeps - 1 - back
             self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1 + back)
         self.retreat_kernel(actions, actions_bar, t)
@@ -241,7 +254,7 @@ class CudaEngine(CudaPhases):
         for q in range(self.particle_threads):
             self.scatter_thread(state, before, after, q, stamp)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 self.grid_thread(w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             if q == 0:
@@ -283,7 +296,7 @@ class CudaEngine(CudaPhases):
                     q = w + turn * self.resident_threads
                     self.scatter_thread(state, before, before + stride, q, stamp + s)
                 meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.block_count[0] << NODE_BITS)):
+                for turn in range(self.resident_turns(w, self.active_nodes())):
                     self.grid_thread(w + turn * self.resident_threads, s)
                 meetings = self.meet(w, meetings)
                 if w == 0:
@@ -319,11 +332,11 @@ class CudaEngine(CudaPhases):
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)
-            if node >= 0:
+            if node >= 0 and self.weighs(2):
                 self.note_distances(e, tile * self.lanes + lane, x)
         # A row of nodes per thread makes a quarter of the atomics.
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, (self.block_count[0] << NODE_BITS) // BLOCK)):
+            for turn in range(self.turns_of(w, self.active_nodes() // BLOCK)):
                 e, first = self.node_of((w + turn * self.node_threads) * BLOCK)
                 part = ti.Vector.zero(ti.f64, 4)
                 for r in range(BLOCK):
@@ -346,7 +359,7 @@ class CudaEngine(CudaPhases):
         for q in range(self.pose_threads * NEAREST_GROUPS):
             for m in ti.static(range(self.manipulators)):
                 if ti.static(self.motions[m] != "static"):
-                    if q // NEAREST_GROUPS % max(1, self.manipulators) == m:
+                    if self.weighs(2) and q // NEAREST_GROUPS % max(1, self.manipulators) == m:
                         self.scan_group(q // (NEAREST_GROUPS * self.manipulators), m, q % NEAREST_GROUPS)
         for e in range(self.batch):
             self.join_losses(e, terms, at + MEASURES * e)
@@ -402,7 +415,7 @@ class CudaEngine(CudaPhases):
             h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
             self.scatter_run(self.velocity_bar, node, spline(fx), h, run, first, doublings)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 e, i = self.node_of(w + turn * self.node_threads)
                 node = e * self.nodes + self.linear(i)
                 total = self.take(self.momentum, node)
@@ -450,7 +463,7 @@ class CudaEngine(CudaPhases):
     def export_mass(self, out: ti.types.ndarray(ndim=1)):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 e, i = self.node_of(w + turn * self.node_threads)
                 index = self.tensor_index(e, i)
                 if index >= 0:

@@ -129,7 +129,7 @@ class CudaPhases(Phases):
     def _allocate(self) -> None:
         super()._allocate()
         threads = self.batch * self.tiles * self.lanes
-        moving = sum(1 for motion in self.motions if motion != "static")
+        moving = any(self.moves(shape) for shape in self.shapes)
         # Distances of all particles, written and scanned once per loss; static manipulators leave theirs out.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
         groups = self.batch * max(1, self.manipulators) * NEAREST_GROUPS
@@ -339,9 +339,11 @@ class CudaPhases(Phases):
     def touching(self, e, s, x):
         """Bit mask of the manipulators whose contact is not zero at a point in substep s."""
         mask = 0
+        if ti.static(not self.skips.far_manipulators):
+            mask = ti.static((1 << self.manipulators) - 1)
         for shape, start, stop in ti.static(self.runs):
             for m in range(start, stop):
-                p = self.frame_rotation[e, s, m].transpose() @ (x - self.frame_centre[e, s, m])
+                p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
                 if self.strength(d) > 0.0:
                     mask = mask | (1 << m)
@@ -359,6 +361,8 @@ class CudaPhases(Phases):
         self, e, m: ti.template(), actions: ti.template(), poses: ti.template(), t, before, after
     ):
         """Poses of one manipulator in all substeps of environment step t."""
+        if ti.static(m == 0):
+            self.note_step(e, t)
         pose = self.pose[e, 0, m]
         entry = (before * self.batch + e) * self.manipulators + m
         for i in ti.static(range(8)):
@@ -390,7 +394,7 @@ class CudaPhases(Phases):
     def note_distances(self, e, particle, x):
         """Write one particle's distances from the moving manipulators."""
         for shape, start, stop in ti.static(self.runs):
-            if ti.static(shape != "Cylinder"):
+            if ti.static(self.moves(shape)):
                 for m in range(start, stop):
                     at = (e * self.manipulators + m) * (self.tiles * self.lanes) + particle
                     self.distance[at] = self.end_distance(shape, e, m, x)
@@ -432,8 +436,10 @@ class CudaPhases(Phases):
         for m in ti.static(range(self.manipulators)):
             if ti.static(self.motions[m] == "static"):
                 self.contact_part[e, 0, m] = 0.0
-            else:
+            elif self.weighs(2):
                 self.join_groups(e, m)
+            else:
+                self.contact_part[e, 0, m] = 0.0
         terms[at] = self.target_sum[e] + self.loss_part[e, 0][0]
         terms[at + 1] = self.loss_part[e, 0][1]
         terms[at + 2] = self.contact_term(e)

@@ -12,6 +12,7 @@ from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
 from plab.sim.order import curve_order
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
+from plab.sim.skips import Skips
 from plab.sim.storage import MEASURES, STATE
 
 __all__ = ["CONTACT_MODELS", "Measures", "Rollout", "Simulator", "State"]
@@ -45,7 +46,8 @@ class Measures:
     """What a state is judged by.
 
     Attributes:
-        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3].
+        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
+            their weight is.
         iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
             NaN before :meth:`Simulator.set_target`.
     """
@@ -91,6 +93,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
+        skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -102,6 +105,7 @@ class Simulator:
                 stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -115,7 +119,8 @@ class Simulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._engine = _engine_class(device)(self.scenes, self._runtime)
+        self._skips = skips
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
@@ -197,7 +202,10 @@ class Simulator:
         self._engine.alpha[None] = softness if model == "soft" else 0.0
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
-        """Set the weights of the three loss terms in the trajectory loss and its gradient."""
+        """Set the weights of the three loss terms in the trajectory loss and its gradient.
+
+        The SDF and the contact term are not computed where their weight is 0: they are given as 0 then.
+        """
         self._engine.loss_weights[None] = [density, sdf, contact]
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
@@ -229,6 +237,7 @@ class Simulator:
         self._engine.copy_slot(self._initial, 0, self._current, 0)
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
+        self._engine.touched.fill(0)
 
     def step(self, actions: np.ndarray) -> None:
         """Advance all environments by one environment step, without keeping history.
@@ -263,7 +272,7 @@ class Simulator:
         self.reset()
         array = self._action_array(np.asarray(actions, np.float64))
         steps = np.shape(actions)[1]
-        plan = self._plan(steps) if gradient else None
+        plan = self._plan(steps) if gradient or not self._skips.history else None
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
         whole[0] = self._initial_poses
@@ -274,7 +283,7 @@ class Simulator:
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
         self._check_fault()
         self._check_terms(values)
-        actions_bar = self._run_backward(array, poses, steps, plan) if plan is not None else None
+        actions_bar = self._run_backward(array, poses, steps, plan) if gradient else None
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
@@ -460,6 +469,7 @@ class Simulator:
         self._bar.fill(0.0)
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
+        contact_free = self._steps_before_contact(steps)
         for k in reversed(range(segments)):
             stop = min(steps, (k + 1) * length)
             if k < segments - 1:
@@ -478,6 +488,7 @@ class Simulator:
                     slot,
                     t,
                     self._take_stamps(self.substeps + 1),
+                    int(t >= contact_free),
                 )
         gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
         gradient = gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
@@ -488,6 +499,13 @@ class Simulator:
                     f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}"
                 )
         return gradient
+
+    def _steps_before_contact(self, steps: int) -> int:
+        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
+        if not self._skips.adjoints:
+            return 0
+        touched = self._engine.touched.to_numpy() != 0
+        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
 
     def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
         self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
