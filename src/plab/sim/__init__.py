@@ -3,6 +3,7 @@
 from plab.sim.memory import batch_limit
 from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
 from plab.sim.simulator import CONTACT_MODELS, Measures, Rollout, Simulator, State
+from plab.sim.skips import Skips
 
 __all__ = [
     "CONTACT_MODELS",
@@ -13,6 +14,7 @@ __all__ = [
     "Rollout",
     "SimulationError",
     "Simulator",
+    "Skips",
     "State",
     "batch_limit",
 ]

@@ -96,9 +96,19 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
         return (total - w + self.node_threads - 1) // self.node_threads
 
     @ti.func
+    def active_nodes(self):
+        """Nodes of the active blocks of all environments."""
+        count = self.block_count[0]
+        if ti.static(not self.skips.empty_blocks):
+            count = self.batch * self.blocks
+        return count << NODE_BITS
+
+    @ti.func
     def node_of(self, q):
         """Environment, block and number in the block of node q of the active blocks."""
-        entry = self.block_list[q >> NODE_BITS]
+        entry = q >> NODE_BITS
+        if ti.static(self.skips.empty_blocks):
+            entry = self.block_list[entry]
         e = entry // self.blocks
         return e, entry - e * self.blocks, q & NODE_MASK
 

@@ -13,6 +13,7 @@ from plab.sim.engine import CpuEngine
 from plab.sim.memory import ENTRIES_MAX, kept_states
 from plab.sim.order import ParticleOrder
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
+from plab.sim.skips import Skips
 from plab.sim.storage import MEASURES, STATE
 
 __all__ = ["CONTACT_MODELS", "Measures", "Rollout", "Simulator", "State"]
@@ -46,7 +47,8 @@ class Measures:
     """What a state is judged by.
 
     Attributes:
-        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3].
+        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
+            their weight is.
         iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
             NaN before :meth:`Simulator.set_target`.
     """
@@ -95,6 +97,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
+        skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -106,6 +109,7 @@ class Simulator:
                 stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -119,7 +123,8 @@ class Simulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._engine = _engine_class(device)(self.scenes, self._runtime)
+        self._skips = skips
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
@@ -208,7 +213,10 @@ class Simulator:
         self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
-        """Set the weights of the three loss terms in the trajectory loss and its gradient."""
+        """Set the weights of the three loss terms in the trajectory loss and its gradient.
+
+        The SDF and the contact term are not computed where their weight is 0: they are given as 0 then.
+        """
         self._engine.loss_weights[None] = [density, sdf, contact]
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
@@ -241,6 +249,7 @@ class Simulator:
         self._order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
+        self._engine.touched.fill(0)
 
     def step(self, actions: np.ndarray) -> None:
         """Advance all environments by one environment step, without keeping history.
@@ -277,7 +286,7 @@ class Simulator:
         self.reset()
         array = self._action_array(np.asarray(actions, np.float64))
         steps = np.shape(actions)[1]
-        plan = self._plan(steps) if gradient else None
+        plan = self._plan(steps) if gradient or not self._skips.history else None
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
         whole[0] = self._initial_poses
@@ -290,7 +299,7 @@ class Simulator:
         if strict:
             _require_none(failures)
         actions_bar = None
-        if plan is not None:
+        if gradient:
             actions_bar = self._run_backward(array, poses, steps, plan, moves)
             failures = _bad_gradients(actions_bar) | failures
             if strict:
@@ -510,6 +519,7 @@ class Simulator:
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
         first = 1 if self._engine.sorts else 0
+        contact_free = self._steps_before_contact(steps)
         for k in reversed(range(segments)):
             stop = min(steps, (k + 1) * length)
             if k < segments - 1:
@@ -529,12 +539,20 @@ class Simulator:
                     first + (t - k * length) * self._slots_per_step,
                     t,
                     self._take_stamps(self.substeps + 1),
+                    int(t >= contact_free),
                 )
                 if self._engine.sorts:
                     self._engine.move_back(self._bar, self._spare_bar, moves, t)
                     self._bar, self._spare_bar = self._spare_bar, self._bar
         gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
         return gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
+
+    def _steps_before_contact(self, steps: int) -> int:
+        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
+        if not self._skips.adjoints:
+            return 0
+        touched = self._engine.touched.to_numpy() != 0
+        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
 
     def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
         self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
