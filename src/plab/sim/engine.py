@@ -7,16 +7,14 @@ is one launch over all environments.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import taichi as ti
 
-from plab.scene import Scene
 from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.pose_phases import PosePhases
-from plab.sim.runtime import Runtime
 from plab.sim.storage import BLOCK, MEASURES, STAGE, STATE, WORK
 from plab.sim.transfer import spline
 
@@ -87,9 +85,9 @@ class CpuEngine(Phases):
     :class:`plab.sim.cuda_engine.CudaEngine` has the same.
     """
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
+    def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
-        super().__init__(scenes, runtime)
+        super().__init__(*args)
         self._teams = {name: TeamChoice(self.team_size) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, *args: object) -> None:

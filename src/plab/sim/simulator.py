@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
 from plab.sim.order import curve_order
+from plab.sim.parameters import parameter_gradient
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
 
@@ -91,6 +93,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
+        material_gradient: bool = False,
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -102,6 +105,8 @@ class Simulator:
                 stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            material_gradient: Whether gradients include :meth:`material_gradient`, which costs a few percent
+                of the backward pass.
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -115,7 +120,7 @@ class Simulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._engine = _engine_class(device)(self.scenes, self._runtime)
+        self._engine = _engine_class(device)(self.scenes, self._runtime, material_gradient)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
@@ -200,6 +205,41 @@ class Simulator:
         """Set the weights of the three loss terms in the trajectory loss and its gradient."""
         self._engine.loss_weights[None] = [density, sdf, contact]
 
+    def set_material(
+        self,
+        youngs_modulus: ArrayLike | None = None,
+        poisson_ratio: ArrayLike | None = None,
+        yield_stress: ArrayLike | None = None,
+    ) -> None:
+        """Change the material; nothing is compiled anew.
+
+        Args:
+            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None.
+            poisson_ratio: Poisson ratio, likewise.
+            yield_stress: von Mises yield stress, likewise.
+
+        Raises:
+            SceneError: If a scene could not be simulated with it; nothing is changed then.
+        """
+        given = {
+            "youngs_modulus": youngs_modulus,
+            "poisson_ratio": poisson_ratio,
+            "yield_stress": yield_stress,
+        }
+        values = {
+            name: np.broadcast_to(np.asarray(value, float), self.batch).tolist()
+            for name, value in given.items()
+            if value is not None
+        }
+        scenes = tuple(
+            replace(scene, **{name: column[e] for name, column in values.items()})
+            for e, scene in enumerate(self.scenes)
+        )
+        for scene in scenes:
+            scene.validate()
+        self.scenes = scenes
+        self._engine.fill_material(scenes)
+
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Set the targets of all environments.
 
@@ -279,6 +319,35 @@ class Simulator:
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar)
+
+    def state_gradient(self) -> State:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
+
+        The backward pass ends with it; asking for it copies it from the device. The gradient with respect to
+        a quaternion is that of the rotation matrix's polynomial, to be projected on its tangent space.
+
+        Raises:
+            RuntimeError: If there was no rollout with a gradient.
+        """
+        self._require_gradient()
+        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
+        return self._unpack(self._bar.to_numpy(), poses)
+
+    def material_gradient(self) -> np.ndarray:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the material.
+
+        Returns:
+            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3].
+
+        Raises:
+            RuntimeError: If the simulator was built without ``material_gradient=True``, or there was no
+                rollout with a gradient.
+        """
+        if not self._engine.material_gradient:
+            raise RuntimeError("build the simulator with material_gradient=True for this gradient")
+        self._require_gradient()
+        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
+        return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
 
     def measure(self) -> Measures:
         """Loss terms and soft IoU of the current state."""
@@ -460,6 +529,7 @@ class Simulator:
         self._bar.fill(0.0)
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
+        self._engine.material_bar.fill(0.0)
         for k in reversed(range(segments)):
             stop = min(steps, (k + 1) * length)
             if k < segments - 1:
@@ -538,6 +608,11 @@ class Simulator:
         if bad.size:
             when = f"after environment step {bad[0][0]}" if bad[0][0] else "at the start"
             raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, {when}")
+
+    def _require_gradient(self) -> None:
+        self._require_runtime()
+        if self._bar is None:
+            raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):

@@ -21,6 +21,7 @@ import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
+from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 
 __all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "MEASURES", "STATE", "WORK", "Storage"]
@@ -54,13 +55,15 @@ LANES = {"cpu": 8, "cuda": 32}
 class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime) -> None:
+    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, material_gradient: bool = False) -> None:
         """Allocate what forward simulation needs.
 
         Args:
             scenes: One per environment, alike in all but the per-environment data.
             runtime: The Taichi runtime in force.
+            material_gradient: Whether gradients include those with respect to the material.
         """
+        self.material_gradient = material_gradient
         first = scenes[0]
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
@@ -179,25 +182,17 @@ class Storage:
         self.momentum_bar = ti.Vector.field(4, real, shape=b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+        # Adjoints of mu, lambda and yield strain.
+        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.material_gradient else 1, 3))
+
+    def fill_material(self, scenes: Sequence[Scene]) -> None:
+        """Write material, floor friction and gravity of all environments."""
+        rows = [[*material_parameters(s), s.floor_friction, *s.gravity] for s in scenes]
+        self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
 
     def _fill_parameters(self, scenes: Sequence[Scene]) -> None:
         numpy_real = np.float32 if self.real == ti.f32 else np.float64
-        self.material.from_numpy(
-            np.array(
-                [
-                    [
-                        s.shear_modulus,
-                        s.lame_lambda,
-                        # An infinite yield stress would turn the unused branch into infinity times zero.
-                        min(s.yield_stress / (2.0 * s.shear_modulus), 1e30),
-                        s.floor_friction,
-                        *s.gravity,
-                    ]
-                    for s in scenes
-                ],
-                dtype=numpy_real,
-            )
-        )
+        self.fill_material(scenes)
         if self.manipulators == 0:
             return
 
