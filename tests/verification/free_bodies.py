@@ -7,6 +7,8 @@ An environment step is one substep.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from plab.scene import Body, Scene
@@ -32,6 +34,10 @@ TILTS = (0.5, 0.9, 1.1, 1.5)
 
 FLOOR_FRICTION = 0.4
 
+BAR_LENGTH = 0.5
+BAR_COUNTS = (4, EDGE)
+"""Particles across the bar: its vibration is one-dimensional, its section need not be resolved."""
+
 
 def lattice(center: np.ndarray, counts: tuple[int, int, int], grid: int) -> np.ndarray:
     """Particles two per cell and axis around a point, shape [particle, 3]."""
@@ -44,6 +50,28 @@ def scene(center: np.ndarray = CENTER, **changes: object) -> Scene:
     body = Body("box", tuple(center), (WIDTH,) * 3, EDGE**3)
     values = {"gravity": (0.0, 0.0, 0.0), "grid_size": GRID, "dt": DT, "substeps": 1, **changes}
     return Scene("free", (body,), (), **values)
+
+
+def bar(grid: int) -> tuple[Scene, np.ndarray]:
+    """A bar along x with Poisson ratio 0, which vibrates in one dimension, and its particles.
+
+    The time step is half the stability limit, so that refining the grid refines it, too.
+    """
+    counts = (round(2 * grid * BAR_LENGTH), *BAR_COUNTS)
+    size = tuple(c / (2 * grid) for c in counts)
+    scene = Scene(
+        "bar",
+        (Body("box", tuple(CENTER), size, math.prod(counts)),),
+        (),
+        youngs_modulus=(0.5 / GRID / DT) ** 2,
+        poisson_ratio=0.0,
+        yield_stress=math.inf,
+        gravity=(0.0, 0.0, 0.0),
+        grid_size=grid,
+        dt=DT * GRID / grid,
+        substeps=1,
+    )
+    return scene, lattice(CENTER, counts, grid)
 
 
 def scenes() -> dict[str, Scene]:
@@ -61,9 +89,14 @@ def scenes() -> dict[str, Scene]:
     return out
 
 
-SCENES = scenes()
+SCENES = {**scenes(), "bar": bar(GRID)[0]}
 NAMES = list(SCENES)
-START = np.stack([lattice(np.array(s.bodies[0].center), (EDGE,) * 3, GRID) for s in SCENES.values()])
+START = np.stack(
+    [
+        bar(GRID)[1] if name == "bar" else lattice(np.array(s.bodies[0].center), (EDGE,) * 3, GRID)
+        for name, s in SCENES.items()
+    ]
+)
 MASS = SCENES["elastic"].particle_mass
 
 

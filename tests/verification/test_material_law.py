@@ -49,7 +49,7 @@ def principal_law(scene: Scene, stretch: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def test_uniaxial_stretch_follows_the_closed_form_through_yield(free: Simulator) -> None:
-    """From half to one and a half the length: elastic, yielding, and where the series hand over to the SVD."""
+    """From half to one and a half of the length: elastic, yielding, by series and by singular values."""
     stretch = np.ones((COUNT, 3))
     stretch[:, 0] = np.linspace(0.5, 1.5, COUNT)
     new, tau = kirchhoff_stress(free, repeat(stretch[:, :, None] * np.eye(3)))
