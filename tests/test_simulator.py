@@ -142,6 +142,45 @@ def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
     assert np.isfinite(sim.rollout(actions()).gradient).all()
 
 
+def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> None:
+    want = sim.rollout(actions())
+    sim.reset()
+    start = sim.state()
+    broken = sim.state()
+    broken.v[1, 7, 0] = math.nan
+    sim.set_initial_state(broken)
+    with pytest.raises(SimulationError) as caught:
+        sim.rollout(actions())
+    assert list(caught.value.failures) == [1]
+    got = sim.rollout(actions(), strict=False)
+    assert got.failures == caught.value.failures
+    assert got.failures[1].startswith("environment step 1, substep 1: the state is not finite")
+    for name in ("step_terms", "step_iou", "gradient"):
+        np.testing.assert_array_equal(getattr(got, name)[[0, 2]], getattr(want, name)[[0, 2]])
+    sim.set_initial_state(start)
+    again = sim.rollout(actions())
+    assert not again.failures
+    np.testing.assert_array_equal(again.gradient, want.gradient)
+
+
+def test_each_environment_may_have_its_own_contact_model(sim: Simulator) -> None:
+    settings = (("soft", 666.0), ("hard", 666.0), ("soft", 200.0))
+    want = []
+    for model, softness in settings:
+        sim.set_contact(model, softness)
+        want.append(sim.rollout(actions()))
+    sim.set_contact(*zip(*settings, strict=True))
+    got = sim.rollout(actions())
+    for e, alone in enumerate(want):
+        np.testing.assert_array_equal(got.gradient[e], alone.gradient[e])
+        np.testing.assert_array_equal(got.step_terms[e], alone.step_terms[e])
+    assert not np.array_equal(want[0].gradient, want[1].gradient)
+    assert not np.array_equal(want[0].gradient, want[2].gradient)
+    with pytest.raises(ValueError, match="contact 'firm' is not one of soft, hard"):
+        sim.set_contact(["soft", "firm", "hard"])
+    sim.set_contact("soft")
+
+
 def test_memory_budget_is_named(sim: Simulator) -> None:
     sim.memory_mb, before = 1e-3, sim.memory_mb
     with pytest.raises(MemoryError, match=r"set sim.memory_mb=\d+ or more"):

@@ -85,6 +85,8 @@ class CpuEngine(Phases):
     :class:`plab.sim.cuda_engine.CudaEngine` has the same.
     """
 
+    sorts = False
+
     def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
         super().__init__(*args)

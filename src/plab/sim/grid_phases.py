@@ -44,9 +44,9 @@ class GridPhases(Storage):
         return (ti.cast(i, self.real) - 1.0) * self.dx
 
     @ti.func
-    def strength(self, d):
+    def strength(self, e, d):
         """Contact strength at distance d; 0 where contact is not applied."""
-        alpha = self.alpha[None]
+        alpha = self.alpha[e]
         s = d * 0.0
         if d <= 0.0:
             s = 1.0 + 0.0 * d
@@ -64,7 +64,7 @@ class GridPhases(Storage):
         """
         mask = 0
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
-        alpha = self.alpha[None]
+        alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
         if alpha > 0.0:
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
@@ -105,7 +105,7 @@ class GridPhases(Storage):
         rotation = self.frame_rotation[e, s, m]
         p = rotation.transpose() @ (x - self.frame_centre[e, s, m])
         d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-        strength = self.strength(d)
+        strength = self.strength(e, d)
         if strength > 0.0:
             normal = rotation @ n_local
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
@@ -127,7 +127,7 @@ class GridPhases(Storage):
         p = rotation.transpose() @ offset
         gap = self.frame_gap[e, s, m]
         d, n_local = signed_distance(shape, p, self.size[e, m], gap)
-        strength = self.strength(d)
+        strength = self.strength(e, d)
         if strength > 0.0:
             normal = rotation @ n_local
             r = v - self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
@@ -150,7 +150,7 @@ class GridPhases(Storage):
                 normal_bar = rn_bar * r - rn * t0_bar
                 d_bar = 0.0 * d
                 if d > 0.0:
-                    d_bar = -self.alpha[None] * strength * bar.dot(t - r)
+                    d_bar = -self.alpha[e] * strength * bar.dot(t - r)
                 self.frame_adjoint(
                     shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar
                 )

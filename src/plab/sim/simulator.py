@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import taichi as ti
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
-from plab.sim.order import curve_order
+from plab.sim.order import ParticleOrder
 from plab.sim.parameters import parameter_gradient
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.storage import MEASURES, STATE
@@ -67,6 +67,8 @@ class Rollout:
         step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
             [batch, T, action], or None if it was not asked for.
+        failures: Environments whose state, loss or gradient stopped being finite, and when and why; their
+            numbers mean nothing, those of the others are what they would be without them.
     """
 
     initial_terms: np.ndarray
@@ -74,6 +76,7 @@ class Rollout:
     initial_iou: np.ndarray
     step_iou: np.ndarray
     gradient: np.ndarray | None
+    failures: dict[int, str] = field(default_factory=dict)
 
 
 class Simulator:
@@ -93,7 +96,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
-        material_gradient: bool = False,
+        full_gradient: bool = False,
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -105,8 +108,8 @@ class Simulator:
                 stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
-            material_gradient: Whether gradients include :meth:`material_gradient`, which costs a few percent
-                of the backward pass.
+            full_gradient: Whether a rollout's gradient includes those with respect to the initial state
+                (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -120,21 +123,24 @@ class Simulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._engine = _engine_class(device)(self.scenes, self._runtime, material_gradient)
+        self._engine = _engine_class(device)(self.scenes, self._runtime, full_gradient)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
         self._history: ti.Ndarray | None = None
         self._checkpoints: ti.Ndarray | None = None
         self._bar: ti.Ndarray | None = None
+        self._spare_bar: ti.Ndarray | None = None
         self._current = self._state_array(1)
+        # Where the current state goes when its particles are put into another order.
+        self._spare = self._state_array(1) if self._engine.sorts else None
         self._initial = self._state_array(1)
         self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
-        self._observed: dict[int, tuple[ti.Ndarray, ti.Ndarray]] = {}
+        self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._order = np.stack([curve_order(x, scenes[0].grid_size) for x in positions])
+        self._order = ParticleOrder(self._engine, positions)
         self._initial_poses = np.array(
             [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
             dtype=np.float64,
@@ -188,18 +194,22 @@ class Simulator:
 
     # -- settings -----------------------------------------------------------------------------------
 
-    def set_contact(self, model: str, softness: float = 666.0) -> None:
+    def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
         """Choose the contact model; nothing is compiled anew.
 
         Args:
-            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``.
-            softness: Decay rate of the soft model [1 / domain unit].
+            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one for all
+                environments, or one for each.
+            softness: Decay rate of the soft model [1 / domain unit]; one for all, or one for each.
         """
-        if model not in CONTACT_MODELS:
-            raise ValueError(f"contact '{model}' is not one of {', '.join(CONTACT_MODELS)}")
-        if model == "soft" and not softness > 0:
-            raise ValueError(f"softness {softness:g} must be positive")
-        self._engine.alpha[None] = softness if model == "soft" else 0.0
+        models = np.broadcast_to(model, self.batch)
+        decay = np.broadcast_to(np.asarray(softness, float), self.batch)
+        for name, rate in zip(models, decay, strict=True):
+            if name not in CONTACT_MODELS:
+                raise ValueError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
+            if name == "soft" and not rate > 0:
+                raise ValueError(f"softness {rate:g} must be positive")
+        self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
         """Set the weights of the three loss terms in the trajectory loss and its gradient."""
@@ -267,6 +277,7 @@ class Simulator:
         """Put all environments into their initial states."""
         self._require_runtime()
         self._engine.copy_slot(self._initial, 0, self._current, 0)
+        self._order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
 
@@ -282,22 +293,24 @@ class Simulator:
         """
         self._require_runtime()
         array = self._action_array(np.asarray(actions, np.float64)[:, None])
+        self._sort_current()
         self._engine.step(self._current, self._pose, array, 0, 0, 0, 0, 0, self._take_stamps(self.substeps))
-        self._check_fault()
+        _require_none(self._faults())
 
-    def rollout(self, actions: np.ndarray, gradient: bool = True) -> Rollout:
+    def rollout(self, actions: np.ndarray, gradient: bool = True, *, strict: bool = True) -> Rollout:
         """Run environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
             actions: Actions, shape [batch, T, action]; clipped to [-1, 1].
             gradient: Whether to compute the gradient.
+            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
 
         Returns:
             Loss terms per step and the gradient; the simulator is left in the final state.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            SimulationError: If state, loss or gradient stop being finite.
+            SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         self.reset()
@@ -310,15 +323,21 @@ class Simulator:
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
         self._losses(self._current, 0, terms, 0)
-        self._run_forward(array, poses, terms, steps, plan)
+        moves = self._run_forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
-        self._check_fault()
-        self._check_terms(values)
-        actions_bar = self._run_backward(array, poses, steps, plan) if plan is not None else None
+        failures = _bad_terms(values) | self._faults()
+        if strict:
+            _require_none(failures)
+        actions_bar = None
+        if plan is not None:
+            actions_bar = self._run_backward(array, poses, steps, plan, moves)
+            failures = _bad_gradients(actions_bar) | failures
+            if strict:
+                _require_none(failures)
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
-        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar)
+        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
     def state_gradient(self) -> State:
         """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
@@ -327,11 +346,12 @@ class Simulator:
         a quaternion is that of the rotation matrix's polynomial, to be projected on its tangent space.
 
         Raises:
-            RuntimeError: If there was no rollout with a gradient.
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no rollout
+                with a gradient.
         """
         self._require_gradient()
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
-        return self._unpack(self._bar.to_numpy(), poses)
+        return self._unpack(self._bar.to_numpy(), poses, self._order.initial)
 
     def material_gradient(self) -> np.ndarray:
         """Gradient of the last :meth:`rollout`'s loss with respect to the material.
@@ -340,11 +360,9 @@ class Simulator:
             Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3].
 
         Raises:
-            RuntimeError: If the simulator was built without ``material_gradient=True``, or there was no
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
                 rollout with a gradient.
         """
-        if not self._engine.material_gradient:
-            raise RuntimeError("build the simulator with material_gradient=True for this gradient")
         self._require_gradient()
         bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
         return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
@@ -373,7 +391,7 @@ class Simulator:
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
         poses = self.poses()
-        return self._unpack(self._current.to_numpy(), poses)
+        return self._unpack(self._current.to_numpy(), poses, self._order.current())
 
     def observe(self, stride: int) -> np.ndarray:
         """Position and velocity of every ``stride``-th particle, in the order in which they were given.
@@ -387,11 +405,11 @@ class Simulator:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
         """
         self._require_runtime()
+        count = -(-self.particle_count // stride)
         if stride not in self._observed:
-            self._observed[stride] = self._allocate_observation(stride)
-        places, out = self._observed[stride]
-        count = places.shape[0] // self.batch
-        self._engine.observe(self._current, places, count, out)
+            self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
+        out = self._observed[stride]
+        self._engine.observe(self._current, self._order.numbers, stride, out)
         return out.to_numpy().reshape(self.batch, count, 6)
 
     def poses(self) -> np.ndarray:
@@ -418,6 +436,7 @@ class Simulator:
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
         self._current.from_numpy(self._pack(state))
+        self._order.reset()
         self._place(np.asarray(state.poses, np.float64))
         self._engine.fault.fill(0)
 
@@ -441,13 +460,6 @@ class Simulator:
             iou = both / (total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
 
-    def _allocate_observation(self, stride: int) -> tuple[ti.Ndarray, ti.Ndarray]:
-        """Places of the observed particles in the tiles' order, and room for what is observed of them."""
-        where = np.argsort(self._order, axis=1)[:, ::stride]
-        places = ti.ndarray(ti.i32, shape=where.size)
-        places.from_numpy(where.astype(np.int32).reshape(-1))
-        return places, ti.ndarray(self._runtime.real, shape=where.size * 6)
-
     def _state_array(self, slots: int) -> ti.Ndarray:
         engine = self._engine
         return ti.ndarray(engine.lane_type, shape=slots * self.batch * engine.tiles * STATE)
@@ -460,17 +472,19 @@ class Simulator:
         """Environment steps per segment whose every state is kept, so that all fits into the memory
         budget."""
         budget = self.memory_mb * 1e6
+        moved = 4 * steps * self._order.places if self._engine.sorts else 0
 
         def cost(length: int) -> int:
             segments = -(-steps // length)
-            return (length * self.substeps + 2 + (segments if segments > 1 else 0)) * self._slot_bytes()
+            slots = length * self._slots_per_step + 2 + (segments if segments > 1 else 0)
+            return (slots + (1 if self._engine.sorts else 0)) * self._slot_bytes() + moved
 
         # Taichi counts the entries of an array in 32 bits.
         slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
         fitting = [
             length
             for length in range(1, steps + 1)
-            if cost(length) <= budget and max(length * self.substeps + 1, -(-steps // length)) <= slots
+            if cost(length) <= budget and max(length * self._slots_per_step + 1, -(-steps // length)) <= slots
         ]
         if not fitting:
             need = min(cost(length) for length in range(1, steps + 1)) / 1e6
@@ -485,7 +499,7 @@ class Simulator:
 
     def _allocate_gradient(self, length: int, segments: int) -> None:
         self._engine.allocate_adjoint()
-        slots = length * self.substeps + 1
+        slots = length * self._slots_per_step + 1
         size = slots * self._current.shape[0]
         if self._history is None or self._history.shape[0] < size:
             self._history = None
@@ -496,15 +510,47 @@ class Simulator:
             self._checkpoints = self._state_array(segments)
         if self._bar is None:
             self._bar = self._state_array(1)
+            self._spare_bar = self._state_array(1) if self._engine.sorts else None
 
-    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> None:
+    @property
+    def _slots_per_step(self) -> int:
+        """Time slots of an environment step in the history. Where particles are put into another order, a
+        step's start is kept in its own order and in that of the step before."""
+        return self.substeps + (1 if self._engine.sorts else 0)
+
+    def _sort_current(self, t: int = 0, moves: ti.Ndarray | None = None) -> None:
+        """Put the particles of the current state into the order of their cells, where that pays."""
+        if self._engine.sorts:
+            moves = self._order.find(self._current, 0, t, self._take_stamps(1), moves)
+            self._engine.move(self._current, 0, self._spare, 0, moves, t)
+            self._current, self._spare = self._spare, self._current
+
+    def _enter_step(self, t: int, slot: int, moves: ti.Ndarray | None, *, known: bool) -> None:
+        """Fill the history's slot in which step t starts from the one before it, in the step's own order.
+
+        Args:
+            t: Environment step.
+            slot: The step's first slot.
+            moves: The orders of all steps.
+            known: Whether the step's order is in ``moves`` already.
+        """
+        if self._engine.sorts:
+            if not known:
+                self._order.find(self._history, slot - 1, t, self._take_stamps(1), moves)
+            self._engine.move(self._history, slot - 1, self._history, slot, moves, t)
+
+    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> ti.Ndarray | None:
+        """Run all steps and keep what the gradient needs; returns the orders of all steps if they change."""
         if length is None:
             for t in range(steps):
+                self._sort_current()
                 self._advance(self._current, 0, 0, t, actions, poses)
                 self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-            return
+            return None
         segments = -(-steps // length)
         self._allocate_gradient(length, segments)
+        moves = self._order.allocate(steps) if self._engine.sorts else None
+        first = 1 if self._engine.sorts else 0
         for k in range(segments):
             if segments > 1:
                 self._engine.copy_slot(self._current, 0, self._checkpoints, k)
@@ -513,16 +559,19 @@ class Simulator:
                 self._engine.copy_slot(self._current, 0, self._history, 0)
             for t in range(k * length, min(steps, (k + 1) * length)):
                 if last:
-                    slot = (t - k * length) * self.substeps
+                    slot = first + (t - k * length) * self._slots_per_step
+                    self._enter_step(t, slot, moves, known=False)
                     self._advance(self._history, slot, 1, t, actions, poses)
                     self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * MEASURES)
                 else:
+                    self._sort_current(t, moves)
                     self._advance(self._current, 0, 0, t, actions, poses)
                     self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-        end = (steps - (segments - 1) * length) * self.substeps
+        end = (steps - (segments - 1) * length) * self._slots_per_step
         self._engine.copy_slot(self._history, end, self._current, 0)
+        return moves
 
-    def _run_backward(self, actions, poses, steps: int, length: int) -> np.ndarray:
+    def _run_backward(self, actions, poses, steps: int, length: int, moves: ti.Ndarray | None) -> np.ndarray:
         segments = -(-steps // length)
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
         actions_bar.fill(0.0)
@@ -530,14 +579,16 @@ class Simulator:
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
         self._engine.material_bar.fill(0.0)
+        first = 1 if self._engine.sorts else 0
         for k in reversed(range(segments)):
             stop = min(steps, (k + 1) * length)
             if k < segments - 1:
                 self._engine.copy_slot(self._checkpoints, k, self._history, 0)
                 for t in range(k * length, stop):
-                    self._advance(self._history, (t - k * length) * self.substeps, 1, t, actions, poses)
+                    slot = first + (t - k * length) * self._slots_per_step
+                    self._enter_step(t, slot, moves, known=True)
+                    self._advance(self._history, slot, 1, t, actions, poses)
             for t in reversed(range(k * length, stop)):
-                slot = (t - k * length) * self.substeps
                 self._engine.step_adjoint(
                     self._history,
                     self._bar,
@@ -545,19 +596,15 @@ class Simulator:
                     actions,
                     actions_bar,
                     self._scratch_terms,
-                    slot,
+                    first + (t - k * length) * self._slots_per_step,
                     t,
                     self._take_stamps(self.substeps + 1),
                 )
+                if self._engine.sorts:
+                    self._engine.move_back(self._bar, self._spare_bar, moves, t)
+                    self._bar, self._spare_bar = self._spare_bar, self._bar
         gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
-        gradient = gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
-        for t in reversed(range(steps)):
-            bad = np.flatnonzero(~np.isfinite(gradient[:, t]).all(axis=1))
-            if bad.size:
-                raise SimulationError(
-                    f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}"
-                )
-        return gradient
+        return gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
 
     def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
         self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
@@ -592,25 +639,22 @@ class Simulator:
             array.from_numpy(flat)
         return array
 
-    def _check_fault(self) -> None:
-        faults = self._engine.fault.to_numpy()
-        bad = np.flatnonzero(faults)
-        if bad.size:
-            step, substep = divmod(int(faults[bad[0]]) - 1, self.substeps)
-            raise SimulationError(
-                f"the state is not finite or a particle crosses the domain in one substep: "
-                f"environment {bad[0]}, "
-                f"environment step {step + 1}, substep {substep + 1}"
-            )
-
-    def _check_terms(self, terms: np.ndarray) -> None:
-        bad = np.argwhere(~np.isfinite(terms))
-        if bad.size:
-            when = f"after environment step {bad[0][0]}" if bad[0][0] else "at the start"
-            raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, {when}")
+    def _faults(self) -> dict[int, str]:
+        """Environments whose state is broken, and since when."""
+        faults, what = (
+            self._engine.fault.to_numpy(),
+            "the state is not finite or a particle crosses the domain",
+        )
+        failures = {}
+        for e in np.flatnonzero(faults):
+            step, substep = divmod(int(faults[e]) - 1, self.substeps)
+            failures[int(e)] = f"environment step {step + 1}, substep {substep + 1}: {what} in one substep"
+        return failures
 
     def _require_gradient(self) -> None:
         self._require_runtime()
+        if not self._engine.full_gradient:
+            raise RuntimeError("build the simulator with full_gradient=True for this gradient")
         if self._bar is None:
             raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
 
@@ -630,11 +674,12 @@ class Simulator:
         flat[:, :, [15, 19, 23]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self._order[:, :, None], axis=1)
+        flat[:, :n] = np.take_along_axis(values, self._order.initial[:, :, None], axis=1)
         tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
-    def _unpack(self, tiles: np.ndarray, poses: np.ndarray) -> State:
+    def _unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray) -> State:
+        """Tiles in an order of the particles to user arrays."""
         engine = self._engine
         b, n = self.batch, self.particle_count
         flat = (
@@ -643,7 +688,7 @@ class Simulator:
             .reshape(b, -1, STATE)[:, :n]
         )
         values = np.empty((b, n, STATE))
-        np.put_along_axis(values, self._order[:, :, None], flat.astype(np.float64), axis=1)
+        np.put_along_axis(values, order[:, :, None], flat.astype(np.float64), axis=1)
         shape = (b, n, 3, 3)
         return State(
             values[..., 0:3],
@@ -652,6 +697,31 @@ class Simulator:
             values[..., 15:24].reshape(shape),
             poses,
         )
+
+
+def _bad_terms(values: np.ndarray) -> dict[int, str]:
+    """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
+    5]."""
+    broken = ~np.isfinite(values).all(axis=2)
+    first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
+    when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
+    return {e: f"{text}: the loss is not finite" for e, text in when.items()}
+
+
+def _bad_gradients(gradient: np.ndarray) -> dict[int, str]:
+    """Environments with a gradient that is not finite, and since which step, going backwards; gradient of
+    shape [batch, T, action]."""
+    broken = ~np.isfinite(gradient).all(axis=2)
+    last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
+    return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
+
+
+def _require_none(failures: Mapping[int, str]) -> None:
+    """Raise SimulationError if an environment has broken off; the first is named."""
+    if failures:
+        first = min(failures)
+        more = f" (and {len(failures) - 1} more environments)" if len(failures) > 1 else ""
+        raise SimulationError(f"environment {first}, {failures[first]}{more}", failures)
 
 
 def _engine_class(device: str) -> type:

@@ -55,15 +55,15 @@ LANES = {"cpu": 8, "cuda": 32}
 class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, material_gradient: bool = False) -> None:
+    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, full_gradient: bool = False) -> None:
         """Allocate what forward simulation needs.
 
         Args:
             scenes: One per environment, alike in all but the per-environment data.
             runtime: The Taichi runtime in force.
-            material_gradient: Whether gradients include those with respect to the material.
+            full_gradient: Whether gradients include those with respect to initial state and material.
         """
-        self.material_gradient = material_gradient
+        self.full_gradient = full_gradient
         first = scenes[0]
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
@@ -129,7 +129,8 @@ class Storage:
         self.low = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.high = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.minimal_gap = ti.field(ti.f64, shape=(b, m))
-        self.alpha = ti.field(real, shape=())
+        # Decay rate of the soft contact model; 0 is the hard one.
+        self.alpha = ti.field(real, shape=b)
         self.loss_weights = ti.Vector.field(3, real, shape=())
         # Poses of one environment step, and what contact needs of them.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
@@ -144,7 +145,7 @@ class Storage:
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
-        self.velocity = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.velocity = self.gathered_grid(b * self.nodes)
         self._allocate_blocks(grids)
         self.target = ti.field(real, shape=b * self.n**3)
         self.target_sdf = ti.field(real, shape=b * self.n**3)
@@ -156,6 +157,10 @@ class Storage:
         self.once = ti.field(ti.i32, shape=())
         self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
+
+    def gathered_grid(self, nodes: int) -> ti.Field:
+        """Allocate a grid of 4-vectors that particles gather from."""
+        return ti.Vector.field(4, self.real, shape=nodes)
 
     def _allocate_blocks(self, grids: int) -> None:
         b = self.batch
@@ -179,11 +184,11 @@ class Storage:
             return
         real, b, m = self.real, self.batch, max(1, self.manipulators)
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
-        self.momentum_bar = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
         # Adjoints of mu, lambda and yield strain.
-        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.material_gradient else 1, 3))
+        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""
