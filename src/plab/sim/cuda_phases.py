@@ -15,6 +15,7 @@ from plab.sim.material import (
     flow_adjoint,
     hencky_strain,
     log_adjoint,
+    parameter_adjoint,
     strain_adjoint,
     stress,
     stress_adjoint,
@@ -270,13 +271,16 @@ class CudaPhases(OrderPhases, PosePhases):
                     d_bar[i] += d_flow[i]
                 for i in ti.static(range(9)):
                     g_bar[i] = g_flow[i]
+            if ti.static(self.full_gradient):
+                mu_bar, lam_bar, yield_bar = parameter_adjoint(d, j, c2, tau_bar, k_bar, p[2], self.series)
+                self.accumulate_material(e, mu_bar, lam_bar, yield_bar)
             z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
             c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
             for i in ti.static(range(9)):
                 bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
                 bar[target + 15 + i][lane] = f_out[i]
         else:
-            self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e)
+            self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     # -- grid ---------------------------------------------------------------------------------------
 

@@ -9,14 +9,19 @@ from plab.sim.material import (
     flow_adjoint,
     hencky_strain,
     log_adjoint,
+    parameter_adjoint,
     strain_adjoint,
     stress,
     stress_adjoint,
     trial_gradient,
     yield_factor,
 )
-from plab.sim.spectral import spectral_return_map, spectral_return_map_adjoint
-from plab.sim.storage import BLOCK, BLOCK_BITS, STATE, Storage
+from plab.sim.spectral import (
+    spectral_parameter_adjoint,
+    spectral_return_map,
+    spectral_return_map_adjoint,
+)
+from plab.sim.storage import BLOCK, BLOCK_BITS, STAGE, STATE, Storage
 from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
 
 __all__ = ["ParticlePhases"]
@@ -224,11 +229,13 @@ class ParticlePhases(Storage):
             else:
                 for i in ti.static(range(9)):
                     self.stage[at + STAGE_G_BAR + i] = bar[target + 15 + i]
+            if ti.static(self.full_gradient):
+                self.parameter_tile_adjoint(entry9, p[2], at)
             self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
         else:
             for lane in range(self.lanes):
                 a_bar = self.load(self.affine, entry9, lane, 9)
-                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e)
+                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, at // STAGE)
 
     @ti.func
     def strain_tile(self, state: ti.template(), source, at):
@@ -289,6 +296,31 @@ class ParticlePhases(Storage):
             self.stage[at + STAGE_G_BAR + i] = g_bar[i]
 
     @ti.func
+    def parameter_tile_adjoint(self, entry9, yield_strain, at):
+        """Add a tile's adjoints of the material's parameters, from ``stage``."""
+        mu_bar, lam_bar, yield_bar = parameter_adjoint(
+            [self.stage[at + STAGE_D + i] for i in range(6)],
+            self.stage[at + STAGE_SCALARS],
+            self.stage[at + STAGE_SCALARS + 1],
+            self.stress_symmetric([self.affine[entry9 + i] for i in range(9)]),
+            self.stage[at + STAGE_BARS],
+            yield_strain,
+            self.series,
+        )
+        self.accumulate_material(at // STAGE, mu_bar.sum(), lam_bar.sum(), yield_bar.sum())
+
+    @ti.func
+    def accumulate_material(self, grid_index, mu_bar, lam_bar, yield_bar):
+        """Add to the material's adjoint: plainly where one thread owns it, atomically on CUDA."""
+        bars = (mu_bar, lam_bar, yield_bar)
+        for i in ti.static(range(3)):
+            wide = ti.cast(bars[i], ti.f64)
+            if ti.static(self.cuda):
+                ti.atomic_add(self.material_bar[grid_index, i], wide)
+            else:
+                self.material_bar[grid_index, i] = self.material_bar[grid_index, i] + wide
+
+    @ti.func
     def strain_tile_adjoint(
         self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at
     ):
@@ -329,7 +361,15 @@ class ParticlePhases(Storage):
 
     @ti.func
     def spectral_material_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, a_bar9: ti.template(), lane, e
+        self,
+        state: ti.template(),
+        source,
+        bar: ti.template(),
+        target,
+        a_bar9: ti.template(),
+        lane,
+        e,
+        grid_index,
     ):
         """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
         p = self.material[e]
@@ -339,7 +379,11 @@ class ParticlePhases(Storage):
         a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
-        g_bar = spectral_return_map_adjoint(f + self.dt * (c @ f), f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
+        g = f + self.dt * (c @ f)
+        g_bar = spectral_return_map_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
+        if ti.static(self.full_gradient):
+            mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
+            self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
         c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
         f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
         for i in ti.static(range(9)):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
 from plab.sim.memory import ENTRIES_MAX, kept_states
 from plab.sim.order import ParticleOrder
+from plab.sim.parameters import parameter_gradient
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.skips import Skips
 from plab.sim.storage import MEASURES, STATE
@@ -97,6 +100,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
+        full_gradient: bool = False,
         skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
@@ -109,6 +113,8 @@ class Simulator:
                 stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            full_gradient: Whether a rollout's gradient includes those with respect to the initial state
+                (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
             skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
@@ -124,7 +130,7 @@ class Simulator:
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
         self._skips = skips
-        self._engine = _engine_class(device)(self.scenes, self._runtime, skips)
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._stamp = 0
@@ -219,6 +225,45 @@ class Simulator:
         """
         self._engine.loss_weights[None] = [density, sdf, contact]
 
+    def set_material(
+        self,
+        youngs_modulus: ArrayLike | None = None,
+        poisson_ratio: ArrayLike | None = None,
+        yield_stress: ArrayLike | None = None,
+    ) -> None:
+        """Change the material; nothing is compiled anew.
+
+        Args:
+            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None.
+            poisson_ratio: Poisson ratio, likewise.
+            yield_stress: von Mises yield stress, likewise.
+
+        Raises:
+            SceneError: If a scene could not be simulated with it; nothing is changed then.
+        """
+        given = {
+            "youngs_modulus": youngs_modulus,
+            "poisson_ratio": poisson_ratio,
+            "yield_stress": yield_stress,
+        }
+        values = {
+            name: np.broadcast_to(np.asarray(value, float), self.batch).tolist()
+            for name, value in given.items()
+            if value is not None
+        }
+        scenes = tuple(
+            replace(scene, **{name: column[e] for name, column in values.items()})
+            for e, scene in enumerate(self.scenes)
+        )
+        for scene in scenes:
+            scene.validate()
+            if math.isfinite(scene.yield_stress) and not self._engine.series.plastic:
+                raise SceneError(
+                    "this simulator was built for infinite yield stress only: build one with a finite one"
+                )
+        self.scenes = scenes
+        self._engine.fill_material(scenes)
+
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Set the targets of all environments.
 
@@ -309,6 +354,34 @@ class Simulator:
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
+    def state_gradient(self) -> State:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
+
+        The backward pass ends with it; asking for it copies it from the device. The gradient with respect to
+        a quaternion is that of the rotation matrix's polynomial, to be projected on its tangent space.
+
+        Raises:
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no rollout
+                with a gradient.
+        """
+        self._require_gradient()
+        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
+        return self._unpack(self._bar.to_numpy(), poses, self._order.initial)
+
+    def material_gradient(self) -> np.ndarray:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the material.
+
+        Returns:
+            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3].
+
+        Raises:
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
+                rollout with a gradient.
+        """
+        self._require_gradient()
+        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
+        return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
+
     def measure(self) -> Measures:
         """Loss terms and soft IoU of the current state."""
         self._require_runtime()
@@ -333,7 +406,7 @@ class Simulator:
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
         poses = self.poses()
-        return self._unpack(self._current.to_numpy(), poses)
+        return self._unpack(self._current.to_numpy(), poses, self._order.current())
 
     def observe(self, stride: int) -> np.ndarray:
         """Position and velocity of every ``stride``-th particle, in the order in which they were given.
@@ -518,6 +591,7 @@ class Simulator:
         self._bar.fill(0.0)
         self._engine.pose_bar.fill(0.0)
         self._engine.frame_bar.fill(0.0)
+        self._engine.material_bar.fill(0.0)
         first = 1 if self._engine.sorts else 0
         contact_free = self._steps_before_contact(steps)
         for k in reversed(range(segments)):
@@ -549,7 +623,7 @@ class Simulator:
 
     def _steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done before a manipulator touches any environment's body."""
-        if not self._skips.adjoints:
+        if self._engine.full_gradient or not self._skips.adjoints:
             return 0
         touched = self._engine.touched.to_numpy() != 0
         return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
@@ -599,6 +673,13 @@ class Simulator:
             failures[int(e)] = f"environment step {step + 1}, substep {substep + 1}: {what} in one substep"
         return failures
 
+    def _require_gradient(self) -> None:
+        self._require_runtime()
+        if not self._engine.full_gradient:
+            raise RuntimeError("build the simulator with full_gradient=True for this gradient")
+        if self._bar is None:
+            raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
+
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
             raise RuntimeError(
@@ -619,7 +700,8 @@ class Simulator:
         tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
-    def _unpack(self, tiles: np.ndarray, poses: np.ndarray) -> State:
+    def _unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray) -> State:
+        """Tiles in an order of the particles to user arrays."""
         engine = self._engine
         b, n = self.batch, self.particle_count
         flat = (
@@ -628,7 +710,7 @@ class Simulator:
             .reshape(b, -1, STATE)[:, :n]
         )
         values = np.empty((b, n, STATE))
-        np.put_along_axis(values, self._order.current()[:, :, None], flat.astype(np.float64), axis=1)
+        np.put_along_axis(values, order[:, :, None], flat.astype(np.float64), axis=1)
         shape = (b, n, 3, 3)
         return State(
             values[..., 0:3],

@@ -23,6 +23,7 @@ import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
+from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.skips import Skips
 
@@ -57,14 +58,18 @@ LANES = {"cpu": 8, "cuda": 32}
 class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips, full_gradient: bool = False
+    ) -> None:
         """Allocate what forward simulation needs.
 
         Args:
             scenes: One per environment, alike in all but the per-environment data.
             runtime: The Taichi runtime in force.
             skips: What is not computed where it is not needed.
+            full_gradient: Whether gradients include those with respect to initial state and material.
         """
+        self.full_gradient = full_gradient
         first = scenes[0]
         self.skips = skips
         self.cuda = runtime.device == "cuda"
@@ -203,25 +208,17 @@ class Storage:
         self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+        # Adjoints of mu, lambda and yield strain.
+        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
+
+    def fill_material(self, scenes: Sequence[Scene]) -> None:
+        """Write material, floor friction and gravity of all environments."""
+        rows = [[*material_parameters(s), s.floor_friction, *s.gravity] for s in scenes]
+        self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
 
     def _fill_parameters(self, scenes: Sequence[Scene]) -> None:
         numpy_real = np.float32 if self.real == ti.f32 else np.float64
-        self.material.from_numpy(
-            np.array(
-                [
-                    [
-                        s.shear_modulus,
-                        s.lame_lambda,
-                        # An infinite yield stress would turn the unused branch into infinity times zero.
-                        min(s.yield_stress / (2.0 * s.shear_modulus), 1e30),
-                        s.floor_friction,
-                        *s.gravity,
-                    ]
-                    for s in scenes
-                ],
-                dtype=numpy_real,
-            )
-        )
+        self.fill_material(scenes)
         if self.manipulators == 0:
             return
 
