@@ -73,7 +73,8 @@ def test_configuration_keys_choose_among_the_results(folder: Path) -> None:
     assert counts(find(folder, "task=Rope"))["done"] == 3
     again = synthetic.config(folder, seed=0)
     again["sim"]["particles_scale"] = 0.5
-    lock = acquire(synthetic.save(dataclasses.replace(synthetic.run(folder), config=again, status="running")))
+    begun = dataclasses.replace(synthetic.synthetic_run(again, rows=synthetic.ROWS), status="running")
+    lock = acquire(synthetic.save(begun))
     found = find(folder, "task=Rope")
     assert (counts(found)["done"], found.others) == (3, 1)
     assert all(group.rate is None for group in found.groups)

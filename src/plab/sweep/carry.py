@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
 
+from plab import runners
 from plab.locks import held
 from plab.results import ResultsError, read, result_path
-from plab.runners import run_batch
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
 from plab.sweep.tally import Outcome
@@ -70,7 +70,7 @@ def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -
 def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
     """Carry out batches in this process, one after the other."""
     for batch in batches:
-        yield from run_batch(batch, progress())
+        yield from runners.run_batch(batch, progress())
 
 
 class BatchTask:
@@ -83,7 +83,7 @@ class BatchTask:
         """Carry out the batch of Hydra's job number; called in the job's process."""
         number = HydraConfig.get().job.num
         note = f"[batch {number + 1}/{len(self._batches)}] " if len(self._batches) > 1 else ""
-        return run_batch(self._batches[number], note)
+        return runners.run_batch(self._batches[number], note)
 
 
 def look_up(cfg: Config) -> Outcome:
