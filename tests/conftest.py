@@ -17,6 +17,13 @@ def device() -> str:
     return os.environ.get("PLAB_TEST_DEVICE", "cpu")
 
 
+@pytest.fixture(autouse=True)
+def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep indices of the tests' results out of the user's cache folder."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
+
+
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     """Collect the configurations that reach the runners, instead of running them."""
@@ -34,13 +41,6 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     monkeypatch.setattr("plab.runners.run_config", collect)
     monkeypatch.setattr("plab.runners.run_batch", collect_batch)
     return configs
-
-
-@pytest.fixture(autouse=True)
-def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep indices of the tests' results out of the user's cache folder."""
-    folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

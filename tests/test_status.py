@@ -71,6 +71,14 @@ def test_configuration_keys_choose_among_the_results(folder: Path) -> None:
     assert counts(find(folder, "sim.particles_scale=0.5", "task=Rope"))["done"] == 1
     assert counts(find(folder, "sim.particles_scale=1", "task=Rope"))["done"] == 2
     assert counts(find(folder, "task=Rope"))["done"] == 3
+    again = synthetic.config(folder, seed=0)
+    again["sim"]["particles_scale"] = 0.5
+    begun = dataclasses.replace(synthetic.synthetic_run(again, rows=synthetic.ROWS), status="running")
+    lock = acquire(synthetic.save(begun))
+    found = find(folder, "task=Rope")
+    assert (counts(found)["done"], found.others) == (3, 1)
+    assert all(group.rate is None for group in found.groups)
+    lock.release()
 
 
 def test_runs_outside_of_the_grid_are_counted_apart(folder: Path) -> None:

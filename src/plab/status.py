@@ -100,7 +100,7 @@ class Survey:
     Attributes:
         runs: Every one of them.
         groups: The same by task and method.
-        others: Number of further runs in the results, that are not asked for.
+        others: Number of further runs in the results: not asked for, or of other settings.
         unreadable: What could not be read.
     """
 
@@ -142,7 +142,8 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
     others = 0
     for row in fitting:
         run = runs.get(_key(row))
-        others += run is None
+        # Of several settings of the same run the best one counts.
+        others += run is None or run.state != "missing"
         if run is not None:
             _take(run, row)
     for run in _starting(Path(source), runs):
@@ -191,6 +192,7 @@ def _take(run: Run, row: Row) -> None:
     if STATES.index(state) >= STATES.index(run.state):
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
+    run.rate = run.left = None
     run.message = row.values["message"] if state == "failed" else ""
     total = lookup(row.config, "method.iterations")
     run.total = int(total if total == total else lookup(row.config, "method.episodes"))
@@ -323,7 +325,8 @@ def _show(found: Survey) -> None:
     if found.workers:
         console.print(f"all done in {duration(found.eta)}, with {found.workers} at a time", highlight=False)
     if found.others:
-        console.print(f"{found.others} further run(s) in the results are not among them", highlight=False)
+        text = "further run(s) in the results, of other names or other settings"
+        console.print(f"{found.others} {text}", highlight=False)
     for error in found.unreadable:
         console.print(f"left out: {error}", highlight=False)
 

@@ -1,9 +1,10 @@
 """Time to load thousands of result files, with and without the index, and from an archive.
 
     python -m plab.bench.results --runs 5000 --rows 5
+    python -m plab.bench.results --runs 1000 --archive
 
 writes so many small result files to a folder that is removed afterwards, and loads them: for the first time,
-again, after one of them has changed, and packed. The index goes to a folder of its own.
+again, after one of them has changed. The index goes to a folder of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import itertools
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +116,8 @@ def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
         yield config
 
 
-def _rows(runs: int, rows: int, folder: Path) -> Iterator[dict[str, object]]:
-    """Write the files and measure; yield a row per way to load them."""
+def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str, object]]:
+    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
     results = folder / "results"
     for config in _configs(runs, rows, results):
         path = result_path(config)
@@ -124,7 +125,7 @@ def _rows(runs: int, rows: int, folder: Path) -> Iterator[dict[str, object]]:
         write(synthetic_run(config, rows=rows), path, compress=False)
     time.sleep(SETTLE)
 
-    def timed(what: str, call: Callable[[], pd.DataFrame]) -> dict[str, object]:
+    def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:
         start = time.perf_counter()
         count = len(call())
         seconds = time.perf_counter() - start
@@ -141,8 +142,10 @@ def _rows(runs: int, rows: int, folder: Path) -> Iterator[dict[str, object]]:
     yield timed("with a key", lambda: load(results, keys=["method.family"]))
     yield timed("without index", lambda: load(results, index=False))
     yield timed("plab.status", lambda: survey(results, Selection()).runs)
+    if not packed:
+        return
     archive = folder / "all.plab.zip"
-    pack(results, archive)
+    yield timed("pack", lambda: range(pack(results, archive).runs))
     time.sleep(SETTLE)
     yield timed("archive", lambda: load(archive))
     yield timed("archive again", lambda: load(archive))
@@ -153,11 +156,12 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="plab.bench.results", description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=5000, help="number of result files")
     parser.add_argument("--rows", type=int, default=5, help="iterations of each")
+    parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
-        table = _rows(options.runs, options.rows, Path(folder))
+        table = _rows(options.runs, options.rows, Path(folder), options.archive)
         report(("what", "runs", "seconds", "times_faster"), table, options.csv)
 
 
