@@ -139,13 +139,8 @@ class Simulator:
         self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
-        positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._order = ParticleOrder(self._engine, positions)
-        self._initial_poses = np.array(
-            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
-            dtype=np.float64,
-        ).reshape(self.batch, self.manipulator_count, 8)
-        self._initial.from_numpy(self._pack(_rest_state(np.stack(positions), self._initial_poses)))
+        self._order = ParticleOrder(self._engine)
+        self._start_from(particles)
         self.set_contact("soft")
         self.set_loss_weights(10.0, 10.0, 1.0)
         self.reset()
@@ -214,6 +209,29 @@ class Simulator:
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
         """Set the weights of the three loss terms in the trajectory loss and its gradient."""
         self._engine.loss_weights[None] = [density, sdf, contact]
+
+    def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
+        """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
+
+        Contact model, weights and targets stay.
+
+        Args:
+            scenes: One scene per environment.
+            particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+        """
+        self._require_runtime()
+        if len(scenes) != self.batch:
+            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
+        for scene in scenes:
+            scene.validate()
+        _require_alike([self.scenes[0], *scenes])
+        self.scenes = tuple(scenes)
+        self._engine.fill_parameters(scenes)
+        self._start_from(particles)
+        self.reset()
 
     def set_material(
         self,
@@ -448,6 +466,16 @@ class Simulator:
         self._engine.copy_slot(self._current, 0, self._initial, 0)
 
     # -- internals ----------------------------------------------------------------------------------
+
+    def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
+        """Make the scenes' start the initial state."""
+        positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
+        self._order.start_from(positions)
+        self._initial_poses = np.array(
+            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in self.scenes],
+            dtype=np.float64,
+        ).reshape(self.batch, self.manipulator_count, 8)
+        self._initial.from_numpy(self._pack(_rest_state(np.stack(positions), self._initial_poses)))
 
     def _measures(self, values: np.ndarray) -> Measures:
         """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""

@@ -78,7 +78,7 @@ class Storage:
         self._set_threads(runtime.threads)
         self._set_manipulators(scenes)
         self._allocate()
-        self._fill_parameters(scenes)
+        self.fill_parameters(scenes)
 
     def _set_grid(self, scene: Scene) -> None:
         self.n = scene.grid_size
@@ -195,7 +195,8 @@ class Storage:
         rows = [[*material_parameters(s), s.floor_friction, *s.gravity] for s in scenes]
         self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
 
-    def _fill_parameters(self, scenes: Sequence[Scene]) -> None:
+    def fill_parameters(self, scenes: Sequence[Scene]) -> None:
+        """Write everything in which environments may differ, targets excepted."""
         numpy_real = np.float32 if self.real == ti.f32 else np.float64
         self.fill_material(scenes)
         if self.manipulators == 0:
