@@ -8,13 +8,14 @@ term of the loss is not, because the parked manipulators are far from everything
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
 
-__all__ = ["PLACES", "common_actions", "common_scene"]
+__all__ = ["PLACES", "common_actions", "common_scene", "own_components"]
 
 PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
 """Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""
@@ -30,51 +31,54 @@ PARKED_SIZES = {
 }
 
 
-def common_scene(scene: Scene, particles: int) -> Scene:
-    """Give a scene all of :data:`PLACES` and a number of particles.
+def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -> Scene:
+    """Give a scene all manipulators of a common kind of scene, and a number of particles.
 
     Args:
         scene: A scene with no more manipulators of a shape than there are places for.
         particles: Particles of all its bodies together, at least as many as there are bodies.
+        places: Shapes of the manipulators of the common kind.
 
     Raises:
         ValueError: If there are too many manipulators or too few particles.
     """
-    tools = [_parked(shape) for shape in PLACES]
-    for number, place in enumerate(_places(scene)):
+    tools = [_parked(shape) for shape in places]
+    for number, place in enumerate(_places(scene, places)):
         tools[place] = scene.manipulators[number]
     return replace(scene, manipulators=tuple(tools), bodies=_shared(scene.bodies, particles))
 
 
-def common_actions(scene: Scene, actions: np.ndarray) -> np.ndarray:
+def common_actions(scene: Scene, actions: np.ndarray, places: Sequence[str] = PLACES) -> np.ndarray:
     """Turn a scene's actions into those of its :func:`common_scene`.
 
     Args:
         scene: The scene.
         actions: Its actions, shape [..., A].
+        places: Shapes of the manipulators of the common kind.
 
     Returns:
         Actions of the common scene, 0 for parked manipulators, shape [..., A'].
     """
-    dims = [len(MANIPULATOR_SHAPES[shape].action_names) for shape in PLACES]
-    starts = np.cumsum([0, *dims])
-    out = np.zeros((*actions.shape[:-1], int(starts[-1])))
-    at = 0
-    for manipulator, place in zip(scene.manipulators, _places(scene), strict=True):
-        size = manipulator.action_dim
-        out[..., starts[place] : starts[place] + size] = actions[..., at : at + size]
-        at += size
+    out = np.zeros((*actions.shape[:-1], sum(len(MANIPULATOR_SHAPES[p].action_names) for p in places)))
+    out[..., own_components(scene, places)] = actions
     return out
 
 
-def _places(scene: Scene) -> list[int]:
+def own_components(scene: Scene, places: Sequence[str] = PLACES) -> list[int]:
+    """Where a scene's action components are among those of its :func:`common_scene`."""
+    dims = [len(MANIPULATOR_SHAPES[shape].action_names) for shape in places]
+    starts = [sum(dims[:place]) for place in range(len(places))]
+    return [starts[p] + i for p in _places(scene, places) for i in range(dims[p])]
+
+
+def _places(scene: Scene, places: Sequence[str]) -> list[int]:
     """Return the place of each of the scene's manipulators."""
-    free = list(range(len(PLACES)))
+    free = list(range(len(places)))
     taken = []
     for manipulator in scene.manipulators:
-        place = next((p for p in free if PLACES[p] == manipulator.shape), None)
+        place = next((p for p in free if places[p] == manipulator.shape), None)
         if place is None:
-            raise ValueError(f"{scene.name} has more manipulators of shape {manipulator.shape} than PLACES")
+            raise ValueError(f"{scene.name} has more manipulators of shape {manipulator.shape} than places")
         free.remove(place)
         taken.append(place)
     return taken
