@@ -9,13 +9,18 @@ from pathlib import Path
 __all__ = ["report"]
 
 
-def report(columns: Sequence[str], rows: Iterable[Mapping[str, object]], path: Path | None) -> None:
+def report(
+    columns: Sequence[str], rows: Iterable[Mapping[str, object]], path: Path | None
+) -> list[Mapping[str, object]]:
     """Print a table and write it to a file if there is one.
 
     Args:
         columns: Names of the columns, in order.
         rows: A value for each column; each row is printed before the next is asked for.
         path: CSV file to write, or None.
+
+    Returns:
+        The rows.
     """
     print("  ".join(f"{name:>12s}" for name in columns), flush=True)
     table = []
@@ -27,3 +32,4 @@ def report(columns: Sequence[str], rows: Iterable[Mapping[str, object]], path: P
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             writer.writerows(table)
+    return table

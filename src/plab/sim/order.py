@@ -81,31 +81,38 @@ class ParticleOrder:
             particles are padding, shape [batch * place].
     """
 
-    def __init__(self, engine: CpuEngine, positions: Sequence[np.ndarray]) -> None:
-        """Start with the curve's order.
+    def __init__(self, engine: CpuEngine) -> None:
+        """Allocate; :meth:`start_from` comes next.
 
         Args:
             engine: The kernels that find and follow another order, where ``engine.sorts``.
-            positions: Initial positions of each environment [domain units], each [particle, 3].
         """
         self._engine = engine
+        self.numbers = self._array(1)
+        if engine.sorts:
+            engine.allocate_order()
+            self._spare = self._array(1)
+            self._moves = self.allocate(1)
+
+    def start_from(self, positions: Sequence[np.ndarray]) -> None:
+        """Start with the curve's order.
+
+        Args:
+            positions: Initial positions of each environment [domain units], each [particle, 3].
+        """
+        engine = self._engine
         self.initial = np.stack([curve_order(x, engine.n) for x in positions])
         batch, particles = self.initial.shape
         padding = np.arange(particles, engine.tiles * engine.lanes)
         rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)
         self._start = rows.astype(np.int32).reshape(-1)
-        self.numbers = self._array(1)
         self._changed = True
-        if engine.sorts:
-            engine.allocate_order()
-            self._spare = self._array(1)
-            self._moves = self.allocate(1)
         self.reset()
 
     @property
     def places(self) -> int:
         """Places in all environments, padding included."""
-        return self._start.size
+        return self._engine.batch * self._engine.tiles * self._engine.lanes
 
     def _array(self, steps: int) -> ti.Ndarray:
         return ti.ndarray(ti.i32, shape=steps * self.places)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,16 +28,15 @@ class Particles:
         order: Which particle is at which place.
     """
 
-    def __init__(self, engine: CpuEngine, positions: Sequence[np.ndarray], numpy_real: type) -> None:
-        """Allocate; the state is not set.
+    def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
+        """Allocate; neither state nor order is set.
 
         Args:
             engine: The kernels.
-            positions: Initial positions of each environment [domain units], each [particle, 3].
             numpy_real: NumPy's type of the simulation's numbers.
         """
         self.engine = engine
-        self.order = ParticleOrder(engine, positions)
+        self.order = ParticleOrder(engine)
         self.current = self.array(1)
         # Where the current state goes when its particles are put into another order.
         self._spare = self.array(1) if engine.sorts else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -85,15 +84,10 @@ class Simulator:
         self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
-        positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._particles = Particles(self._engine, positions, self._numpy_real)
+        self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
         self._initial = self._particles.array(1)
-        self._initial_poses = np.array(
-            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
-            dtype=np.float64,
-        ).reshape(self.batch, self.manipulator_count, 8)
-        self._initial.from_numpy(self._particles.pack(rest_state(np.stack(positions), self._initial_poses)))
+        self._start_from(particles)
         self.set_contact("soft")
         self.set_loss_weights(10.0, 10.0, 1.0)
         self.reset()
@@ -166,6 +160,30 @@ class Simulator:
         """
         self._engine.loss_weights[None] = [density, sdf, contact]
 
+    def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
+        """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
+
+        Contact model, weights and targets stay.
+
+        Args:
+            scenes: One scene per environment.
+            particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+        """
+        self._require_runtime()
+        if len(scenes) != self.batch:
+            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
+        for scene in scenes:
+            scene.validate()
+        _require_alike([self.scenes[0], *scenes])
+        self._engine.require_kept(scenes)
+        self.scenes = tuple(scenes)
+        self._engine.fill_parameters(scenes)
+        self._start_from(particles)
+        self.reset()
+
     def set_material(
         self,
         youngs_modulus: ArrayLike | None = None,
@@ -198,10 +216,7 @@ class Simulator:
         )
         for scene in scenes:
             scene.validate()
-            if math.isfinite(scene.yield_stress) and not self._engine.series.plastic:
-                raise SceneError(
-                    "this simulator was built for infinite yield stress only: build one with a finite one"
-                )
+        self._engine.require_kept(scenes)
         self.scenes = scenes
         self._engine.fill_material(scenes)
 
@@ -419,6 +434,17 @@ class Simulator:
         if on_device(like):
             return tensor_from(array, shape, like)
         return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
+
+    def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
+        """Make the scenes' start the initial state."""
+        positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
+        self._particles.order.start_from(positions)
+        self._initial_poses = np.array(
+            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in self.scenes],
+            dtype=np.float64,
+        ).reshape(self.batch, self.manipulator_count, 8)
+        start = rest_state(np.stack(positions), self._initial_poses)
+        self._initial.from_numpy(self._particles.pack(start))
 
     def _measures(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""
