@@ -301,8 +301,7 @@ def test_batch_size_must_be_positive(capsys) -> None:
 def test_full_size_batches_fit_the_memory(device: str) -> None:
     """What :class:`plab.sim.Simulator` will find, computed here without one."""
     from plab.config import build_scene
-    from plab.sim import batch_limit
-    from plab.sim.memory import kept_states
+    from plab.sim.memory import batch_limit, kept_states
 
     scene = build_scene(load_config(["task=Rope"]))
     limits = [batch_limit(scene, "float32", device, memory) for memory in (1.0, 4000.0, 8000.0, 40000.0)]

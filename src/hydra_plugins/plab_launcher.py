@@ -105,13 +105,15 @@ class BatchLauncher(Launcher):
             )
             # A job composes the configuration of its first run and then computes the whole batch.
             jobs = [overrides[str(result_path(batch[0]))] for batch in batches]
+            runs, name = sum(len(batch) for batch in batches), type(inner).__name__
+            print(f"{runs} runs go to {name} in {len(batches)} jobs", flush=True)
             try:
                 returns = inner.launch(jobs, initial_job_idx=0)
                 outcomes = [one for job in returns for one in job.return_value]
             except Exception as error:
                 # A job's process was killed, say, or the queue refused the jobs: the files know how far they
                 # came.
-                print(f"{type(inner).__name__}: {type(error).__name__}: {error}", flush=True)
+                print(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}", flush=True)
                 outcomes = [look_up(cfg) for batch in batches for cfg in batch]
             yield from outcomes
 

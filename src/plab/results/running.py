@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.locks import Lock, acquire
+from plab.locks import Lock, acquire, lock_path
 from plab.provenance import provenance, version_changes
 from plab.results.files import opened, read, write
 from plab.results.schema import (
@@ -65,21 +65,36 @@ class RunFile:
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
         _refuse_newer(self.path, self.partial_path)
-        if config["force"] or not self._is_finished():
-            _probe(self.path.parent)
-            self._lock_and_look(config["force"])
+        if not config["force"] and self._is_finished():
+            if lock_path(self.path).exists() or self.partial_path.exists():
+                self._clear_up()
+            return
+        _probe(self.path.parent)
+        self._lock_and_look(config["force"])
 
     def _lock_and_look(self, force: bool) -> None:
         """Take the run's lock, then see what there is: whoever had it before may have changed everything."""
         self._lock = acquire(self.path)
         if self._lock is None:
             raise RunBusyError(f"{self.path} is being computed by another process")
+        self._remove_temporary()
         if not force and not self._is_finished():
             self._take_up_earlier()
-        for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
-            leftover.unlink(missing_ok=True)
         if self.finished:
             self.release()
+
+    def _clear_up(self) -> None:
+        """Remove what a process left that was killed just after it had finished the run."""
+        lock = acquire(self.path)
+        # Otherwise somebody computes it again, by force.
+        if lock is not None:
+            self._remove_temporary()
+            self.partial_path.unlink(missing_ok=True)
+            lock.release(remove=True)
+
+    def _remove_temporary(self) -> None:
+        for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
+            leftover.unlink(missing_ok=True)
 
     @property
     def result(self) -> RunResult:

@@ -1,6 +1,5 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
-from plab.sim.memory import batch_limit
 from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
 from plab.sim.simulator import CONTACT_MODELS, Measures, Rollout, Simulator, State
 
@@ -14,5 +13,4 @@ __all__ = [
     "SimulationError",
     "Simulator",
     "State",
-    "batch_limit",
 ]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from hydra.core.hydra_config import HydraConfig
 
 from plab import runners
-from plab.locks import held
-from plab.results import ResultsError, read, result_path
+from plab.locks import held, lock_path
+from plab.results import ResultsError, RunFile, read, result_path
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
 from plab.sweep.tally import Outcome
@@ -104,8 +104,10 @@ def look_up(cfg: Config) -> Outcome:
 
 def _finished_before(cfg: Config) -> Outcome | None:
     """Return the outcome of a run whose result is there."""
+    path = result_path(cfg)
     try:
-        result = read(result_path(cfg))
+        # Where there is something left of a process that was killed, RunFile clears it up.
+        result = RunFile(cfg).result if path.exists() and lock_path(path).exists() else read(path)
     except ResultsError:
         return None
     if result.status != "finished":

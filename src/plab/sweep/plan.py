@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.problem import build_scenes
 from plab.runners import BATCHING
-from plab.sim import batch_limit
+from plab.sim.memory import batch_limit
 
 if TYPE_CHECKING:
     from plab.config import Config
