@@ -91,8 +91,8 @@ def load(
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
         best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
-        of the final evaluation, and ``keys``. ``score``, ``iou`` and ``loss`` are the final evaluation's, NaN
-        before it.
+        of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
+        ``score``, ``iou`` and ``loss`` are the final evaluation's, NaN before it.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
@@ -225,7 +225,7 @@ def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | Result
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, from its attributes alone."""
     config = json.loads(file.attrs["config"])
-    evaluation = attributes(file["evaluation"])
+    evaluation, phases = attributes(file["evaluation"]), attributes(file["wall_time"])
     table, best, origin = file["iterations"], file["best"].attrs, file["provenance"].attrs
     columns = [str(name) for name in table.attrs["columns"]]
     known = {
@@ -238,9 +238,10 @@ def _row(file: h5py.File, path: Path) -> Row:
         "iterations": table[columns[0]].shape[0] if columns else 0,
         "best_iteration": int(best["iteration"]),
         "best_loss": float(best["loss"]),
-        "seconds": float(sum(attributes(file["wall_time"]).values())),
+        "seconds": float(sum(phases.values())),
         "config_hash": file.attrs["config_hash"],
         "path": str(path),
     } | {name: origin.get(attribute, np.nan) for name, attribute in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
-    return Row(values | {name: value for name, value in evaluation.items() if name not in values}, config)
+    values |= {name: value for name, value in evaluation.items() if name not in values}
+    return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)
