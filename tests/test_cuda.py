@@ -74,8 +74,8 @@ def relative_error(got: np.ndarray, want: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("contact", "resident"), [("soft", True), ("hard", False)])
 def test_cuda_agrees_with_the_cpu(contact: str, resident: bool, monkeypatch) -> None:
-    # A step of many particles is many launches, after the particles were put into order; one of few is a single
-    # launch. These scenes have few.
+    # A step of many particles is many launches, after the particles were put into order; one of few is a
+    # single launch. These scenes have few.
     monkeypatch.setattr(cuda_engine, "RESIDENT_TURNS", 1000 if resident else 0)
     want = results("cpu", contact)
     got = results("cuda", contact)

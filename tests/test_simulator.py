@@ -52,7 +52,7 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints() -> None:
     base = simulator(SCENES, "cpu", threads=2)
     want = base.rollout(u)
     final = base.state()
-    slot_mb = base._slot_bytes() / 1e6
+    slot_mb = base._particles.slot_bytes / 1e6
     for settings, batch in (
         ({"threads": 1}, 3),
         ({"threads": 2}, 1),
@@ -139,7 +139,7 @@ def test_actions_are_clipped(sim: Simulator) -> None:
 
 def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
     sim.reset()
-    with pytest.raises(ValueError, match=r"actions have shape \(3, 1, 5\), not \(3, 1, 6\)"):
+    with pytest.raises(ValueError, match=r"actions have shape \(3, 5\), not \(3, 6\)"):
         sim.step(np.zeros((3, 5)))
     with pytest.raises(ValueError, match="NaN or infinity"):
         sim.step(np.full((3, 6), math.nan))

@@ -41,7 +41,7 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, actions: torch.Tensor, problem: Problem) -> torch.Tensor:
         wanted = ctx.needs_input_grad[0]
-        result = problem.rollout(actions.detach().cpu().double().numpy(), gradient=wanted)
+        result = problem.rollout(actions.detach().cpu().double().numpy(), gradient=wanted, exact=False)
         if wanted:
             ctx.save_for_backward(actions.new_tensor(result.gradient))
         return actions.new_tensor(result.loss.sum(axis=1))

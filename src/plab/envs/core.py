@@ -157,7 +157,7 @@ class EpisodeBatch:
         """Build everything; the episodes start at :meth:`reset`.
 
         Args:
-            cfgs: One configuration per sub-environment, alike in ``sim`` and ``method``.
+            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss weights.
             contact: Contact model, ``hard`` or ``soft``.
 
         Raises:
@@ -180,8 +180,8 @@ class EpisodeBatch:
         self.action_space = Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
-        self._simulator.set_contact(contact, softness=cfgs[0].method.softness)
-        self._judged = self.problem.scores(self.problem.initial_mass)
+        self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
+        self._judged = self.problem.initial_scores
         self._initial_info = self._info()
         self._initial_observation = self._observe()
 

@@ -64,7 +64,8 @@ class CudaEngine(CudaPhases):
     @property
     def resident(self) -> bool:
         """Whether a step is one launch."""
-        return self.particle_threads <= RESIDENT_TURNS * self.resident_threads
+        few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
+        return few and self.skips.launches
 
     @property
     def sorts(self) -> bool:
@@ -226,17 +227,19 @@ class CudaEngine(CudaPhases):
         slot: int,
         t: int,
         stamp: int,
+        contact: int,
     ) -> None:
         """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and its loss.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
-        likewise.
+        likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does not matter and
+        does not hold the adjoint.
         """
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
         self.losses_kernel(state, end, terms, 0, stamp)
         self.loss_gradient_kernel(state, end, bar)
-        for back in range(self.substeps):
+        for back in range(self.substeps if contact else 0):
             s = self.substeps - 1 - back
             self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1)
         self.retreat_kernel(actions, actions_bar, t)
@@ -282,7 +285,7 @@ class CudaEngine(CudaPhases):
             self.scatter_thread(state, before, after, q, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 self.grid_thread(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             self.gather_thread(state, before, after, q, time)
@@ -322,13 +325,14 @@ class CudaEngine(CudaPhases):
                     q = w + turn * self.resident_threads
                     self.scatter_thread(state, before, before + stride, q, stamp)
                 meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.block_count[0] << NODE_BITS)):
+                for turn in range(self.resident_turns(w, self.active_nodes())):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
                 meetings = self.meet(w, meetings)
                 for turn in range(self.resident_turns(w, self.particle_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, t * self.substeps + s)
-                meetings = self.meet(w, meetings)
+                # A warp scatters what it has gathered itself, so that the others need not wait.
+                self.wait_for_warp()
 
     @ti.kernel
     def losses_kernel(
@@ -355,16 +359,16 @@ class CudaEngine(CudaPhases):
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)
-            if node >= 0:
+            if node >= 0 and self.weighs(2):
                 self.note_distances(e, tile * self.lanes + lane, x)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 self.loss_thread(w, w + turn * self.node_threads)
         for q in range(self.pose_threads * NEAREST_GROUPS):
             for m in ti.static(range(self.manipulators)):
                 if ti.static(self.motions[m] != "static"):
-                    if q // NEAREST_GROUPS % max(1, self.manipulators) == m:
+                    if self.weighs(2) and q // NEAREST_GROUPS % max(1, self.manipulators) == m:
                         self.scan_group(q // (NEAREST_GROUPS * self.manipulators), m, q % NEAREST_GROUPS)
         for e in range(self.batch):
             self.join_losses(e, terms, at + MEASURES * e)
@@ -428,7 +432,7 @@ class CudaEngine(CudaPhases):
             self.scatter_runs(self.velocity_bar, 3, sums, heads, q, w, h, run, first, rank, total, doublings)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
@@ -463,7 +467,7 @@ class CudaEngine(CudaPhases):
     def export_mass(self, out: ti.types.ndarray(ndim=1)):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 i = self.node_of_block(block, r)
                 index = self.tensor_index(e, i)

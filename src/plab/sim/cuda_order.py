@@ -7,7 +7,7 @@ share begins, and which place that gives to each particle. The order within a ce
 
 import taichi as ti
 
-from plab.sim.cuda_warp import ALL_LANES, NODE_BITS, RUN_BITS, WARP, WARP_BLOCK, WarpPhases
+from plab.sim.cuda_warp import ALL_LANES, RUN_BITS, WARP, WARP_BLOCK, WarpPhases
 from plab.sim.storage import STATE
 
 __all__ = ["OrderPhases"]
@@ -79,7 +79,7 @@ class OrderPhases(WarpPhases):
                 self.list_block(e * self.blocks + block, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.begin_shares(e, e * self.nodes + self.linear_in_block(block, r), w % WARP)
         for q in range(self.particle_threads):
@@ -90,7 +90,7 @@ class OrderPhases(WarpPhases):
                 place = self.cell_count[e * self.nodes + self.node_index(base)] + self.rank[q]
             moves[t * self.particle_threads + q - particle + place] = particle
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.block_count[0] << NODE_BITS)):
+            for turn in range(self.turns_of(w, self.active_nodes())):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.cell_count[e * self.nodes + self.linear_in_block(block, r)] = 0
 

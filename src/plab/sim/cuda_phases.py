@@ -43,7 +43,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def _allocate(self) -> None:
         super()._allocate()
         threads = self.batch * self.tiles * self.lanes
-        moving = sum(1 for motion in self.motions if motion != "static")
+        moving = any(self.moves(shape) for shape in self.shapes)
         # Distances of all particles, written and scanned once per loss; static manipulators leave theirs out.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
         groups = self.batch * max(1, self.manipulators) * NEAREST_GROUPS
@@ -231,13 +231,13 @@ class CudaPhases(OrderPhases, PosePhases):
         g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
         j = det(g)
         c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
-        _q, _det, _norm, k = yield_factor(d, p[2])
+        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
         if self.served(z2, j):
             a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
             for i in ti.static(range(9)):
                 out[i] = a[i]
             if ti.static(update):
-                if k < 1.0:
+                if self.flows(k):
                     f_new = flow(d, g, p[2], self.series)
                     for i in ti.static(range(9)):
                         state[target + 15 + i][lane] = f_new[i]
@@ -263,8 +263,8 @@ class CudaPhases(OrderPhases, PosePhases):
         if self.served(z2, j):
             tau_bar = self.stress_symmetric(a_bar)
             d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
-            _q, _det, _norm, k = yield_factor(d, p[2])
-            if k < 1.0:
+            _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+            if self.flows(k):
                 d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
                 k_bar += k_flow
                 for i in ti.static(range(6)):
@@ -288,9 +288,11 @@ class CudaPhases(OrderPhases, PosePhases):
     def touching(self, e, s, x):
         """Bit mask of the manipulators whose contact is not zero at a point in substep s."""
         mask = 0
+        if ti.static(not self.skips.far_manipulators):
+            mask = ti.static((1 << self.manipulators) - 1)
         for shape, start, stop in ti.static(self.runs):
             for m in range(start, stop):
-                p = self.frame_rotation[e, s, m].transpose() @ (x - self.frame_centre[e, s, m])
+                p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
                 if self.strength(e, d) > 0.0:
                     mask = mask | (1 << m)
@@ -308,6 +310,8 @@ class CudaPhases(OrderPhases, PosePhases):
         self, e, m: ti.template(), actions: ti.template(), poses: ti.template(), t, before, after
     ):
         """Poses of one manipulator in all substeps of environment step t."""
+        if ti.static(m == 0):
+            self.note_step(e, t)
         pose = self.pose[e, 0, m]
         entry = (before * self.batch + e) * self.manipulators + m
         for i in ti.static(range(8)):
@@ -339,7 +343,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def note_distances(self, e, particle, x):
         """Write one particle's distances from the moving manipulators."""
         for shape, start, stop in ti.static(self.runs):
-            if ti.static(shape != "Cylinder"):
+            if ti.static(self.moves(shape)):
                 for m in range(start, stop):
                     at = (e * self.manipulators + m) * (self.tiles * self.lanes) + particle
                     self.distance[at] = self.end_distance(shape, e, m, x)
@@ -381,8 +385,10 @@ class CudaPhases(OrderPhases, PosePhases):
         for m in ti.static(range(self.manipulators)):
             if ti.static(self.motions[m] == "static"):
                 self.contact_part[e, 0, m] = 0.0
-            else:
+            elif self.weighs(2):
                 self.join_groups(e, m)
+            else:
+                self.contact_part[e, 0, m] = 0.0
         terms[at] = self.target_sum[e] + self.loss_part[e, 0][0]
         terms[at + 1] = self.loss_part[e, 0][1]
         terms[at + 2] = self.contact_term(e)

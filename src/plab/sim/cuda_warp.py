@@ -96,11 +96,26 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
         return (total - w + self.node_threads - 1) // self.node_threads
 
     @ti.func
+    def active_nodes(self):
+        """Nodes of the active blocks of all environments."""
+        count = self.block_count[0]
+        if ti.static(not self.skips.empty_blocks):
+            count = self.batch * self.blocks
+        return count << NODE_BITS
+
+    @ti.func
     def node_of(self, q):
         """Environment, block and number in the block of node q of the active blocks."""
-        entry = self.block_list[q >> NODE_BITS]
+        entry = q >> NODE_BITS
+        if ti.static(self.skips.empty_blocks):
+            entry = self.block_list[entry]
         e = entry // self.blocks
         return e, entry - e * self.blocks, q & NODE_MASK
+
+    @ti.func
+    def wait_for_warp(self):
+        """Let the lanes of the warp see what each other have written."""
+        ti.simt.warp.sync(ti.u32(ALL_LANES))
 
     # -- blocks of the grid -------------------------------------------------------------------------
 
@@ -128,11 +143,11 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
             node = e * self.nodes + self.linear_in_block(block, r - lane + near)
             stage[corner + near * NODE_STRIDE + lane % 4] = grid[node][lane % 4]
             grid[node][lane % 4] = 0.0
-        ti.simt.warp.sync(ti.u32(ALL_LANES))
+        self.wait_for_warp()
         out = ti.Vector.zero(self.real, 4)
         for c in ti.static(range(4)):
             out[c] = stage[corner + lane * NODE_STRIDE + c]
-        ti.simt.warp.sync(ti.u32(ALL_LANES))
+        self.wait_for_warp()
         return out
 
     @ti.func
@@ -143,7 +158,7 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for c in ti.static(range(4)):
             stage[corner + lane * NODE_STRIDE + c] = value[c]
-        ti.simt.warp.sync(ti.u32(ALL_LANES))
+        self.wait_for_warp()
         if ti.static(self.real == ti.f32):
             for turn in ti.static(range(2)):
                 near = turn * 16 + lane // 2
@@ -155,7 +170,7 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
                 near = turn * 8 + lane // 4
                 node = e * self.nodes + self.linear_in_block(block, r - lane + near)
                 grid[node][lane % 4] = stage[corner + near * NODE_STRIDE + lane % 4]
-        ti.simt.warp.sync(ti.u32(ALL_LANES))
+        self.wait_for_warp()
 
     # -- sums over a warp ---------------------------------------------------------------------------
 
@@ -296,7 +311,7 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
                         sums[at + c] = r0[c]
                         sums[at + width + c] = r1[c]
                         sums[at + 2 * width + c] = r2[c]
-            ti.simt.warp.sync(ti.u32(ALL_LANES))
+            self.wait_for_warp()
             # What a run adds to a plane of its stencil: 9 nodes.
             plane = ti.static(9 * width)
             for turn in range((total * plane + WARP - 1) // WARP):
@@ -309,14 +324,14 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
                         grid[row + part % (3 * width) // width][part % width],
                         sums[(corner + owner) * PLANE_STRIDE + part],
                     )
-            ti.simt.warp.sync(ti.u32(ALL_LANES))
+            self.wait_for_warp()
 
     @ti.func
     def share_heads(self, heads: ti.template(), q, node, first, rank):
         """Write the base nodes of a warp's runs to shared memory, for :meth:`scatter_runs`."""
         if first:
             heads[q % WARP_BLOCK - q % WARP + rank] = node
-        ti.simt.warp.sync(ti.u32(ALL_LANES))
+        self.wait_for_warp()
 
     @ti.func
     def scatter_mass_run(self, e, base, fx, run, first, doublings):

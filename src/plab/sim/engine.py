@@ -7,7 +7,7 @@ is one launch over all environments.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import taichi as ti
 
@@ -34,19 +34,19 @@ PROBE = 50
 
 
 class TeamChoice:
-    """Chooses between the largest team of threads and none for a kernel's launches, by what they take.
+    """Chooses between teams of threads for a kernel's launches, by what they take.
 
     Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
     Results do not depend on the choice.
     """
 
-    def __init__(self, largest: int) -> None:
-        """Start with the largest team.
+    def __init__(self, sizes: Sequence[int]) -> None:
+        """Start with the first team.
 
         Args:
-            largest: Threads that can work on one environment.
+            sizes: Threads that work on one environment, in the order in which they are tried.
         """
-        self._sizes = (largest, 1) if largest > 1 else (1,)
+        self._sizes = tuple(dict.fromkeys(sizes))
         self._seconds: dict[int, float] = {}
         self._launches = 0
 
@@ -90,7 +90,8 @@ class CpuEngine(Phases):
     def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
         super().__init__(*args)
-        self._teams = {name: TeamChoice(self.team_size) for name in ("step", "losses", "step_adjoint")}
+        sizes = (self.team_size, 1) if self.skips.waiting else (self.team_size,)
+        self._teams = {name: TeamChoice(sizes) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, *args: object) -> None:
         """One environment step; arguments as for :meth:`step_kernel` after the team's size."""
@@ -169,7 +170,10 @@ class CpuEngine(Phases):
         """Sum a node over the private grids of the chunks that hold it, and clear it there."""
         total = ti.Vector.zero(self.real, 4)
         for c in range(self.chunks):
-            if holders & (1 << c):
+            held = holders & (1 << c) != 0
+            if ti.static(not self.skips.empty_grids):
+                held = True
+            if held:
                 at = (e * self.chunks + c) * self.nodes + node
                 total += grid[at]
                 grid[at] = ti.Vector.zero(self.real, 4)
@@ -242,8 +246,9 @@ class CpuEngine(Phases):
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
         """Spread mass, and find the particle nearest to each manipulator."""
         grid_index = e * self.chunks + c
+        search = self.weighs(2)
         for m in ti.static(range(self.manipulators)):
-            self.contact_part[e, c, m] = 1e9
+            self.contact_part[e, c, m] = ti.select(search, 1e9, 0.0)
             self.contact_particle[e, c, m] = 0
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
@@ -252,13 +257,19 @@ class CpuEngine(Phases):
                 base, fx = self.stencil(x)
                 self.mark(grid_index, base, stamp)
                 self.scatter_mass(grid_index, base, fx)
-                for shape, start, stop in ti.static(self.runs):
-                    if ti.static(shape != "Cylinder"):
-                        for m in range(start, stop):
-                            d = self.end_distance(shape, e, m, x)
-                            if d < self.contact_part[e, c, m]:
-                                self.contact_part[e, c, m] = d
-                                self.contact_particle[e, c, m] = tile * self.lanes + lane
+                if search:
+                    self.find_nearest(e, c, tile * self.lanes + lane, x)
+
+    @ti.func
+    def find_nearest(self, e, c, particle, x):
+        """Note a particle of a chunk where it is nearer to a manipulator than those before."""
+        for shape, start, stop in ti.static(self.runs):
+            if ti.static(self.moves(shape)):
+                for m in range(start, stop):
+                    d = self.end_distance(shape, e, m, x)
+                    if d < self.contact_part[e, c, m]:
+                        self.contact_part[e, c, m] = d
+                        self.contact_particle[e, c, m] = particle
 
     @ti.func
     def grid_loss_chunk(self, e, c):
@@ -416,12 +427,14 @@ class CpuEngine(Phases):
         slot: ti.i32,
         t: ti.i32,
         stamp: ti.i32,
+        contact: ti.i32,
     ):
         """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of
         its loss.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it,
-        ``pose_bar`` likewise.
+        ``pose_bar`` likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does
+        not matter and is left alone.
         """
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
@@ -437,8 +450,9 @@ class CpuEngine(Phases):
                         self.advance_manipulators(e, actions, poses, t, t, t + 1)
                     self.barrier(team, size)
                     self.losses_of_team(state, end, e, team, rank, size, stamp, terms, MEASURES * e)
-                    for r in range(self.rounds(rank, size)):
-                        self.loss_gradient_chunk(state, end, bar, e, rank + r * size)
+                    if contact:
+                        for r in range(self.rounds(rank, size)):
+                            self.loss_gradient_chunk(state, end, bar, e, rank + r * size)
                     self.barrier(team, size)
                     if rank == 0:
                         self.contact_gradient(state, end, bar, e)
@@ -446,22 +460,26 @@ class CpuEngine(Phases):
                     for back in range(self.substeps):
                         s = self.substeps - 1 - back
                         now = stamp + 1 + back
-                        for r in range(self.rounds(rank, size)):
-                            self.scatter_chunk_adjoint(
-                                state, slot + s, slot + s + 1, bar, e, rank + r * size, now
-                            )
-                        self.barrier(team, size)
-                        if rank == 0:
-                            self.collect_blocks(e, now)
-                        self.barrier(team, size)
-                        for r in range(self.rounds(rank, size)):
-                            self.grid_chunk_adjoint(e, rank + r * size, s)
-                        self.barrier(team, size)
+                        if contact:
+                            for r in range(self.rounds(rank, size)):
+                                self.scatter_chunk_adjoint(
+                                    state, slot + s, slot + s + 1, bar, e, rank + r * size, now
+                                )
+                            self.barrier(team, size)
+                            if rank == 0:
+                                self.collect_blocks(e, now)
+                            self.barrier(team, size)
+                            for r in range(self.rounds(rank, size)):
+                                self.grid_chunk_adjoint(e, rank + r * size, s)
+                            self.barrier(team, size)
                         if rank == 0:
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
-                        for r in range(self.rounds(rank, size)):
-                            self.gather_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, rank + r * size)
-                        self.barrier(team, size)
+                        if contact:
+                            for r in range(self.rounds(rank, size)):
+                                self.gather_chunk_adjoint(
+                                    state, slot + s, slot + s + 1, bar, e, rank + r * size
+                                )
+                            self.barrier(team, size)
 
     @ti.kernel
     def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):

@@ -5,6 +5,7 @@ import math
 
 import taichi as ti
 
+from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
 
@@ -63,6 +64,8 @@ class GridPhases(Storage):
         Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
         """
         mask = 0
+        if ti.static(not self.skips.far_manipulators):
+            mask = ti.static((1 << self.manipulators) - 1)
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
@@ -70,13 +73,33 @@ class GridPhases(Storage):
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
         for shape, start, stop in ti.static(self.runs):
             for m in range(start, stop):
-                p = self.frame_rotation[e, s, m].transpose() @ (centre - self.frame_centre[e, s, m])
+                p = self.into_frame(shape, e, s, m, centre - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
                 if d <= reach:
                     mask = mask | (1 << m)
         return mask
 
     # -- contact ------------------------------------------------------------------------------------
+
+    def rotated(self, shape: str) -> bool:
+        """Whether the rotation of a shape's frame matters; decided while compiling."""
+        return shape != "Sphere" or not self.skips.rotations
+
+    @ti.func
+    def into_frame(self, shape: ti.template(), e, s, m, v):
+        """A world vector in manipulator m's frame."""
+        out = v
+        if ti.static(self.rotated(shape)):
+            out = self.frame_rotation[e, s, m].transpose() @ v
+        return out
+
+    @ti.func
+    def out_of_frame(self, shape: ti.template(), e, s, m, v):
+        """A vector of manipulator m's frame in the world."""
+        out = v
+        if ti.static(self.rotated(shape)):
+            out = self.frame_rotation[e, s, m] @ v
+        return out
 
     @ti.func
     def rigid_velocity(self, m_turns: ti.template(), e, s, m, p):
@@ -92,22 +115,26 @@ class GridPhases(Storage):
         friction."""
         rn = r.dot(normal)
         t = r - rn * normal
-        length = t.norm()
-        factor = 0.0 * rn
-        if length + rn * friction > 0.0 and length > 0.0:
-            factor = 1.0 + rn * friction / length
-        return factor * t
+        if ti.static(self.manipulators_rub):
+            length = t.norm()
+            factor = 0.0 * rn
+            if length + rn * friction > 0.0 and length > 0.0:
+                factor = 1.0 + rn * friction / length
+            t = factor * t
+        return t
 
     @ti.func
     def contact(self, shape: ti.template(), e, s, m, x, v):
         """Velocity of a node after contact with manipulator m."""
         out = v
-        rotation = self.frame_rotation[e, s, m]
-        p = rotation.transpose() @ (x - self.frame_centre[e, s, m])
+        p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
         d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
         strength = self.strength(e, d)
         if strength > 0.0:
-            normal = rotation @ n_local
+            # What touches a manipulator that cannot move does not touch an action.
+            if ti.static(MANIPULATOR_SHAPES[shape].motion != "static"):
+                self.note_contact(e)
+            normal = self.out_of_frame(shape, e, s, m, n_local)
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
             r = v - u
             if r.dot(normal) < 0.0:
@@ -116,20 +143,30 @@ class GridPhases(Storage):
 
     def turns(self, shape: str) -> bool:
         """Whether manipulators of this shape rotate; decided while compiling."""
-        return shape in ("RollingPin", "Chopsticks", "Box")
+        return shape in ("RollingPin", "Chopsticks", "Box") or not self.skips.rotations
+
+    def moves(self, shape: str) -> bool:
+        """Whether manipulators of this shape can move; decided while compiling."""
+        return MANIPULATOR_SHAPES[shape].motion != "static" or not self.skips.still_manipulators
+
+    @ti.func
+    def note_contact(self, e):
+        """Note that a moving manipulator touches an environment's body."""
+        if ti.static(self.skips.adjoints):
+            if self.touched[e] == 0:
+                self.touched[e] = 1
 
     @ti.func
     def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):
         """Adjoint of v under :meth:`contact`; the frame's adjoint is accumulated."""
         out = bar
-        rotation = self.frame_rotation[e, s, m]
         offset = x - self.frame_centre[e, s, m]
-        p = rotation.transpose() @ offset
+        p = self.into_frame(shape, e, s, m, offset)
         gap = self.frame_gap[e, s, m]
         d, n_local = signed_distance(shape, p, self.size[e, m], gap)
         strength = self.strength(e, d)
         if strength > 0.0:
-            normal = rotation @ n_local
+            normal = self.out_of_frame(shape, e, s, m, n_local)
             r = v - self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
             rn = r.dot(normal)
             if rn < 0.0:
@@ -139,7 +176,11 @@ class GridPhases(Storage):
                 t = t0 * 0.0
                 t0_bar = t0 * 0.0
                 rn_bar = 0.0 * rn
-                if length + rn * friction > 0.0 and length > 0.0:
+                if ti.static(not self.manipulators_rub):
+                    if length > 0.0:
+                        t = t0
+                        t0_bar = strength * bar
+                elif length + rn * friction > 0.0 and length > 0.0:
                     factor = 1.0 + rn * friction / length
                     along = t0.dot(bar) / length
                     t = factor * t0
@@ -163,16 +204,15 @@ class GridPhases(Storage):
     ):
         """Accumulate the adjoint of manipulator m's frame from those of normal, distance and rigid
         velocity."""
-        if ti.static(shape != "Cylinder"):
-            rotation = self.frame_rotation[e, s, m]
+        if ti.static(self.moves(shape)):
             size = self.size[e, m]
             gap = self.frame_gap[e, s, m]
-            n_bar = rotation.transpose() @ normal_bar
+            n_bar = self.into_frame(shape, e, s, m, normal_bar)
             from_distance = d_bar * n_local + hessian_product(shape, p, size, gap, n_bar)
             p_bar = from_distance
             if ti.static(self.turns(shape)):
                 p_bar += self.frame_spin[e, s, m].transpose() @ u_bar
-            centre_bar = -(rotation @ p_bar)
+            centre_bar = -self.out_of_frame(shape, e, s, m, p_bar)
             for i in ti.static(range(3)):
                 self.accumulate_frame(grid_index, m, i, centre_bar[i])
                 self.accumulate_frame(grid_index, m, 3 + i, u_bar[i])
@@ -245,15 +285,18 @@ class GridPhases(Storage):
         return out
 
     @ti.func
-    def on_floor(self, i, v):
+    def rubs(self, i, v, friction):
         """Whether the floor acts on a node, beyond stopping it as any wall does."""
-        return i[1] - 1 < WALL and v[1] < 0.0
+        out = False
+        if ti.static(self.floor_rubs):
+            out = friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
+        return out
 
     @ti.func
     def walls(self, i, v, friction):
         """Velocity of a node after walls and floor, axis by axis."""
         v1 = self.wall_free(i, v, 0)
-        if friction > 0.0 and self.on_floor(i, v1):
+        if self.rubs(i, v1, friction):
             v1 = self.floor(v1, friction)
         else:
             v1 = self.wall_free(i, v1, 1)
@@ -264,7 +307,7 @@ class GridPhases(Storage):
         """Adjoint of v under :meth:`walls`."""
         v1 = self.wall_free(i, v, 0)
         v2 = v1
-        floored = friction > 0.0 and self.on_floor(i, v1)
+        floored = self.rubs(i, v1, friction)
         if floored:
             v2 = self.floor(v1, friction)
         out = self.wall_free_adjoint(i, v2, bar, 2)

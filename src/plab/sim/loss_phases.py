@@ -46,6 +46,14 @@ class LossPhases(Storage):
         return out
 
     @ti.func
+    def weighs(self, term: ti.template()):
+        """Whether a term of the loss is computed: not where its weight is 0."""
+        out = self.loss_weights[None][term] != 0.0
+        if ti.static(not self.skips.zero_weights):
+            out = True
+        return out
+
+    @ti.func
     def node_loss(self, e, i, mass):
         """Density and SDF terms of one node, relative to an empty node, d (weighted loss) / d mass, and mass
         times target mass."""
@@ -59,14 +67,16 @@ class LossPhases(Storage):
             difference = mass - self.target[index]
             weights = self.loss_weights[None]
             density = ti.abs(difference) - self.target[index]
-            sdf = self.target_sdf[index] * mass
+            if self.weighs(1):
+                sdf = self.target_sdf[index] * mass
+                slope = weights[1] * self.target_sdf[index]
             overlap = self.target[index] * mass
             sign = 0.0 * mass
             if difference > 0.0:
                 sign = 1.0
             elif difference < 0.0:
                 sign = -1.0
-            slope = weights[0] * sign + weights[1] * self.target_sdf[index]
+            slope += weights[0] * sign
         return density, sdf, slope, overlap
 
     @ti.func
@@ -104,17 +114,20 @@ class LossPhases(Storage):
         return rotation_matrix(vec4(pose[3], pose[4], pose[5], pose[6]))
 
     @ti.func
-    def local_point(self, e, m, x):
+    def local_point(self, shape: ti.template(), e, m, x):
         """A world point in the manipulator's frame at the end of the environment step."""
         pose = self.pose[e, self.substeps, m]
         centre = ti.Vector([pose[0], pose[1], pose[2]])
-        return ti.cast(self.pose_rotation(e, m).transpose() @ (ti.cast(x, ti.f64) - centre), self.real)
+        offset = ti.cast(x, ti.f64) - centre
+        if ti.static(self.rotated(shape)):
+            offset = self.pose_rotation(e, m).transpose() @ offset
+        return ti.cast(offset, self.real)
 
     @ti.func
     def end_distance(self, shape: ti.template(), e, m, x):
         """Distance of a world point at the end of the environment step."""
         gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
-        d, _n = signed_distance(shape, self.local_point(e, m, x), self.size[e, m], gap)
+        d, _n = signed_distance(shape, self.local_point(shape, e, m, x), self.size[e, m], gap)
         return d
 
     @ti.func
@@ -132,12 +145,13 @@ class LossPhases(Storage):
         """Adjoint of the nearest particle's position under the weighted contact term; pose_bar is
         accumulated."""
         gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
-        p = self.local_point(e, m, x)
+        p = self.local_point(shape, e, m, x)
         d, n = signed_distance(shape, p, self.size[e, m], gap)
         n64 = ti.cast(n, ti.f64)
         d_bar = 2.0 * ti.cast(self.loss_weights[None][2], ti.f64) * ti.max(ti.cast(d, ti.f64), 0.0)
-        rotation = self.pose_rotation(e, m)
-        x_bar = d_bar * (rotation @ n64)
+        x_bar = d_bar * n64
+        if ti.static(self.rotated(shape)):
+            x_bar = self.pose_rotation(e, m) @ x_bar
         pose = self.pose[e, self.substeps, m]
         offset = ti.cast(x, ti.f64) - ti.Vector([pose[0], pose[1], pose[2]])
         for i in ti.static(range(3)):
@@ -156,7 +170,7 @@ class LossPhases(Storage):
     def contact_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
         """Add the gradient of the contact term to the nearest particles' and the poses' adjoints."""
         for shape, start, stop in ti.static(self.runs):
-            if ti.static(shape != "Cylinder"):
+            if ti.static(self.moves(shape)):
                 for m in range(start, stop):
                     if self.contact_part[e, 0, m] > 0.0:
                         particle = self.contact_particle[e, 0, m]

@@ -75,6 +75,7 @@ class Series:
         z_squared_max: Largest |Z|^2 (Frobenius) that the series serve.
         j_min: Smallest J that the series serve.
         j_max: Largest J that the series serve.
+        plastic: Whether anything yields; if not, k = 1 without being computed.
     """
 
     log_terms: int
@@ -83,6 +84,7 @@ class Series:
     z_squared_max: float = 0.0144
     j_min: float = 0.6
     j_max: float = 1.6
+    plastic: bool = True
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
@@ -274,7 +276,7 @@ def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
 @ti.func
 def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()):
     """Kirchhoff stress (6 components) after return mapping; arguments as for :func:`stress_adjoint`."""
-    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     qk = k * k * q
     dk = k * k * k * det_d
     e0, e1, e2 = exp_coefficients(qk, dk, series.exp_terms)
@@ -290,18 +292,22 @@ def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()
 @ti.func
 def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()):
     """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
-    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     s = k - 1.0
     m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
     return mul_sym_mat(polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d)), g)
 
 
 @ti.func
-def yield_factor(d: ti.template(), yield_strain):
+def yield_factor(d: ti.template(), yield_strain, series: ti.template()):
     """q = tr(d^2) / 2, det d, the regularised norm of d and the factor k of return mapping."""
     q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
-    norm = ti.sqrt(2.0 * q + NORM_SHIFT)
-    return q, det_sym(d), norm, ti.min(yield_strain / norm, 1.0)
+    norm = 0.0 * q + 1.0
+    k = 0.0 * q + 1.0
+    if ti.static(series.plastic):
+        norm = ti.sqrt(2.0 * q + NORM_SHIFT)
+        k = ti.min(yield_strain / norm, 1.0)
+    return q, det_sym(d), norm, k
 
 
 @ti.func
@@ -347,7 +353,7 @@ def stress_adjoint(
     Returns:
         Adjoints of d (6) at fixed k, of k, of c2 and of J.
     """
-    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     d2 = square_sym(d)
     qk = k * k * q
     dk = k * k * k * det_d
@@ -425,7 +431,7 @@ def flow_adjoint(
     Returns:
         Adjoints of d (6) at fixed k, of k, and of G (9) at fixed d.
     """
-    q, det_d, _norm, k = yield_factor(d, yield_strain)
+    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     s = k - 1.0
     qs = s * s * q
     ds = s * s * s * det_d
@@ -469,9 +475,11 @@ def log_adjoint(
     Returns:
         Adjoint of Z, 6 components.
     """
-    _q, _det, norm, k = yield_factor(d, yield_strain)
+    _q, _det, norm, k = yield_factor(d, yield_strain, series)
     # k = yield_strain / norm where it yields, else constant.
-    q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
+    q_bar = 0.0 * k
+    if ti.static(series.plastic):
+        q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
     full = scaled_sum(1.0, d_bar, -q_bar, d)
     mean = (full[0] + full[1] + full[2]) * (1.0 / 3.0)
     dev = (full[0] - mean, full[1] - mean, full[2] - mean, full[3], full[4], full[5])

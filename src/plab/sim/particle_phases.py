@@ -124,6 +124,17 @@ class ParticlePhases(Storage):
         return self.served(z_squared.max(), j.max()) and j.min() >= self.series.j_min
 
     @ti.func
+    def flows(self, k):
+        """Whether plastic flow is computed where the factor of return mapping is ``k``, the least of a
+        tile."""
+        out = k < 1.0
+        if ti.static(not self.series.plastic):
+            out = False
+        if ti.static(not self.skips.flow):
+            out = True
+        return out
+
+    @ti.func
     def stress_and_momentum(self, tau: ti.template(), c: ti.template()):
         """A = stress_scale tau + mass C from a symmetric tau (6) and a full C (9)."""
         return [self.stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + self.mass * c[i] for i in range(9)]
@@ -163,13 +174,13 @@ class ParticlePhases(Storage):
             self.stage[at + i] = g[i]
         for i in ti.static(range(6)):
             self.stage[at + 9 + i] = d[i]
-        _q, _det, _norm, k = yield_factor(d, p[2])
+        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
         if self.all_served(z2, j):
             a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
             for i in ti.static(range(9)):
                 self.affine[entry9 + i] = a[i]
             if ti.static(update):
-                if k.min() < 1.0:
+                if self.flows(k.min()):
                     f_new = flow(
                         [self.stage[at + 9 + i] for i in range(6)],
                         [self.stage[at + i] for i in range(9)],
@@ -260,13 +271,13 @@ class ParticlePhases(Storage):
             yield_strain,
             self.series,
         )
-        _q, _det, _norm, k = yield_factor(d, yield_strain)
+        _q, _det, _norm, k = yield_factor(d, yield_strain, self.series)
         for i in ti.static(range(6)):
             self.stage[at + STAGE_D_BAR + i] = d_bar[i]
         self.stage[at + STAGE_BARS] = k_bar
         self.stage[at + STAGE_BARS + 1] = c2_bar
         self.stage[at + STAGE_BARS + 2] = j_bar
-        return k.min() < 1.0
+        return self.flows(k.min())
 
     @ti.func
     def flow_tile_adjoint(self, bar: ti.template(), target, yield_strain, at):
@@ -563,6 +574,12 @@ class ParticlePhases(Storage):
                             count += 1
                         self.block_chunks[entry] = self.block_chunks[entry] | (1 << c)
             self.mark_count[grid_index] = 0
+        if ti.static(not self.skips.empty_blocks):
+            for block in range(self.blocks):
+                if self.block_stamp[e * self.blocks + block] != stamp:
+                    self.block_chunks[e * self.blocks + block] = 0
+                    self.block_list[e * self.blocks + count] = block
+                    count += 1
         self.block_count[e] = count
 
     @ti.func

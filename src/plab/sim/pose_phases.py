@@ -38,9 +38,17 @@ class PosePhases(Storage):
         return u
 
     @ti.func
+    def note_step(self, e, t):
+        """Note that environment step t starts before the first contact, if it does."""
+        if ti.static(self.skips.adjoints):
+            if self.touched[e] == 0:
+                self.untouched_step[e] = t
+
+    @ti.func
     def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
         """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
         ``after``."""
+        self.note_step(e, t)
         for m in ti.static(range(self.manipulators)):
             entry = (before * self.batch + e) * self.manipulators + m
             for i in ti.static(range(8)):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
@@ -11,72 +13,22 @@ from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
-from plab.sim.order import ParticleOrder
+from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.parameters import parameter_gradient
-from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
-from plab.sim.storage import MEASURES, STATE
+from plab.sim.particles import Particles
+from plab.sim.runtime import is_current, register_user, start_runtime
+from plab.sim.skips import Skips
+from plab.sim.state import Measures, Rollout, State, rest_state
+from plab.sim.storage import MEASURES
+from plab.sim.tape import Tape
+from plab.sim.tensors import on_device, tensor_from, write_numbers
 
-__all__ = ["CONTACT_MODELS", "Measures", "Rollout", "Simulator", "State"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["CONTACT_MODELS", "Simulator"]
 
 CONTACT_MODELS = ("soft", "hard")
-
-STAMP_MAX = 2**31 - 2**20
-
-
-@dataclass(frozen=True)
-class State:
-    """Particles and manipulators of all environments, float64.
-
-    Attributes:
-        x: Particle positions [domain units], shape [batch, particle, 3].
-        v: Particle velocities, shape [batch, particle, 3].
-        C: APIC velocity gradients, shape [batch, particle, 3, 3].
-        F: Deformation gradients, shape [batch, particle, 3, 3].
-        poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, manipulator, 8].
-    """
-
-    x: np.ndarray
-    v: np.ndarray
-    C: np.ndarray
-    F: np.ndarray
-    poses: np.ndarray
-
-
-@dataclass(frozen=True)
-class Measures:
-    """What a state is judged by.
-
-    Attributes:
-        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3].
-        iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
-            NaN before :meth:`Simulator.set_target`.
-    """
-
-    terms: np.ndarray
-    iou: np.ndarray
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """What a rollout of T environment steps gives.
-
-    Attributes:
-        initial_terms: Unweighted loss terms (density, SDF, contact) of the initial state, shape [batch, 3].
-        step_terms: The same after each environment step, shape [batch, T, 3].
-        initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
-        step_iou: The same after each environment step, shape [batch, T].
-        gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
-            [batch, T, action], or None if it was not asked for.
-        failures: Environments whose state, loss or gradient stopped being finite, and when and why; their
-            numbers mean nothing, those of the others are what they would be without them.
-    """
-
-    initial_terms: np.ndarray
-    step_terms: np.ndarray
-    initial_iou: np.ndarray
-    step_iou: np.ndarray
-    gradient: np.ndarray | None
-    failures: dict[int, str] = field(default_factory=dict)
 
 
 class Simulator:
@@ -97,6 +49,7 @@ class Simulator:
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
         full_gradient: bool = False,
+        skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -110,6 +63,7 @@ class Simulator:
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             full_gradient: Whether a rollout's gradient includes those with respect to the initial state
                 (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
+            skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -123,23 +77,17 @@ class Simulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._engine = _engine_class(device)(self.scenes, self._runtime, full_gradient)
+        self._skips = skips
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
-        self._stamp = 0
-        self._history: ti.Ndarray | None = None
-        self._checkpoints: ti.Ndarray | None = None
-        self._bar: ti.Ndarray | None = None
-        self._spare_bar: ti.Ndarray | None = None
-        self._current = self._state_array(1)
-        # Where the current state goes when its particles are put into another order.
-        self._spare = self._state_array(1) if self._engine.sorts else None
-        self._initial = self._state_array(1)
         self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
         self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
-        self._order = ParticleOrder(self._engine)
+        self._particles = Particles(self._engine, self._numpy_real)
+        self._tape = Tape(self._particles)
+        self._initial = self._particles.array(1)
         self._start_from(particles)
         self.set_contact("soft")
         self.set_loss_weights(10.0, 10.0, 1.0)
@@ -207,7 +155,10 @@ class Simulator:
         self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
-        """Set the weights of the three loss terms in the trajectory loss and its gradient."""
+        """Set the weights of the three loss terms in the trajectory loss and its gradient.
+
+        The SDF and the contact term are not computed where their weight is 0: they are given as 0 then.
+        """
         self._engine.loss_weights[None] = [density, sdf, contact]
 
     def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
@@ -228,6 +179,7 @@ class Simulator:
         for scene in scenes:
             scene.validate()
         _require_alike([self.scenes[0], *scenes])
+        self._require_compiled(scenes)
         self.scenes = tuple(scenes)
         self._engine.fill_parameters(scenes)
         self._start_from(particles)
@@ -265,6 +217,10 @@ class Simulator:
         )
         for scene in scenes:
             scene.validate()
+            if math.isfinite(scene.yield_stress) and not self._engine.series.plastic:
+                raise SceneError(
+                    "this simulator was built for infinite yield stress only: build one with a finite one"
+                )
         self.scenes = scenes
         self._engine.fill_material(scenes)
 
@@ -294,32 +250,37 @@ class Simulator:
     def reset(self) -> None:
         """Put all environments into their initial states."""
         self._require_runtime()
-        self._engine.copy_slot(self._initial, 0, self._current, 0)
-        self._order.reset()
+        self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
+        self._particles.order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
+        self._engine.touched.fill(0)
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self, actions: np.ndarray | torch.Tensor) -> None:
         """Advance all environments by one environment step, without keeping history.
 
         Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1].
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. A CUDA tensor is taken as it is.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
             SimulationError: If the state stops being finite.
         """
         self._require_runtime()
-        array = self._action_array(np.asarray(actions, np.float64)[:, None])
-        self._sort_current()
-        self._engine.step(self._current, self._pose, array, 0, 0, 0, 0, 0, self._take_stamps(self.substeps))
-        _require_none(self._faults())
+        array = self._action_array(
+            actions if on_device(actions) else np.asarray(actions, np.float64), steps=1
+        )
+        self._particles.step(self._pose, array)
+        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
 
-    def rollout(self, actions: np.ndarray, gradient: bool = True, *, strict: bool = True) -> Rollout:
+    def rollout(
+        self, actions: np.ndarray | torch.Tensor, gradient: bool = True, *, strict: bool = True
+    ) -> Rollout:
         """Run environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
-            actions: Actions, shape [batch, T, action]; clipped to [-1, 1].
+            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, the gradient
+                is one too, of its type.
             gradient: Whether to compute the gradient.
             strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
 
@@ -332,26 +293,29 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         self.reset()
-        array = self._action_array(np.asarray(actions, np.float64))
-        steps = np.shape(actions)[1]
-        plan = self._plan(steps) if gradient else None
+        array = self._action_array(actions if on_device(actions) else np.asarray(actions, np.float64))
+        steps = actions.shape[1] if on_device(actions) else np.shape(actions)[1]
+        kept = gradient or not self._skips.history
+        plan = self._tape.plan(steps, self.memory_mb) if kept else None
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
         whole[0] = self._initial_poses
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
-        self._losses(self._current, 0, terms, 0)
-        moves = self._run_forward(array, poses, terms, steps, plan)
+        self._particles.losses(terms, 0)
+        self._tape.forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
-        failures = _bad_terms(values) | self._faults()
+        failures = broken_terms(values) | broken_states(self._engine.fault.to_numpy(), self.substeps)
         if strict:
-            _require_none(failures)
+            require_none(failures)
         actions_bar = None
-        if plan is not None:
-            actions_bar = self._run_backward(array, poses, steps, plan, moves)
-            failures = _bad_gradients(actions_bar) | failures
+        if gradient:
+            contact_free = self._steps_before_contact(steps)
+            bars = self._tape.backward(array, poses, steps, contact_free)
+            actions_bar = self._given(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
+            failures = broken_gradients(actions_bar) | failures
             if strict:
-                _require_none(failures)
+                require_none(failures)
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
@@ -369,7 +333,7 @@ class Simulator:
         """
         self._require_gradient()
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
-        return self._unpack(self._bar.to_numpy(), poses, self._order.initial)
+        return self._particles.unpack(self._tape.bar.to_numpy(), poses, self._particles.order.initial)
 
     def material_gradient(self) -> np.ndarray:
         """Gradient of the last :meth:`rollout`'s loss with respect to the material.
@@ -385,11 +349,11 @@ class Simulator:
         bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
         return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
 
-    def measure(self) -> Measures:
-        """Loss terms and soft IoU of the current state."""
+    def measure(self, like: torch.Tensor | None = None) -> Measures:
+        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type."""
         self._require_runtime()
-        self._losses(self._current, 0, self._scratch_terms, 0)
-        return self._measures(self._scratch_terms.to_numpy().reshape(self.batch, MEASURES))
+        self._particles.losses(self._scratch_terms, 0)
+        return self._measures(self._given(self._scratch_terms, (self.batch, MEASURES), like))
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
@@ -398,7 +362,7 @@ class Simulator:
     def mass_tensor(self) -> np.ndarray:
         """Mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
         self._require_runtime()
-        self._losses(self._current, 0, self._scratch_terms, 0)
+        self._particles.losses(self._scratch_terms, 0)
         n = self.grid_size
         out = np.zeros(self.batch * n**3, self._numpy_real)
         self._engine.export_mass(out)
@@ -409,15 +373,16 @@ class Simulator:
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
         poses = self.poses()
-        return self._unpack(self._current.to_numpy(), poses, self._order.current())
+        return self._particles.unpack(self._particles.current.to_numpy(), poses)
 
-    def observe(self, stride: int) -> np.ndarray:
+    def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Position and velocity of every ``stride``-th particle, in the order in which they were given.
 
         Only these are copied from the device.
 
         Args:
             stride: Distance of the observed particles' numbers, at least 1.
+            like: Given a CUDA tensor, the result is one too, of its type, and nothing is copied to the host.
 
         Returns:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
@@ -427,13 +392,14 @@ class Simulator:
         if stride not in self._observed:
             self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
         out = self._observed[stride]
-        self._engine.observe(self._current, self._order.numbers, stride, out)
-        return out.to_numpy().reshape(self.batch, count, 6)
+        self._engine.observe(self._particles.current, self._particles.order.numbers, stride, out)
+        return self._given(out, (self.batch, count, 6), like)
 
-    def poses(self) -> np.ndarray:
-        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`."""
+    def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
+        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
+        tensor if ``like`` is one, of its type."""
         self._require_runtime()
-        return self._pose.to_numpy()[: self._initial_poses.size].reshape(self._initial_poses.shape)
+        return self._given(self._pose, self._initial_poses.shape, like)
 
     def set_state(self, state: State) -> None:
         """Replace the current state.
@@ -453,8 +419,8 @@ class Simulator:
                 )
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
-        self._current.from_numpy(self._pack(state))
-        self._order.reset()
+        self._particles.current.from_numpy(self._particles.pack(state))
+        self._particles.order.reset()
         self._place(np.asarray(state.poses, np.float64))
         self._engine.fault.fill(0)
 
@@ -463,24 +429,31 @@ class Simulator:
         :class:`State`."""
         self.set_state(state)
         self._initial_poses = np.array(state.poses, np.float64)
-        self._engine.copy_slot(self._current, 0, self._initial, 0)
+        self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
 
     # -- internals ----------------------------------------------------------------------------------
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
         """Make the scenes' start the initial state."""
         positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
-        self._order.start_from(positions)
+        self._particles.order.start_from(positions)
         self._initial_poses = np.array(
             [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in self.scenes],
             dtype=np.float64,
         ).reshape(self.batch, self.manipulator_count, 8)
-        self._initial.from_numpy(self._pack(_rest_state(np.stack(positions), self._initial_poses)))
+        self._initial.from_numpy(self._particles.pack(rest_state(np.stack(positions), self._initial_poses)))
 
-    def _measures(self, values: np.ndarray) -> Measures:
+    def _given(self, array: ti.Ndarray, shape: tuple[int, ...], like: object) -> np.ndarray | torch.Tensor:
+        """What an array on the device holds, as a tensor like a CUDA tensor or else as an array."""
+        if on_device(like):
+            return tensor_from(array, shape, like)
+        return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
+
+    def _measures(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""
         overlap, peak = values[..., 3], values[..., 4]
-        target_sum, target_peak = self._target_scale
+        scale = values.new_tensor(self._target_scale) if on_device(values) else self._target_scale
+        target_sum, target_peak = scale
         total = self.scenes[0].particle_mass * self.particle_count
         # Without a target there is no IoU: NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -488,202 +461,44 @@ class Simulator:
             iou = both / (total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
 
-    def _state_array(self, slots: int) -> ti.Ndarray:
-        engine = self._engine
-        return ti.ndarray(engine.lane_type, shape=slots * self.batch * engine.tiles * STATE)
-
-    def _slot_bytes(self) -> int:
-        engine = self._engine
-        return self.batch * engine.tiles * STATE * engine.lanes * np.dtype(self._numpy_real).itemsize
-
-    def _plan(self, steps: int) -> int:
-        """Environment steps per segment whose every state is kept, so that all fits into the memory
-        budget."""
-        budget = self.memory_mb * 1e6
-        moved = 4 * steps * self._order.places if self._engine.sorts else 0
-
-        def cost(length: int) -> int:
-            segments = -(-steps // length)
-            slots = length * self._slots_per_step + 2 + (segments if segments > 1 else 0)
-            return (slots + (1 if self._engine.sorts else 0)) * self._slot_bytes() + moved
-
-        # Taichi counts the entries of an array in 32 bits.
-        slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
-        fitting = [
-            length
-            for length in range(1, steps + 1)
-            if cost(length) <= budget and max(length * self._slots_per_step + 1, -(-steps // length)) <= slots
-        ]
-        if not fitting:
-            need = min(cost(length) for length in range(1, steps + 1)) / 1e6
-            raise MemoryError(
-                f"the gradient of {steps} steps needs at least {need:.0f} MB, but memory_mb is "
-                f"{self.memory_mb:g}: "
-                f"set sim.memory_mb={need:.0f} or more"
-            )
-        # Fewest recomputed steps first: as few segments as possible, of even length.
-        segments = -(-steps // max(fitting))
-        return -(-steps // segments)
-
-    def _allocate_gradient(self, length: int, segments: int) -> None:
-        self._engine.allocate_adjoint()
-        slots = length * self._slots_per_step + 1
-        size = slots * self._current.shape[0]
-        if self._history is None or self._history.shape[0] < size:
-            self._history = None
-            self._history = self._state_array(slots)
-        if segments > 1 and (
-            self._checkpoints is None or self._checkpoints.shape[0] < segments * self._current.shape[0]
-        ):
-            self._checkpoints = self._state_array(segments)
-        if self._bar is None:
-            self._bar = self._state_array(1)
-            self._spare_bar = self._state_array(1) if self._engine.sorts else None
-
-    @property
-    def _slots_per_step(self) -> int:
-        """Time slots of an environment step in the history. Where particles are put into another order, a
-        step's start is kept in its own order and in that of the step before."""
-        return self.substeps + (1 if self._engine.sorts else 0)
-
-    def _sort_current(self, t: int = 0, moves: ti.Ndarray | None = None) -> None:
-        """Put the particles of the current state into the order of their cells, where that pays."""
-        if self._engine.sorts:
-            moves = self._order.find(self._current, 0, t, self._take_stamps(1), moves)
-            self._engine.move(self._current, 0, self._spare, 0, moves, t)
-            self._current, self._spare = self._spare, self._current
-
-    def _enter_step(self, t: int, slot: int, moves: ti.Ndarray | None, *, known: bool) -> None:
-        """Fill the history's slot in which step t starts from the one before it, in the step's own order.
-
-        Args:
-            t: Environment step.
-            slot: The step's first slot.
-            moves: The orders of all steps.
-            known: Whether the step's order is in ``moves`` already.
-        """
-        if self._engine.sorts:
-            if not known:
-                self._order.find(self._history, slot - 1, t, self._take_stamps(1), moves)
-            self._engine.move(self._history, slot - 1, self._history, slot, moves, t)
-
-    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> ti.Ndarray | None:
-        """Run all steps and keep what the gradient needs; returns the orders of all steps if they change."""
-        if length is None:
-            for t in range(steps):
-                self._sort_current()
-                self._advance(self._current, 0, 0, t, actions, poses)
-                self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-            return None
-        segments = -(-steps // length)
-        self._allocate_gradient(length, segments)
-        moves = self._order.allocate(steps) if self._engine.sorts else None
-        first = 1 if self._engine.sorts else 0
-        for k in range(segments):
-            if segments > 1:
-                self._engine.copy_slot(self._current, 0, self._checkpoints, k)
-            last = k == segments - 1
-            if last:
-                self._engine.copy_slot(self._current, 0, self._history, 0)
-            for t in range(k * length, min(steps, (k + 1) * length)):
-                if last:
-                    slot = first + (t - k * length) * self._slots_per_step
-                    self._enter_step(t, slot, moves, known=False)
-                    self._advance(self._history, slot, 1, t, actions, poses)
-                    self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * MEASURES)
-                else:
-                    self._sort_current(t, moves)
-                    self._advance(self._current, 0, 0, t, actions, poses)
-                    self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-        end = (steps - (segments - 1) * length) * self._slots_per_step
-        self._engine.copy_slot(self._history, end, self._current, 0)
-        return moves
-
-    def _run_backward(self, actions, poses, steps: int, length: int, moves: ti.Ndarray | None) -> np.ndarray:
-        segments = -(-steps // length)
-        actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
-        actions_bar.fill(0.0)
-        self._bar.fill(0.0)
-        self._engine.pose_bar.fill(0.0)
-        self._engine.frame_bar.fill(0.0)
-        self._engine.material_bar.fill(0.0)
-        first = 1 if self._engine.sorts else 0
-        for k in reversed(range(segments)):
-            stop = min(steps, (k + 1) * length)
-            if k < segments - 1:
-                self._engine.copy_slot(self._checkpoints, k, self._history, 0)
-                for t in range(k * length, stop):
-                    slot = first + (t - k * length) * self._slots_per_step
-                    self._enter_step(t, slot, moves, known=True)
-                    self._advance(self._history, slot, 1, t, actions, poses)
-            for t in reversed(range(k * length, stop)):
-                self._engine.step_adjoint(
-                    self._history,
-                    self._bar,
-                    poses,
-                    actions,
-                    actions_bar,
-                    self._scratch_terms,
-                    first + (t - k * length) * self._slots_per_step,
-                    t,
-                    self._take_stamps(self.substeps + 1),
-                )
-                if self._engine.sorts:
-                    self._engine.move_back(self._bar, self._spare_bar, moves, t)
-                    self._bar, self._spare_bar = self._spare_bar, self._bar
-        gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
-        return gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
-
-    def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
-        self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
-
-    def _losses(self, state, slot: int, terms, at: int) -> None:
-        self._engine.losses(state, slot, terms, at, self._take_stamps(1))
+    def _steps_before_contact(self, steps: int) -> int:
+        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
+        if self._engine.full_gradient or not self._skips.adjoints:
+            return 0
+        touched = self._engine.touched.to_numpy() != 0
+        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
 
     def _place(self, poses: np.ndarray) -> None:
         if self.manipulator_count:
             self._pose.from_numpy(np.ascontiguousarray(poses).reshape(-1))
             self._engine.place(self._pose, 0)
 
-    def _take_stamps(self, count: int) -> int:
-        """The first of ``count`` fresh stamps."""
-        if self._stamp + count >= STAMP_MAX:
-            self._engine.block_stamp.fill(0)
-            self._engine.mark_stamp.fill(0)
-            self._stamp = 0
-        first = self._stamp + 1
-        self._stamp += count
-        return first
-
-    def _action_array(self, actions: np.ndarray) -> ti.Ndarray:
-        expected = (self.batch, actions.shape[1] if actions.ndim == 3 else "T", self.action_dim)
-        if actions.shape != expected:
-            raise ValueError(f"actions have shape {actions.shape}, not {expected} (batch, steps, components)")
-        if not np.isfinite(actions).all():
+    def _action_array(self, actions: np.ndarray | torch.Tensor, steps: int | None = None) -> ti.Ndarray:
+        """Actions for the kernels; shape [batch, T, action], or [batch, action] if ``steps`` is 1."""
+        expected = (self.batch, self.action_dim)
+        if steps is None:
+            expected = (self.batch, actions.shape[1] if actions.ndim == 3 else "T", self.action_dim)
+        if tuple(actions.shape) != expected:
+            named = " (batch, steps, components)" if steps is None else " (batch, components)"
+            raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected}{named}")
+        finite = actions.isfinite() if on_device(actions) else np.isfinite(actions)
+        if not finite.all():
             raise ValueError("actions contain NaN or infinity")
-        flat = np.ascontiguousarray(actions.transpose(1, 0, 2)).reshape(-1)
-        array = ti.ndarray(ti.f64, shape=max(1, flat.size))
-        if flat.size:
-            array.from_numpy(flat)
+        flat = actions.swapaxes(0, 1).reshape(-1) if steps is None else actions.reshape(-1)
+        array = ti.ndarray(ti.f64, shape=max(1, flat.shape[0]))
+        if not flat.shape[0]:
+            return array
+        if on_device(actions) and self.device == "cuda":
+            write_numbers(flat.detach().contiguous(), array)
+        else:
+            array.from_numpy(np.ascontiguousarray(flat.cpu().double() if on_device(flat) else flat))
         return array
-
-    def _faults(self) -> dict[int, str]:
-        """Environments whose state is broken, and since when."""
-        faults, what = (
-            self._engine.fault.to_numpy(),
-            "the state is not finite or a particle crosses the domain",
-        )
-        failures = {}
-        for e in np.flatnonzero(faults):
-            step, substep = divmod(int(faults[e]) - 1, self.substeps)
-            failures[int(e)] = f"environment step {step + 1}, substep {substep + 1}: {what} in one substep"
-        return failures
 
     def _require_gradient(self) -> None:
         self._require_runtime()
         if not self._engine.full_gradient:
             raise RuntimeError("build the simulator with full_gradient=True for this gradient")
-        if self._bar is None:
+        if self._tape.bar is None:
             raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
 
     def _require_runtime(self) -> None:
@@ -693,63 +508,6 @@ class Simulator:
                 "number of "
                 "threads; build the simulator again"
             )
-
-    def _pack(self, state: State) -> np.ndarray:
-        """User arrays to tiles along the curve, the last tile padded with particles at rest."""
-        engine = self._engine
-        b, n = self.batch, self.particle_count
-        flat = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
-        flat[:, :, [15, 19, 23]] = 1.0
-        parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
-        values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self._order.initial[:, :, None], axis=1)
-        tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
-        return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
-
-    def _unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray) -> State:
-        """Tiles in an order of the particles to user arrays."""
-        engine = self._engine
-        b, n = self.batch, self.particle_count
-        flat = (
-            tiles.reshape(b, engine.tiles, STATE, engine.lanes)
-            .transpose(0, 1, 3, 2)
-            .reshape(b, -1, STATE)[:, :n]
-        )
-        values = np.empty((b, n, STATE))
-        np.put_along_axis(values, order[:, :, None], flat.astype(np.float64), axis=1)
-        shape = (b, n, 3, 3)
-        return State(
-            values[..., 0:3],
-            values[..., 3:6],
-            values[..., 6:15].reshape(shape),
-            values[..., 15:24].reshape(shape),
-            poses,
-        )
-
-
-def _bad_terms(values: np.ndarray) -> dict[int, str]:
-    """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
-    5]."""
-    broken = ~np.isfinite(values).all(axis=2)
-    first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
-    when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
-    return {e: f"{text}: the loss is not finite" for e, text in when.items()}
-
-
-def _bad_gradients(gradient: np.ndarray) -> dict[int, str]:
-    """Environments with a gradient that is not finite, and since which step, going backwards; gradient of
-    shape [batch, T, action]."""
-    broken = ~np.isfinite(gradient).all(axis=2)
-    last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
-    return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
-
-
-def _require_none(failures: Mapping[int, str]) -> None:
-    """Raise SimulationError if an environment has broken off; the first is named."""
-    if failures:
-        first = min(failures)
-        more = f" (and {len(failures) - 1} more environments)" if len(failures) > 1 else ""
-        raise SimulationError(f"environment {first}, {failures[first]}{more}", failures)
 
 
 def _engine_class(device: str) -> type:
@@ -764,12 +522,6 @@ def _unit(rotation: Sequence[float]) -> list[float]:
     """A quaternion of length 1; YAML files round theirs."""
     q = np.asarray(rotation, float)
     return list(q / np.linalg.norm(q))
-
-
-def _rest_state(x: np.ndarray, poses: np.ndarray) -> State:
-    shape = (*x.shape, 3)
-    identity = np.broadcast_to(np.eye(3), shape)
-    return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)
 
 
 def _require_alike(scenes: Sequence[Scene]) -> None:

@@ -14,7 +14,9 @@ depend on the number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import taichi as ti
@@ -23,6 +25,7 @@ from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
+from plab.sim.skips import Skips
 
 __all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "MEASURES", "STATE", "WORK", "Storage"]
 
@@ -55,16 +58,20 @@ LANES = {"cpu": 8, "cuda": 32}
 class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, full_gradient: bool = False) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips, full_gradient: bool = False
+    ) -> None:
         """Allocate what forward simulation needs.
 
         Args:
             scenes: One per environment, alike in all but the per-environment data.
             runtime: The Taichi runtime in force.
+            skips: What is not computed where it is not needed.
             full_gradient: Whether gradients include those with respect to initial state and material.
         """
         self.full_gradient = full_gradient
         first = scenes[0]
+        self.skips = skips
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
         self.batch = len(scenes)
@@ -73,7 +80,7 @@ class Storage:
         self.tiles = -(-self.particles // self.lanes)
         self.chunks = 1 if self.cuda else CHUNKS
         self.substeps = first.substeps
-        self.series = Series.for_precision(runtime.precision)
+        self._set_material(scenes, runtime.precision)
         self._set_grid(first)
         self._set_threads(runtime.threads)
         self._set_manipulators(scenes)
@@ -93,6 +100,24 @@ class Storage:
         self.nodes = self.axis**3
         self.blocks = self.blocks_per_axis**3
 
+    def _set_material(self, scenes: Sequence[Scene], precision: str) -> None:
+        series = Series.for_precision(precision)
+        if not self.skips.singular_values:
+            series = replace(series, z_squared_max=-1.0)
+        yields = any(math.isfinite(s.yield_stress) for s in scenes)
+        self.series = replace(series, plastic=yields or not self.skips.plasticity)
+        self.floor_rubs = not self.skips.friction or any(s.floor_friction > 0 for s in scenes)
+
+    def left_out(self, scenes: Sequence[Scene]) -> list[str]:
+        """Names of the :class:`Skips` because of which these scenes cannot be simulated any more."""
+        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
+        needed = {
+            "plasticity": any(math.isfinite(s.yield_stress) for s in scenes) and not self.series.plastic,
+            "friction": (any(s.floor_friction > 0 for s in scenes) and not self.floor_rubs)
+            or (rub and not self.manipulators_rub),
+        }
+        return [name for name, missing in needed.items() if missing]
+
     def _set_threads(self, threads: int) -> None:
         self.threads = threads
         # Threads beyond one per environment team up on its chunks.
@@ -103,6 +128,8 @@ class Storage:
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
+        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
+        self.manipulators_rub = rub or not self.skips.friction
         dims = [m.action_dim for m in manipulators]
         self.action_offsets = tuple(int(o) for o in np.cumsum([0, *dims])[:-1])
         self.action_dims = tuple(dims)
@@ -157,6 +184,10 @@ class Storage:
         self.once = ti.field(ti.i32, shape=())
         self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
+        # Whether a moving manipulator has touched the body since the reset, and the last environment step at
+        # whose start none had.
+        self.touched = ti.field(ti.i32, shape=b)
+        self.untouched_step = ti.field(ti.i32, shape=b)
 
     def gathered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors that particles gather from."""
