@@ -108,6 +108,16 @@ class Storage:
         self.series = replace(series, plastic=yields or not self.skips.plasticity)
         self.floor_rubs = not self.skips.friction or any(s.floor_friction > 0 for s in scenes)
 
+    def left_out(self, scenes: Sequence[Scene]) -> list[str]:
+        """Names of the :class:`Skips` because of which these scenes cannot be simulated any more."""
+        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
+        needed = {
+            "plasticity": any(math.isfinite(s.yield_stress) for s in scenes) and not self.series.plastic,
+            "friction": (any(s.floor_friction > 0 for s in scenes) and not self.floor_rubs)
+            or (rub and not self.manipulators_rub),
+        }
+        return [name for name, missing in needed.items() if missing]
+
     def _set_threads(self, threads: int) -> None:
         self.threads = threads
         # Threads beyond one per environment team up on its chunks.
