@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import taichi as ti
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
+from plab.sim.memory import held_bytes
 from plab.sim.order import curve_order
 from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
 from plab.sim.skips import Skips
@@ -101,8 +103,8 @@ class Simulator:
             scenes: One scene per environment.
             precision: ``float32`` or ``float64``.
             device: ``cpu`` or ``cuda``.
-            memory_mb: Budget for the states kept for gradients [MB]; fewer are kept and more recomputed to
-                stay in it.
+            memory_mb: Budget for all fields and arrays with a gradient [MB]; fewer states are kept and more
+                recomputed to stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             skips: What is not computed where it is not needed; for measuring what that saves.
@@ -392,6 +394,11 @@ class Simulator:
         engine = self._engine
         return ti.ndarray(engine.lane_type, shape=slots * self.batch * engine.tiles * STATE)
 
+    def memory_bytes(self) -> int:
+        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
+        its compiled kernels and what is on the way to or from the host."""
+        return held_bytes((*vars(self._engine).values(), *vars(self).values()))
+
     def _slot_bytes(self) -> int:
         engine = self._engine
         return self.batch * engine.tiles * STATE * engine.lanes * np.dtype(self._numpy_real).itemsize
@@ -400,10 +407,13 @@ class Simulator:
         """Environment steps per segment whose every state is kept, so that all fits into the memory
         budget."""
         budget = self.memory_mb * 1e6
+        self._engine.allocate_adjoint()
+        fixed = held_bytes(vars(self._engine).values()) + held_bytes((self._current, self._initial))
 
         def cost(length: int) -> int:
             segments = -(-steps // length)
-            return (length * self.substeps + 2 + (segments if segments > 1 else 0)) * self._slot_bytes()
+            slots = length * self.substeps + 2 + (segments if segments > 1 else 0)
+            return fixed + slots * self._slot_bytes()
 
         # Taichi counts the entries of an array in 32 bits.
         slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
@@ -413,18 +423,17 @@ class Simulator:
             if cost(length) <= budget and max(length * self.substeps + 1, -(-steps // length)) <= slots
         ]
         if not fitting:
-            need = min(cost(length) for length in range(1, steps + 1)) / 1e6
+            need = math.ceil(min(cost(length) for length in range(1, steps + 1)) / 1e6)
             raise MemoryError(
-                f"the gradient of {steps} steps needs at least {need:.0f} MB, but memory_mb is "
+                f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is "
                 f"{self.memory_mb:g}: "
-                f"set sim.memory_mb={need:.0f} or more"
+                f"set sim.memory_mb={need} or more"
             )
         # Fewest recomputed steps first: as few segments as possible, of even length.
         segments = -(-steps // max(fitting))
         return -(-steps // segments)
 
     def _allocate_gradient(self, length: int, segments: int) -> None:
-        self._engine.allocate_adjoint()
         slots = length * self.substeps + 1
         size = slots * self._current.shape[0]
         if self._history is None or self._history.shape[0] < size:
@@ -433,6 +442,7 @@ class Simulator:
         if segments > 1 and (
             self._checkpoints is None or self._checkpoints.shape[0] < segments * self._current.shape[0]
         ):
+            self._checkpoints = None
             self._checkpoints = self._state_array(segments)
         if self._bar is None:
             self._bar = self._state_array(1)
