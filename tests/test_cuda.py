@@ -90,9 +90,9 @@ def test_recomputed_states_give_the_same_gradient(resident: bool, monkeypatch) -
     simulator = disturbed_simulator("cuda", "float64", "soft")
     actions = random_actions()
     whole = simulator.rollout(actions).gradient
-    slot = 24 * len(SCENES) * 8 * (SCENES[0].particle_count + 32) / 1e6
-    # Room for the states of one environment step of two.
-    simulator.memory_mb = slot * (SCENES[0].substeps + 7)
+    # Room for the states of one environment step of two, and two checkpoints.
+    fewer = (SCENES[0].substeps - 2) * simulator._particles.slot_bytes
+    simulator.memory_mb = (simulator.memory_bytes() - fewer) / 1e6
     assert relative_error(simulator.rollout(actions).gradient, whole) < TOLERANCE
 
 

@@ -494,7 +494,7 @@ class SimConfig:
     Attributes:
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
-        memory_mb: Memory for the states that the gradient needs [MB]; checkpoints are spaced to fit.
+        memory_mb: Memory of the simulator with a gradient [MB]; checkpoints are spaced to fit.
         grid_size: Grid nodes per axis.
         dt: Time step of one substep [s].
         substeps: Substeps per environment step.

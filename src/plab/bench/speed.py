@@ -1,108 +1,260 @@
-"""Time of an environment step, forward and with gradient.
+"""Time of an environment step, and how far it is from what the machine can do.
 
-    python -m plab.bench.speed task=Move sim.device=cuda --batch 1 64 --steps 10
+    python -m plab.bench.speed                                       Move on the CPU
+    python -m plab.bench.speed --quick                               the same in less than a minute
+    python -m plab.bench.speed task=Rope sim.device=cuda --batch 1 64
+    python -m plab.bench.speed --task Move,Torus --precision float32 float64
+    python -m plab.bench.speed --skips                               what each skip saves
+    python -m plab.bench.speed --scaling                             from 1,000 to 1,000,000 particles
+    python -m plab.bench.speed --paper                               the paper's table of ten tasks
+    python -m plab.bench.speed --limits                              what the machine can do
 
-prints one row per batch size: first call (which compiles), and the median and spread of repeated calls after
-it.
+Rows are printed as they come, and written to --csv. docs/benchmarks.md explains the columns.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
+import gc
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
+from plab.bench import paper, scaling, skips
+from plab.bench.costs import bound, phases
+from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
+from plab.bench.table import progress, report
+from plab.bench.workload import KINDS, build, peak_rss_mb, restart_peak_rss, time_calls
+from plab.config import Config, ConfigError, load_config
+from plab.config_errors import COMPOSE_ERRORS, explain
+from plab.scene import SceneError
+from plab.sim import DeviceError, SimulationError
+from plab.suite import suite_tasks, task_list
+from plab.targets import TargetError
 
-from plab.bench.table import report
-from plab.config import load_config
-from plab.problem import Problem
-
-__all__ = ["main", "measure"]
+__all__ = ["COLUMNS", "main", "rows"]
 
 COLUMNS = (
-    "task",
-    "device",
-    "precision",
-    "batch",
-    "what",
-    "first_s",
-    "median_ms",
-    "min_ms",
-    "max_ms",
-    "steps_per_s",
-)
+    "task", "device", "precision", "batch", "what", "first_s", "median_ms", "min_ms", "max_ms",
+    "steps_per_s", "ns_per_particle", "memory_mb", "peak_rss_mb", "bound_ms", "limit", "times_bound",
+)  # fmt: skip
+
+LIMIT_COLUMNS = ("device", "precision", "limit", "value", "unit")
+
+LAUNCHES = {"forward": 1, "forward + reward": 2, "forward + reward + observation": 3, "forward + backward": 3}
+"""Launches per environment step that cannot be fewer: one for a step, for its loss, for its observation, and
+for its adjoint."""
+
+WIDE = {"what": max(map(len, KINDS)), "skip": 18, "device": 6, "batch": 5}
+"""Widths of columns whose entries are not as long as most."""
+
+QUICK_KINDS = ("forward", "forward + backward")
 
 
-def measure(call: Callable[[], object], repeats: int) -> tuple[float, np.ndarray]:
-    """Seconds of the first call, and of each of ``repeats`` calls after it, shape [repeats]."""
-    start = time.perf_counter()
-    call()
-    first = time.perf_counter() - start
-    seconds = np.empty(repeats)
-    for i in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds[i] = time.perf_counter() - start
-    return first, seconds
-
-
-def rows(overrides: list[str], batch: int, steps: int, repeats: int) -> list[dict[str, object]]:
-    """Measure one batch size.
+def rows(
+    cfg: Config, batch: int, steps: int, repeats: int, kinds: Sequence[str], limits: Limits
+) -> Iterator[dict[str, object]]:
+    """Measure one configuration and batch size.
 
     Args:
-        overrides: Configuration overrides, as for :mod:`plab.run`.
-        batch: Number of environments, all alike.
+        cfg: The configuration.
+        batch: Number of environments.
         steps: Environment steps per rollout.
-        repeats: Timed rollouts after the first.
+        repeats: Timed rollouts.
+        kinds: What is timed, keys of :data:`plab.bench.workload.KINDS`.
+        limits: What the machine can do.
 
-    Returns:
-        A row per kind of rollout; times are per environment step of the whole batch, results on the host
-        included.
+    Yields:
+        A row per kind; times are per environment step of the whole batch.
     """
-    cfg = load_config(overrides)
-    simulator = Problem([cfg] * batch).simulator
-    actions = np.random.default_rng(0).uniform(-0.5, 0.5, size=(batch, steps, simulator.action_dim))
-    out = []
-    for what, gradient in (("forward", False), ("forward + backward", True)):
-        first, seconds = measure(lambda g=gradient: simulator.rollout(actions, gradient=g), repeats)
-        ms = seconds / steps * 1e3
-        out.append(
-            {
-                "task": cfg.task.name,
-                "device": cfg.sim.device,
-                "precision": cfg.sim.precision,
-                "batch": batch,
-                "what": what,
-                "first_s": round(first, 2),
-                "median_ms": round(float(np.median(ms)), 3),
-                "min_ms": round(float(ms.min()), 3),
-                "max_ms": round(float(ms.max()), 3),
-                "steps_per_s": round(batch * 1e3 / float(np.median(ms)), 1),
-            }
-        )
-    return out
+    restart_peak_rss()
+    load = build(cfg, batch, steps)
+    simulator = load.simulator
+    for kind in kinds:
+        progress(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
+        timing = time_calls(load.call(kind), repeats)
+        median, least, most = timing.ms(steps)
+        best = bound(load, phases(load, kind == "forward + backward"), limits, LAUNCHES[kind])
+        work = batch * simulator.particle_count * simulator.substeps
+        yield {
+            "task": cfg.task.name,
+            "device": simulator.device,
+            "precision": simulator.precision,
+            "batch": batch,
+            "what": kind,
+            "first_s": round(load.first_step_s if kind == "forward" else timing.first_s, 2),
+            "median_ms": round(median, 3),
+            "min_ms": round(least, 3),
+            "max_ms": round(most, 3),
+            "steps_per_s": round(batch * 1e3 / median, 1),
+            "ns_per_particle": round(median * 1e6 / work, 3),
+            "memory_mb": round(simulator.memory_bytes() / 1e6, 1),
+            "peak_rss_mb": round(peak_rss_mb()) if simulator.device == "cpu" else "",
+            "bound_ms": round(best.ms, 3),
+            "limit": best.limit,
+            "times_bound": round(median / best.ms, 1),
+        }
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Parse the command line, measure, print, and write a CSV file if asked to."""
-    parser = argparse.ArgumentParser(prog="plab.bench.speed", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
+def _all_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
+    """Rows of the plain benchmark, precision by precision: Taichi starts anew for each."""
+    for precision in options.precision or [None]:
+        chosen = [*options.overrides, *([f"sim.precision={precision}"] if precision else [])]
+        first = load_config([*chosen, *_task(options.task[0] if options.task else None)])
+        limits = _limits(first)
+        for task in options.task or [None]:
+            for batch in options.batch:
+                gc.collect()
+                cfg = load_config([*chosen, *_task(task)])
+                yield from rows(cfg, batch, options.steps, options.repeats, options.kinds, limits)
+
+
+def _task(name: str | None) -> list[str]:
+    return [f"task={name}"] if name else []
+
+
+def _limits(cfg: Config) -> Limits:
+    progress(f"limits of the machine, {cfg.sim.device}, {cfg.sim.precision}")
+    limits = measure_limits(cfg.sim.device, cfg.sim.precision)
+    gc.collect()
+    return limits
+
+
+def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
+    for precision in options.precision or [None]:
+        cfg = load_config([*options.overrides, *([f"sim.precision={precision}"] if precision else [])])
+        limits = _limits(cfg)
+        where = {"device": cfg.sim.device, "precision": cfg.sim.precision}
+        for footprint, value in zip(FOOTPRINTS, limits.bandwidth, strict=True):
+            name = f"copy, {footprint / 1e6:.0f} MB"
+            yield where | {"limit": name, "value": round(value / 1e9, 1), "unit": "GB/s"}
+        yield where | {"limit": "arithmetic", "value": round(limits.flops / 1e9, 1), "unit": "Gflop/s"}
+        yield where | {"limit": "atomics", "value": round(limits.atomics / 1e9, 3), "unit": "G/s"}
+        yield where | {"limit": "launch", "value": round(limits.launch_s * 1e6, 1), "unit": "us"}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m plab.bench.speed",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
+    parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
+    parser.add_argument("--device", help="the same as sim.device=...")
+    parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
     parser.add_argument("--batch", type=int, nargs="+", default=[1], help="numbers of environments")
-    parser.add_argument("--steps", type=int, default=10, help="environment steps per rollout")
-    parser.add_argument("--repeats", type=int, default=5, help="timed rollouts after the first")
+    parser.add_argument("--steps", type=int, help="environment steps per rollout")
+    parser.add_argument("--repeats", type=int, help="timed rollouts")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="what is timed")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
-    options = parser.parse_intermixed_args(argv)
+    parser.add_argument("--markdown", type=Path, help="file to write the paper's table to")
+    parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
+    modes = parser.add_mutually_exclusive_group()
+    modes.add_argument("--skips", nargs="*", metavar="SKIP", help="rows with one skip off; all, or these")
+    modes.add_argument("--scaling", action="store_true", help="rows for numbers of particles and grids")
+    modes.add_argument("--paper", action="store_true", help="the paper's table beside ours")
+    modes.add_argument("--limits", action="store_true", help="what the machine can do")
+    parser.add_argument("--particles", type=int, nargs="+", help="--scaling: numbers of particles")
+    parser.add_argument("--grids", type=int, nargs="+", help="--scaling: nodes per axis")
+    return parser
+
+
+def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+    options = _parser().parse_intermixed_args(argv)
+    if options.device:
+        options.overrides = [*options.overrides, f"sim.device={options.device}"]
+    given = [override.partition("=")[0] for override in options.overrides]
+    if not options.task and "task" not in given:
+        options.task = list(suite_tasks()) if options.paper else ["Move"]
+    quick = options.quick
+    options.steps = options.steps or (5 if quick else 10)
+    options.repeats = options.repeats or (3 if quick else 7)
+    options.kinds = options.kinds or (QUICK_KINDS if quick else tuple(KINDS))
+    options.particles = options.particles or scaling.PARTICLES[: 2 if quick else None]
+    options.grids = options.grids or scaling.GRIDS[: 2 if quick else None]
+    return options
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.limits:
+        report(LIMIT_COLUMNS, _limit_rows(options), options.csv, {"limit": 13})
+    elif options.skips is not None:
+        return _run_skips(options)
+    elif options.scaling:
+        _run_scaling(options)
+    elif options.paper:
+        _run_paper(options)
+    else:
+        report(COLUMNS, _all_rows(options), options.csv, WIDE)
+    return 0
+
+
+def _precision(options: argparse.Namespace) -> list[str]:
+    """The overrides, with the first precision of the list."""
+    return [*options.overrides, *(f"sim.precision={p}" for p in (options.precision or ())[:1])]
+
+
+def _run_skips(options: argparse.Namespace) -> int:
+    overrides = _precision(options)
+    cases = skips.cases_for(load_config(overrides).sim.device, options.skips)
+    table = report(
+        skips.COLUMNS,
+        (
+            row
+            for batch in options.batch
+            for row in skips.rows(cases, overrides, batch, options.steps, options.repeats, options.quick)
+        ),
+        options.csv,
+        WIDE,
+    )
+    broken = [str(row["skip"]) for row in table if not row["equal"]]
+    if broken:
+        print(f"plab: results differ by more than rounding: {', '.join(broken)}", file=sys.stderr)
+    return 1 if broken else 0
+
+
+def _run_scaling(options: argparse.Namespace) -> None:
+    tasks = _task(options.task[0] if options.task else None)
+    kinds = QUICK_KINDS[:1] if options.quick else QUICK_KINDS
+    table = scaling.rows(
+        [*_precision(options), *tasks], options.particles, options.grids, kinds, options.repeats
+    )
+    report(scaling.COLUMNS, table, options.csv, WIDE)
+
+
+def _run_paper(options: argparse.Namespace) -> None:
     table = (
         row
         for batch in options.batch
-        for row in rows(options.overrides, batch, options.steps, options.repeats)
+        for row in paper.rows(options.task, _precision(options), batch, options.steps, options.repeats)
     )
-    report(COLUMNS, table, options.csv)
+    done = report(paper.COLUMNS, table, options.csv, {"task": 10})
+    if options.markdown is not None:
+        paper.write_markdown(options.markdown, done)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line, measure, print, and write a CSV file if asked to.
+
+    Args:
+        argv: Arguments after the program's name; those of the process by default.
+
+    Returns:
+        Exit code: 0, 1 if a skip changes results, 2 for a mistake of the user's.
+    """
+    options = _options(argv)
+    try:
+        return _run(options)
+    except COMPOSE_ERRORS as error:
+        message = explain(error)
+    except (ConfigError, SceneError, TargetError, DeviceError, SimulationError, MemoryError) as error:
+        message = str(error)
+    except OSError as error:
+        message = f"cannot write {error.filename}: {error.strerror}"
+    print(f"plab: {message}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

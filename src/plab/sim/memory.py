@@ -1,16 +1,22 @@
-"""How much memory gradients take, without allocating any."""
+"""How much memory gradients will take, and what fields and arrays do."""
 
 from __future__ import annotations
+
+import math
+
+import taichi as ti
 
 from plab.scene import Scene
 from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE
 
-__all__ = ["ENTRIES_MAX", "batch_limit", "kept_states"]
+__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
 ENTRIES_MAX = 2**31 - 1
 """Entries of one array: Taichi counts them in 32 bits."""
 
 REAL_BYTES = {"float32": 4, "float64": 8}
+
+BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
 
 
 def kept_states(steps: int, slots_per_step: int, length: int) -> int:
@@ -45,10 +51,30 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     slots_per_step = scene.substeps + (0 if device == "cpu" else 1)
     states = [kept_states(scene.horizon, slots_per_step, length) + 1 for length in lengths]
     kept = states[-1] if device == "cpu" else min(states)
-    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; the target and its distance.
+    # Current and initial state, stress, adjoints, orders and what goes with them: less than six more states.
+    kept += 6
+    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts of particles by cell; the
+    # target and its distance.
     nodes = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
-    grids = 4 * nodes * (2 * (CHUNKS if device == "cpu" else 1) + 2) + 2 * scene.grid_size**3
+    grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
     # The sparsest way to keep states, by the entries of the longer of its two arrays.
     longest = min(max(length * slots_per_step + 1, -(-scene.horizon // length)) for length in lengths)
     return max(1, min(fitting, ENTRIES_MAX // (longest * entries)))
+
+
+def array_bytes(data: ti.Field | ti.Ndarray) -> int:
+    """Bytes of a field's or an array's entries."""
+    scalars = data.element_shape if isinstance(data, ti.Ndarray) else _entry_shape(data)
+    return math.prod(data.shape) * math.prod(scalars) * BYTES[data.dtype]
+
+
+def _entry_shape(field: ti.Field) -> tuple[int, ...]:
+    return (field.n, field.m) if isinstance(field, ti.MatrixField) else ()
+
+
+def held_bytes(*holders: object) -> int:
+    """Bytes of all fields and arrays among the attributes of objects, each counted once."""
+    values = [value for holder in holders for value in vars(holder).values()]
+    held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
+    return sum(array_bytes(value) for value in held.values())

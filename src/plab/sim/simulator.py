@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
+from plab.sim.memory import held_bytes
 from plab.sim.parameters import parameter_gradient
 from plab.sim.particles import Particles
 from plab.sim.runtime import is_current, register_user, start_runtime
@@ -56,8 +57,8 @@ class Simulator:
             scenes: One scene per environment.
             precision: ``float32`` or ``float64``.
             device: ``cpu`` or ``cuda``.
-            memory_mb: Budget for the states kept for gradients [MB]; fewer are kept and more recomputed to
-                stay in it.
+            memory_mb: Budget for all fields and arrays with a gradient [MB]; fewer states are kept and more
+                recomputed to stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             full_gradient: Whether a rollout's gradient includes those with respect to the initial state
@@ -133,6 +134,11 @@ class Simulator:
     def substeps(self) -> int:
         """Substeps per environment step."""
         return self.scenes[0].substeps
+
+    def memory_bytes(self) -> int:
+        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
+        its compiled kernels and what is on the way to or from the host."""
+        return held_bytes(self, self._engine, self._particles, self._particles.order, self._tape)
 
     # -- settings -----------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.memory import ENTRIES_MAX, kept_states
+from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
 from plab.sim.storage import MEASURES
 
@@ -56,7 +56,7 @@ class Tape:
 
         Args:
             steps: Environment steps T.
-            memory_mb: Budget [MB].
+            memory_mb: Budget for everything that the simulator holds [MB].
 
         Returns:
             The most that fit into the budget, or fewer if as many segments do; all have about this length.
@@ -65,11 +65,15 @@ class Tape:
             MemoryError: If even one step per segment does not fit.
         """
         slot_bytes, slots_per_step = self._particles.slot_bytes, self._slots_per_step
-        moved = 4 * steps * self._particles.order.places if self._engine.sorts else 0
+        self._engine.allocate_adjoint()
+        # The initial state is one more of the current one's size.
+        fixed = held_bytes(self._engine, self._particles, self._particles.order) + slot_bytes
+        if self._engine.sorts:
+            # The orders of all steps, and the adjoint's other half.
+            fixed += 4 * steps * self._particles.order.places + slot_bytes
 
         def cost(length: int) -> int:
-            states = kept_states(steps, slots_per_step, length) + (1 if self._engine.sorts else 0)
-            return states * slot_bytes + moved
+            return kept_states(steps, slots_per_step, length) * slot_bytes + fixed
 
         slots = ENTRIES_MAX // self._particles.slot_entries
         fitting = [
@@ -89,7 +93,6 @@ class Tape:
         return -(-steps // segments)
 
     def _allocate(self, steps: int) -> None:
-        self._engine.allocate_adjoint()
         slots, segments = self._length * self._slots_per_step + 1, -(-steps // self._length)
         per_slot = self._particles.current.shape[0]
         if self._history is None or self._history.shape[0] < slots * per_slot:

@@ -1,0 +1,196 @@
+"""What the speed benchmarks run: a batch of environments in the middle of a demonstration."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+
+from plab.config import Config, build_scene
+from plab.demonstrations import known_actions
+from plab.objective import OBSERVED_PARTICLES, target_sdf
+from plab.sim import Simulator, Skips, State
+
+__all__ = ["KINDS", "Timing", "Workload", "build", "peak_rss_mb", "restart_peak_rss", "time_calls"]
+
+NOISE = 0.02
+"""Actions of the environments of a batch differ by this much, so that no two do the same."""
+
+WARM_UP = 2
+"""Calls after the first, which compiles, that are not counted: the CPU's kernels try sizes of their teams."""
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A simulator and the actions to time.
+
+    Attributes:
+        cfg: The configuration of all environments.
+        simulator: Their simulator; its initial state is where the actions start.
+        actions: Actions, shape [batch, T, A].
+        first_step_s: Seconds of the very first step, which compiles or loads from Taichi's cache.
+    """
+
+    cfg: Config
+    simulator: Simulator
+    actions: np.ndarray
+    first_step_s: float
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of a rollout."""
+        return self.actions.shape[1]
+
+    def call(self, kind: str) -> Callable[[], object]:
+        """Return what is timed: a rollout of one of the :data:`KINDS`."""
+        return lambda: KINDS[kind](self)
+
+
+def build(
+    cfg: Config,
+    batch: int,
+    steps: int,
+    *,
+    from_start: bool = False,
+    start: State | None = None,
+    skips: Skips | None = None,
+) -> Workload:
+    """Build a simulator and put it where the plasticine is being worked on.
+
+    Targets cost time to make and none to compare with, so the target is the initial shape, moved.
+
+    Args:
+        cfg: The configuration.
+        batch: Number of environments.
+        steps: Environment steps of a rollout.
+        from_start: Start at the scene's own initial state, instead of in the middle of the best actions
+            known.
+        start: Initial state, if it was found before.
+        skips: What is not computed where it is not needed; everything that need not be by default.
+
+    Raises:
+        plab.scene.SceneError: If the scene cannot be simulated.
+        plab.targets.TargetError: If the target, which the best actions come from, has a mistake.
+        plab.sim.DeviceError: If CUDA was asked for and is not there.
+    """
+    scene = build_scene(cfg)
+    simulator = Simulator(
+        [scene] * batch,
+        precision=cfg.sim.precision,
+        device=cfg.sim.device,
+        memory_mb=cfg.sim.memory_mb,
+        skips=skips or Skips(),
+    )
+    simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
+    weights = cfg.method.loss_weights
+    simulator.set_loss_weights(weights.density, weights.sdf, weights.contact)
+    mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
+    shape = (batch, *mass.shape)
+    simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(target_sdf(mass), shape))
+    actions = _actions(cfg, batch, scene.action_dim)
+    first = 0
+    begin = time.perf_counter()
+    simulator.step(actions[:, 0])
+    first_step_s = time.perf_counter() - begin
+    if not from_start:
+        first = max(0, actions.shape[1] // 2 - steps // 2)
+        if start is None:
+            simulator.reset()
+            for t in range(first):
+                simulator.step(actions[:, t])
+        simulator.set_initial_state(start or simulator.state())
+    chosen = np.arange(first, first + steps) % actions.shape[1]
+    return Workload(cfg, simulator, actions[:, chosen], first_step_s)
+
+
+def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:
+    """Return an episode's actions, shape [batch, T, A]: the best known, or random ones where none are."""
+    rng = np.random.default_rng(0)
+    known = known_actions(cfg)
+    if known is None:
+        known = rng.uniform(-0.5, 0.5, size=(cfg.sim.horizon, width))
+    return np.clip(known + rng.uniform(-NOISE, NOISE, size=(batch, *known.shape)), -1.0, 1.0)
+
+
+def _forward(load: Workload, *, reward: bool = False, observation: bool = False) -> None:
+    simulator = load.simulator
+    simulator.reset()
+    stride = max(simulator.particle_count // OBSERVED_PARTICLES, 1)
+    for t in range(load.steps):
+        simulator.step(load.actions[:, t])
+        if reward:
+            simulator.measure()
+        if observation:
+            simulator.observe(stride)
+            simulator.poses()
+    ti.sync()
+
+
+def _forward_backward(load: Workload) -> None:
+    load.simulator.rollout(load.actions)
+    ti.sync()
+
+
+KINDS: dict[str, Callable[[Workload], None]] = {
+    "forward": _forward,
+    "forward + reward": lambda load: _forward(load, reward=True),
+    "forward + reward + observation": lambda load: _forward(load, reward=True, observation=True),
+    "forward + backward": _forward_backward,
+}
+"""What can be timed. The reward is what every step's is made of, loss terms and IoU, on the host; the
+observation is what the environments return; the backward pass includes the losses."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of a call.
+
+    Attributes:
+        first_s: Seconds of the first call; it compiles, or loads from Taichi's cache.
+        seconds: Seconds of each counted call, shape [repeat].
+    """
+
+    first_s: float
+    seconds: np.ndarray
+
+    def ms(self, steps: int) -> np.ndarray:
+        """Milliseconds per environment step: median, least, most."""
+        values = self.seconds / steps * 1e3
+        return np.array([np.median(values), values.min(), values.max()])
+
+
+def time_calls(call: Callable[[], object], repeats: int) -> Timing:
+    """Time a call that leaves nothing running: once cold, and ``repeats`` times after the warm-up."""
+    start = time.perf_counter()
+    call()
+    first = time.perf_counter() - start
+    for _ in range(WARM_UP):
+        call()
+    seconds = np.empty(repeats)
+    for i in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds[i] = time.perf_counter() - start
+    return Timing(first, seconds)
+
+
+def restart_peak_rss() -> None:
+    """Start the process's peak resident memory anew, where Linux allows it."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_rss_mb() -> float:
+    """Peak resident memory of the process [MB] since it was started anew; NaN where it is not known."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return float("nan")
+    return next(
+        (int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")), float("nan")
+    )

@@ -1,0 +1,170 @@
+"""The benchmarks: rows are complete and kept, skips change nothing, memory is what it is said to be."""
+
+from __future__ import annotations
+
+import csv
+import gc
+import math
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plab.bench import opcount, paper, skips, speed
+from plab.bench.table import report
+from plab.scene import Body, Manipulator, Scene
+from plab.sim import Simulator, Skips
+from plab.sim import linalg as linear_algebra
+from plab.suite import suite_tasks
+
+TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
+STEPS = 6
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = tmp_path / "new" / "speed.csv"
+    assert speed.main([*TINY, "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]) == 0
+    rows = read(path)
+    assert [row["what"] for row in rows] == list(speed.QUICK_KINDS)
+    for row in rows:
+        assert tuple(row) == speed.COLUMNS
+        assert all(row.values()), row
+        assert 0 < float(row["min_ms"]) <= float(row["median_ms"]) <= float(row["max_ms"])
+        assert float(row["bound_ms"]) > 0 and float(row["memory_mb"]) > 0
+        assert row["limit"] in ("bandwidth", "arithmetic", "launches")
+    assert float(rows[1]["memory_mb"]) > float(rows[0]["memory_mb"])
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].split() == list(speed.COLUMNS) and len(printed) == 1 + len(rows)
+
+
+def test_a_skip_has_a_row_and_a_changed_result_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "skips.csv"
+    command = [*TINY, "--skips", "waiting", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
+    assert speed.main(command) == 0
+    (row,) = read(path)
+    assert tuple(row) == skips.COLUMNS
+    assert row["equal"] == "True" and float(row["loss_difference"]) == 0.0
+    monkeypatch.setattr(skips, "_differences", lambda *_: (0.1, 0.0))
+    assert speed.main(command) == 1
+    assert "results differ by more than rounding: waiting" in capsys.readouterr().err
+
+
+def test_every_skip_is_measured_on_some_device() -> None:
+    assert {case.skip for case in skips.CASES} == {field.name for field in fields(Skips)}
+
+
+def test_mistakes_are_answered_in_one_line(capsys: pytest.CaptureFixture) -> None:
+    for command, words in (
+        (["task=Mvoe"], "did you mean Move?"),
+        (["sim.precision=float16"], "float16"),
+        (["--skips", "everything"], "there is no 'everything'; choose from: empty_blocks"),
+    ):
+        assert speed.main(command) == 2
+        message = capsys.readouterr().err
+        assert message.startswith("plab: ") and message.count("\n") == 1 and words in message
+
+
+def test_rows_are_kept_when_a_benchmark_breaks_off(tmp_path: Path) -> None:
+    def rows():
+        yield {"a": 1, "b": 2}
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        report(("a", "b"), rows(), tmp_path / "table.csv")
+    assert read(tmp_path / "table.csv") == [{"a": "1", "b": "2"}]
+
+
+def test_paper_table_is_whole_and_agrees_with_itself() -> None:
+    table = paper.paper_table()
+    assert sorted(table.index) == suite_tasks()
+    for kind in ("forward", "forward_backward"):
+        np.testing.assert_array_equal((1e3 / table[f"{kind}_ms"]).round(), table[f"{kind}_fps"])
+
+
+def test_operations_are_counted() -> None:
+    nine = opcount._numbers(9)
+    assert opcount._counted(lambda: opcount.plain(linear_algebra.mul)(nine, nine)) == 45
+    assert opcount._counted(lambda: opcount.plain(linear_algebra.det)(nine)) == 14
+    single, double = (opcount.particle_operations(p) for p in ("float32", "float64"))
+    # Only the series differ.
+    assert single["gather"] == double["gather"] and single["scatter"] < double["scatter"]
+
+
+def scene(particles: int = 300) -> Scene:
+    """A ball of plasticine that never yields, next to a pillar and with a sphere coming, without friction."""
+    tools = (
+        Manipulator("Sphere", (0.06,), (0.22, 0.15, 0.5), scale=(0.02,) * 3, friction=0.0),
+        Manipulator("Cylinder", (0.05, 0.2), (0.62, 0.1, 0.5), scale=(), friction=0.0),
+    )
+    ball = Body("sphere", (0.5, 0.12, 0.5), (0.1,), particles)
+    settings = {"grid_size": 16, "substeps": 5, "dt": 2e-4, "yield_stress": math.inf, "floor_friction": 0.0}
+    return Scene("skips", (ball,), tools, **settings)
+
+
+def simulator(particles: int = 300, **settings: object) -> Simulator:
+    sim = Simulator([scene(particles)], **settings)
+    n = sim.grid_size
+    grid = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
+    distance = np.linalg.norm(grid - (0.55, 0.15, 0.5), axis=-1)
+    mass = np.where(distance < 0.12, 3.0 * scene(particles).particle_mass, 0.0)
+    sim.set_target(mass[None], np.maximum(distance - 0.12, 0.0)[None])
+    return sim
+
+
+def actions(steps: int = STEPS) -> np.ndarray:
+    """Actions that take the sphere to the ball, which it reaches in the second step."""
+    u = np.zeros((1, steps, 3))
+    u[:, :, 0] = 1.0
+    u[:, :, 1] = np.random.default_rng(0).uniform(-1, 1, size=steps)
+    return u
+
+
+def test_skips_change_nothing(device: str) -> None:
+    """In a scene that has something to skip for each of them."""
+    everything = Skips(**{field.name: False for field in fields(Skips)})
+    usual, thorough = (simulator(precision="float64", device=device, skips=s) for s in (Skips(), everything))
+    for weights in ((10.0, 10.0, 1.0), (10.0, 0.0, 0.0)):
+        results = []
+        for sim in (usual, thorough):
+            sim.set_loss_weights(*weights)
+            results.append(sim.rollout(actions()))
+        losses = [result.step_terms @ weights for result in results]
+        np.testing.assert_allclose(losses[0], losses[1], rtol=1e-9)
+        largest = np.abs(results[0].gradient).max()
+        np.testing.assert_allclose(results[0].gradient, results[1].gradient, rtol=0, atol=1e-9 * largest)
+        np.testing.assert_allclose(usual.state().x, thorough.state().x, rtol=0, atol=1e-12)
+    # What the scene is for: the first step has no adjoints of particles, the last ones have.
+    assert 0 < usual._steps_before_contact(STEPS) < STEPS
+    assert thorough._steps_before_contact(STEPS) == 0
+    assert np.abs(results[0].gradient[:, 0]).max() > 0
+
+
+def resident_mb() -> float:
+    gc.collect()
+    return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) * 1024 / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads the resident memory from /proc")
+def test_memory_is_what_it_is_said_to_be() -> None:
+    """A gradient needs no more than its budget, and what it allocates is what appears in the process."""
+    sim = simulator(60_000)
+    u = actions(4)
+    sim.rollout(u)
+    whole = sim.memory_bytes() / 1e6
+    del sim
+    gc.collect()
+    sim = simulator(60_000, memory_mb=whole / 2)
+    before = sim.rollout(u), resident_mb(), sim.memory_bytes() / 1e6
+    assert before[2] <= whole / 2
+    sim.memory_mb = 2 * whole
+    after = sim.rollout(u), resident_mb(), sim.memory_bytes() / 1e6
+    assert after[1] - before[1] == pytest.approx(after[2] - before[2], rel=0.05)
+    np.testing.assert_array_equal(before[0].gradient, after[0].gradient)
