@@ -53,8 +53,8 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     kept = states[-1] if device == "cpu" else min(states)
     # Current and initial state, stress, adjoints, orders and what goes with them: less than six more states.
     kept += 6
-    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts of particles by cell; the
-    # target and its distance.
+    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts by cell; target and
+    # distance.
     nodes = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
     grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
