@@ -310,7 +310,7 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
     run.record(make_row(0), make_state(rng))
     before = run.partial_path.read_bytes()
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(results.os, "replace", full)
@@ -318,7 +318,7 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
         run.record(make_row(1), make_state(rng))
     assert run.partial_path.read_bytes() == before
     assert not list(run.path.parent.glob("*.tmp"))
-    monkeypatch.setattr(results.Path, "write_bytes", full)
+    monkeypatch.setattr(results.tempfile, "TemporaryFile", full)
     with pytest.raises(ResultsError, match=r"cannot write results to .*No space left"):
         RunFile(make_config(tmp_path))
 
