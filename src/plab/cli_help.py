@@ -29,7 +29,7 @@ EXAMPLES
   python -m plab.run +experiment=yield_ablation                a sweep that a file describes
   python -m plab.run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
 
-  python -m plab.run +experiment=smoke hydra/launcher=batch_joblib         in several processes; docs/sweeps.md
+  python -m plab.run +experiment=smoke hydra/launcher=batch_joblib         in several processes
 
 FLAGS
   -m, --multirun    run every combination of the values given with commas
