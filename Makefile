@@ -4,6 +4,7 @@
 # make lint   check style
 # make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
 # make tables   the paper's tables beside ours, from results alone: reports/tables; RESULTS=folder or archive
+# make curves   the paper's curves and more, from results alone: reports/curves
 # make tex-packages   on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
 # make clean  remove everything that can be made again, except results
 
@@ -15,7 +16,7 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint clean system-packages tex-packages tables
+.PHONY: run test test-slow lint clean system-packages tex-packages tables curves
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
@@ -38,6 +39,9 @@ tex-packages:
 
 tables: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.report tables --results $(RESULTS) --out $(REPORTS)/tables
+
+curves: $(VENV)/.run.stamp
+	$(BIN)/python -m plab.report curves --results $(RESULTS) --out $(REPORTS)/curves
 
 clean:
 	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov

@@ -191,8 +191,8 @@ def test_difference_is_over_the_variants_that_both_have(folder: Path) -> None:
 
 
 def test_mixed_settings_are_refused_with_advice(folder: Path, tmp_path: Path) -> None:
-    for scale in (0.5, 1.0):
-        other = synthetic.config(tmp_path, seed=int(scale))
+    for seed, scale in enumerate((0.5, 0.25)):
+        other = synthetic.config(tmp_path, seed=seed)
         other["sim"]["particles_scale"] = scale
         synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
     with pytest.raises(MixedRunsError, match=r"Rope adam differ in sim\.particles_scale.*choose one"):
@@ -202,6 +202,16 @@ def test_mixed_settings_are_refused_with_advice(folder: Path, tmp_path: Path) ->
     assert runs.unusual == {"method.iterations": [synthetic.ROWS], "sim.particles_scale": [0.5]}
     note = by_form(iou_per_task(runs))["ours"].notes[-1]
     assert "sim.particles_scale = 0.5" in note
+
+
+def test_runs_that_try_something_do_not_disturb_the_others(tmp_path: Path) -> None:
+    for seed, stress in enumerate((200.0, 50.0, 10.0)):
+        other = synthetic.config(tmp_path, seed=seed)
+        other["task"]["yield_stress"], other["method"]["iterations"] = stress, 200
+        synthetic.save(synthetic.synthetic_run(other, rows=2))
+    runs = gather(tmp_path)
+    assert (len(runs.table), runs.set_aside, runs.unusual) == (1, 2, {})
+    assert len(gather(tmp_path, "task.yield_stress=10").table) == 1
 
 
 def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
@@ -318,7 +328,8 @@ def test_every_file_names_command_and_runs(written: Path, folder: Path) -> None:
         )
         assert "python -m plab.report tables" in text and digest in text
     beside = json.loads((written / "ours" / "iou_per_task.json").read_text(encoding="utf-8"))
-    assert len(beside["runs"]) == 44 and all(Path(run["path"]).is_file() for run in beside["runs"])
+    runs = json.loads((written / "ours" / beside["runs"]).read_text(encoding="utf-8"))
+    assert len(runs) == 44 and all(Path(run["path"]).is_file() for run in runs)
 
 
 def test_csv_has_all_digits(written: Path) -> None:

@@ -1,12 +1,13 @@
 """The paper's tables and curves from result files alone.
 
 python -m plab.report tables --results results --out reports/tables
-python -m plab.report tables --results runs.plab.zip task=Rope,Move seed=0,1,2
+python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -16,15 +17,20 @@ from typing import Any
 import pandas as pd
 
 import plab
-from plab.report.collect import NAMES, MixedRunsError, Runs, collect
+from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
+from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
+from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
+from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
 from plab.selection import SelectionError, select
 
-__all__ = ["main", "write_tables"]
+__all__ = ["main", "write_curves", "write_tables"]
+
+YIELD_STRESS = "task.yield_stress"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,17 +38,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     options = _parse(arguments)
     command = shlex.join(["python", "-m", "plab.report", *arguments])
+    out = options.out or Path("reports") / options.what
     try:
-        runs = collect(options.results, select(options.words, NAMES))
-        benchmark = None if options.speed is None else _benchmark(options.speed)
-        written = write_tables(runs, options.out, command, benchmark)
+        chosen = select(options.words, NAMES)
+        runs = collect(options.results, chosen)
+        if options.what == "tables":
+            benchmark = None if options.speed is None else _benchmark(options.speed)
+            count = len(write_tables(runs, out, command, benchmark))
+        else:
+            ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
+            count = len(write_curves(runs, ablation, out, command))
     except (ResultsError, SelectionError, MixedRunsError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
-    _tell(runs, written, options.out)
+    _tell(runs, f"{count} {'tables' if options.what == 'tables' else 'figures'}", out)
     return 0
 
 
@@ -53,11 +65,11 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=["tables"], help="what to make")
+    parser.add_argument("what", choices=["tables", "curves"], help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
     what = "folder of results, archive, or several of them (default: results)"
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
-    parser.add_argument("--out", type=Path, default=Path("reports/tables"), help="folder to write to")
+    parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
     options = parser.parse_intermixed_args(argv)
@@ -87,7 +99,9 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
         hyperparameters(),
     )
     tables = [table for group in groups for table in group]
-    from_runs, from_paper = _origin(runs, command), {"command": command, "footer": [f"Made by: {command}"]}
+    from_runs = _origin(runs, command, deep=True)
+    from_paper = {"command": command, "footer": [f"Made by: {command}"]}
+    _write_runs(runs, out)
     for table in tables:
         uses_runs = table.form != "paper" and table.name not in ("solvability", "hyperparameters")
         write_table(table, out, from_runs if uses_runs else from_paper)
@@ -95,7 +109,38 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     return tables
 
 
-def _origin(runs: Runs, command: str) -> dict[str, Any]:
+def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str) -> list[Drawing]:
+    """Draw all figures that there are runs for.
+
+    Args:
+        runs: Our runs.
+        ablation: Runs that differ in the yield stress, or None.
+        out: Folder to write to.
+        command: What is given as the command that makes them.
+
+    Returns:
+        The figures.
+    """
+    drawings: list[Drawing] = []
+    with style():
+        if len(runs.table):
+            series = load_series(runs)
+            drawings += [
+                *rewards(runs, series),
+                *score_curves(runs, series),
+                *rl_scores(runs),
+                *aggregates(runs),
+            ]
+        if ablation is not None:
+            groups = {value: [load_rows(path) for path in paths] for value, paths in ablation.paths.items()}
+            drawings += yield_ablation(groups, f"{ablation.task}-v{ablation.variant}", ablation.method)
+        _write_runs(runs, out)
+        save(drawings, out, _origin(runs, command, deep=False))
+    return drawings
+
+
+def _origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
+    """Return what is said about where tables or figures come from; ``deep``: for files in a subfolder."""
     digest = runs.digest
     footer = [f"Made by: {command}", f"From {len(runs.table)} run(s), SHA-256 over them {digest}"]
     return {
@@ -105,9 +150,17 @@ def _origin(runs: Runs, command: str) -> dict[str, Any]:
         "digest": digest,
         "unfinished": runs.unfinished,
         "others": runs.others,
+        "set_aside": runs.set_aside,
         "unusual": runs.unusual,
-        "runs": runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else [],
+        "runs": "../runs.json" if deep else "runs.json",
     }
+
+
+def _write_runs(runs: Runs, out: Path) -> None:
+    """Write which files the runs come from, once for all tables or figures."""
+    known = runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else []
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "runs.json").write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
 def _benchmark(path: Path) -> pd.DataFrame:
@@ -121,12 +174,13 @@ def _benchmark(path: Path) -> pd.DataFrame:
     return table
 
 
-def _tell(runs: Runs, written: Sequence[Table], out: Path) -> None:
+def _tell(runs: Runs, what: str, out: Path) -> None:
     expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
-    print(f"{out}: {len(written)} tables of {len(runs.table)} out of {expected} runs; tables.md has all")
+    print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
     for count, what in (
-        (runs.unfinished, "are not finished, hence not in the tables"),
-        (runs.others, "are of other tasks, variants, methods or seeds, hence not in the tables"),
+        (runs.unfinished, "are not finished, hence not in them"),
+        (runs.others, "are of other tasks, variants, methods or seeds, hence not in them"),
+        (runs.set_aside, "try other settings than conf/ has, hence are not in them"),
         (len(runs.unreadable), "cannot be read: python -m plab.results check"),
     ):
         if count:

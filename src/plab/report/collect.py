@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections import defaultdict
@@ -18,7 +19,7 @@ from plab.results import Row, lookup, rows
 from plab.selection import Selection
 from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 
-__all__ = ["KEYS", "NAMES", "MixedRunsError", "Runs", "collect"]
+__all__ = ["KEYS", "NAMES", "Ablation", "MixedRunsError", "Runs", "collect", "collect_ablation"]
 
 NAMES = ("task", "variant", "method", "seed")
 
@@ -56,6 +57,8 @@ class Runs:
         seeds: Seeds asked for.
         unfinished: Number of runs of theirs that are not finished, hence not in ``table``.
         others: Number of finished runs that belong to nothing asked for.
+        set_aside: Number of finished runs with more changes to plab's own settings than others of the same
+            task and method have.
         unusual: Settings other than plab's own: key to the values that occur.
         unreadable: What could not be read.
     """
@@ -67,6 +70,7 @@ class Runs:
     seeds: list[str]
     unfinished: int
     others: int
+    set_aside: int
     unusual: dict[str, list[Any]]
     unreadable: list[str]
 
@@ -75,6 +79,23 @@ class Runs:
         """SHA-256, in hex, over the runs' configurations, evaluations and times, wherever their files are."""
         lines = sorted(_fingerprint(row) for row in self.table.drop(columns="path").to_dict("records"))
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """Runs that differ in one setting.
+
+    Attributes:
+        task: Name of the task.
+        variant: Name of the variant.
+        method: Name of the method.
+        paths: Files of the runs, by the setting's value.
+    """
+
+    task: str
+    variant: str
+    method: str
+    paths: dict[Any, list[Path]]
 
 
 def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Runs:
@@ -93,7 +114,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     fitting = [row for row in found if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
-    finished = [row for row in inside if row.values["status"] == "finished"]
+    complete = [row for row in inside if row.values["status"] == "finished"]
+    finished = _prefer_usual(complete)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
     table = pd.DataFrame(values, columns=None if finished else [*NAMES, "score", "path", *KEYS])
@@ -103,8 +125,9 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         variants=asked["variant"],
         methods=asked["method"],
         seeds=asked["seed"],
-        unfinished=len(inside) - len(finished),
-        others=sum(row.values["status"] == "finished" for row in fitting) - len(finished),
+        unfinished=len(inside) - len(complete),
+        others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
+        set_aside=len(complete) - len(finished),
         unusual=_unusual(finished),
         unreadable=[str(error) for error in unreadable],
     )
@@ -119,6 +142,41 @@ def _asked(found: Sequence[Row], chosen: Selection) -> dict[str, list[str]]:
         "seed": sorted(seeds, key=int),
     }
     return {name: chosen.choices.get(name, free[name]) for name in NAMES}
+
+
+def collect_ablation(
+    source: str | Path | Sequence[str | Path], chosen: Selection, key: str
+) -> Ablation | None:
+    """Find the finished runs of one task, variant and method that differ in one setting.
+
+    Args:
+        source: Folder of results, archive, or several of them.
+        chosen: Which runs.
+        key: The setting, dotted.
+
+    Returns:
+        Those in which it takes the most values; None where it never takes more than one.
+
+    Raises:
+        MixedRunsError: If they differ in more than that, or there are two of one seed.
+    """
+    found = [row for row in rows(source)[0] if row.values["status"] == "finished"]
+    groups: dict[tuple[str, ...], dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row in found:
+        if chosen(row.values, row.config):
+            groups[tuple(str(row.values[name]) for name in NAMES[:3])][lookup(row.config, key)].append(row)
+    if not groups:
+        return None
+    (task, variant, method), by_value = max(groups.items(), key=lambda item: len(item[1]))
+    if len(by_value) < 2:
+        return None
+    for value, same in by_value.items():
+        _refuse_differing(f"{task}-v{variant} {method}, {key} = {value}", [row.config for row in same])
+        _refuse_repeated(same)
+    every = [row.config for same in by_value.values() for row in same]
+    _refuse_differing(f"{task}-v{variant} {method}", every, apart=key)
+    paths = {value: [row.path for row in same] for value, same in by_value.items()}
+    return Ablation(task, variant, method, paths)
 
 
 # --------------------------------------------------------------------------------------------------- settings
@@ -140,9 +198,9 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
             _refuse_repeated(same)
 
 
-def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]]) -> None:
+def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
     for key, values in _differences(configs).items():
-        if key not in _HARMLESS:
+        if key not in _HARMLESS and key != apart:
             texts = " and ".join(map(str, values))
             advice = f"choose one, for example {key}={values[0]}"
             raise MixedRunsError(f"runs of {what} differ in {key}, which is {texts}: {advice}")
@@ -181,24 +239,38 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield f"{path}{key}", value
 
 
+def _prefer_usual(found: Sequence[Row]) -> list[Row]:
+    """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes."""
+    changes = [len(_unusual_of(row)) for row in found]
+    fewest: dict[tuple[str, str], int] = {}
+    for row, count in zip(found, changes, strict=True):
+        fewest[_pair(row)] = min(count, fewest.get(_pair(row), count))
+    return [row for row, count in zip(found, changes, strict=True) if count == fewest[_pair(row)]]
+
+
+def _pair(row: Row) -> tuple[str, str]:
+    return row.values["task"], row.values["method"]
+
+
 def _unusual(found: Sequence[Row]) -> dict[str, list[Any]]:
     """Return the settings that are not those of plab's own files: key to the values that occur."""
-    usual: dict[str, dict[str, Any]] = {}
     unusual: dict[str, set[str]] = defaultdict(set)
     for row in found:
-        name = row.values["method"]
-        if name not in usual:
-            usual[name] = _usual(name)
-        for key, value in usual[name].items():
-            own = lookup(row.config, key)
-            if key not in _HARMLESS and own != value:
-                unusual[key].add(json.dumps(own))
-        for key, value in _usual_task(row.values["task"]).items():
-            if lookup(row.config, f"task.{key}") != value and key not in _changed_by_variant(row.config):
-                unusual[f"task.{key}"].add(json.dumps(lookup(row.config, f"task.{key}")))
+        for key, value in _unusual_of(row).items():
+            unusual[key].add(json.dumps(value))
     return {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
 
 
+def _unusual_of(row: Row) -> dict[str, Any]:
+    """Return a run's settings that are not those of plab's own files."""
+    expected = _usual(row.values["method"])
+    by_variant = _changed_by_variant(row.config)
+    task = {f"task.{k}": v for k, v in _usual_task(row.values["task"]).items() if k not in by_variant}
+    own = {key: (value, lookup(row.config, key)) for key, value in (expected | task).items()}
+    return {key: mine for key, (value, mine) in own.items() if key not in _HARMLESS and mine != value}
+
+
+@functools.cache
 def _usual(method: str) -> dict[str, Any]:
     """Return method and sim as plab's files have them; only sim of a method that plab does not know."""
     # Imported here: composing needs Hydra.
@@ -211,16 +283,12 @@ def _usual(method: str) -> dict[str, Any]:
     return dict(_leaves({name: config[name] for name in sections}))
 
 
+@functools.cache
 def _usual_task(task: str) -> dict[str, Any]:
     """Return the numbers of a task that are no part of bodies, manipulators, target or variants."""
-    if task not in _tasks:
-        path = conf_folder() / "task" / f"{task}.yaml"
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        _tasks[task] = {key: value for key, value in content.items() if not isinstance(value, dict)}
-    return _tasks[task]
-
-
-_tasks: dict[str, dict[str, Any]] = {}
+    path = conf_folder() / "task" / f"{task}.yaml"
+    content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return {key: value for key, value in content.items() if not isinstance(value, dict)}
 
 
 def _changed_by_variant(config: Mapping[str, Any]) -> Mapping[str, Any]:

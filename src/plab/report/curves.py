@@ -1,0 +1,289 @@
+"""The figures: rewards and scores during the runs, final scores, and the suite as a whole."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
+
+import numpy as np
+import pandas as pd
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, to_hex
+
+from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.collect import Runs
+from plab.report.figures import Drawing, draw_band, grid, legend, log_axis
+from plab.report.methods import RL, method
+from plab.report.series import band
+from plab.report.statistics import CONFIDENCE
+from plab.report.tables import ordered_tasks, settings_note
+
+__all__ = ["Series", "aggregates", "rewards", "rl_scores", "score_curves", "yield_ablation"]
+
+Tables = Mapping[str, list[pd.DataFrame]]
+"""Rows of runs by method."""
+
+Series = Sequence[tuple[dict[str, str], pd.DataFrame]]
+"""What :func:`plab.report.series.load_series` gives."""
+
+_CLAMPED = "Values below zero count as zero, as in the paper."
+_SHADED = "Lines: mean over the runs; shaded: one standard deviation."
+_EPISODES = "episodes"
+
+
+def _pick(series: Series, **which: str) -> dict[str, list[pd.DataFrame]]:
+    """Return the rows of the runs that are what is asked for, by method."""
+    found: dict[str, list[pd.DataFrame]] = defaultdict(list)
+    for names, table in series:
+        if all(names[key] == value for key, value in which.items()):
+            found[names["method"]].append(table)
+    return found
+
+
+def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expected: int) -> None:
+    """Draw the bands of all methods, and say in small print which of them lack runs."""
+    short = []
+    for name in runs.methods:
+        drawn = band(tables.get(name, []), axis, column)
+        if drawn is not None:
+            draw_band(axes, drawn, name, ceiling=1.0 if column == "score" else np.inf)
+        count = 0 if drawn is None else drawn.count
+        if count < expected and name in set(runs.table["method"]):
+            short.append(f"{method(name).label} {count}/{expected}")
+    axes.set_ylim(bottom=0.0)
+    text = "\n".join(short) if tables else "no runs"
+    axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=5, color="#666666")
+
+
+# ---------------------------------------------------------------------------------------------------- rewards
+
+
+def rewards(runs: Runs, series: Series) -> list[Drawing]:
+    """Return reward against episodes, per task and per configuration, all methods on one axis."""
+    notes = [
+        "Reward of an episode (sum over its steps) against episodes simulated so far, its own included.",
+        _SHADED,
+        _CLAMPED,
+        "Small print: methods that lack runs.",
+        *settings_note(runs),
+    ]
+    per_task = _per_task(runs, series, "episodes", "reward", _EPISODES, "reward")
+    tasks = ordered_tasks(runs.tasks)
+    figure, axes = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
+    for line, task in zip(axes, tasks, strict=True):
+        for panel, variant in zip(line, runs.variants, strict=True):
+            tables = _pick(series, task=task, variant=variant)
+            _panel(panel, runs, tables, "episodes", "reward", len(runs.seeds))
+            panel.set_title(f"{task}-v{variant}")
+            log_axis(panel, _EPISODES if task == tasks[-1] else "")
+        line[0].set_ylabel("reward")
+    legend(figure)
+    return [
+        Drawing("reward_per_task", per_task, notes),
+        Drawing("reward_per_configuration", figure, notes),
+    ]
+
+
+def score_curves(runs: Runs, series: Series) -> list[Drawing]:
+    """Return score against wall time and against simulated substeps, per task."""
+    notes = [
+        "Score of each row of the results: RL methods in the hard contact model, gradient methods in that of "
+        "their rollouts, so that their ends may differ from the final evaluation.",
+        "Bands end where the first of their runs ends.",
+        _SHADED,
+        *settings_note(runs),
+    ]
+    time = [
+        "Wall time of the rows, compilation in the first one included; of runs in one batch each one's share."
+    ]
+    return [
+        Drawing(name, _per_task(runs, series, axis, "score", label, "score"), [*more, *notes])
+        for name, axis, label, more in (
+            ("score_against_time", "seconds", "wall time [s]", time),
+            ("score_against_substeps", "substeps", "simulated substeps", []),
+        )
+    ]
+
+
+def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str):
+    tasks = ordered_tasks(runs.tasks)
+    columns = min(len(tasks), 5)
+    rows = -(-len(tasks) // columns)
+    figure, axes = grid(rows, columns)
+    panels = axes.ravel()
+    for panel, task in zip(panels, tasks, strict=False):
+        expected = len(runs.variants) * len(runs.seeds)
+        _panel(panel, runs, _pick(series, task=task), axis, column, expected)
+        panel.set_title(task)
+        log_axis(panel, label)
+    for panel in panels[len(tasks) :]:
+        panel.set_visible(False)
+    for line in axes:
+        line[0].set_ylabel(title)
+    legend(figure)
+    return figure
+
+
+# ------------------------------------------------------------------------------------------------- RL scores
+
+
+def rl_scores(runs: Runs) -> list[Drawing]:
+    """Return the final scores of the RL methods per task, with their limit."""
+    tasks = ordered_tasks(runs.tasks)
+    methods = [name for name in runs.methods if method(name).kind == RL]
+    with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
+        known = pd.read_csv(file).groupby("task")["score"].mean()
+    figure, axes = grid(1, 1, width=7.0, height=2.4)
+    panel = axes[0, 0]
+    width = 0.8 / max(len(methods), 1)
+    table = runs.table
+    for number, name in enumerate(methods):
+        look = method(name)
+        for position, task in enumerate(tasks):
+            scores = table[(table["task"] == task) & (table["method"] == name)]["score"].to_numpy(float)
+            if not len(scores):
+                continue
+            x = position + (number - (len(methods) - 1) / 2) * width
+            panel.bar(x, scores.mean(), width * 0.9, color=look.colour, alpha=0.45, label=look.label)
+            spread = np.linspace(-0.3, 0.3, len(scores)) * width
+            panel.scatter(x + spread, np.sort(scores), s=5, color=look.colour, linewidths=0, zorder=3)
+    panel.axhline(1.0, color="#555555", linestyle="--", linewidth=1, label="theoretical limit")
+    best = [known.get(task, np.nan) for task in tasks]
+    mark = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
+    panel.scatter(range(len(tasks)), best, label="best actions known", **mark)
+    panel.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
+    panel.set_ylim(0.0, 1.08)
+    panel.set_ylabel("normalised incremental IoU")
+    panel.grid(axis="x", visible=False)
+    legend(figure)
+    notes = [
+        "Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs.",
+        "The limit is the target itself; black: mean over the variants of what the reference demonstrations "
+        "reach.",
+        *settings_note(runs),
+    ]
+    return [Drawing("rl_scores", figure, notes)]
+
+
+# --------------------------------------------------------------------------------------------------- ablation
+
+
+def yield_ablation(groups: Mapping[float, Sequence[pd.DataFrame]], what: str, name: str) -> list[Drawing]:
+    """Return reward against episodes for several yield stresses.
+
+    Args:
+        groups: Rows of the runs by yield stress.
+        what: Task and variant, for the heading.
+        name: The method.
+    """
+    figure, axes = grid(1, 1, width=4.2, height=2.8)
+    panel = axes[0, 0]
+    stresses = sorted(groups)
+    finite = [stress for stress in stresses if 0 < stress < np.inf] or [1.0]
+    scale = LogNorm(min(finite), max(max(finite), min(finite) * 1.0001), clip=True)
+    for stress in stresses:
+        drawn = band(groups[stress], "episodes", "reward")
+        if drawn is not None:
+            # Not to the map's end, which is too light on white.
+            colour = to_hex(colormaps["viridis"](0.88 * float(scale(stress))))
+            label = f"{stress:g} ({drawn.count} runs)"
+            draw_band(panel, drawn, name, colour=colour, label=label)
+    panel.set_title(f"{what}, {method(name).label}")
+    panel.set_ylabel("reward")
+    panel.set_xlabel(_EPISODES)
+    panel.set_ylim(bottom=0.0)
+    panel.legend(title="yield stress")
+    notes = ["Reward of an episode against episodes, by yield stress.", _SHADED, _CLAMPED]
+    return [Drawing("yield_ablation", figure, notes)]
+
+
+# ------------------------------------------------------------------------------------------------ aggregates
+
+
+def aggregates(runs: Runs) -> list[Drawing]:
+    """Return interquartile means, performance profiles and probabilities of improvement."""
+    scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
+    for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
+        scores[name][task, variant] = own["score"].to_numpy(float)
+    methods = [name for name in runs.methods if name in scores]
+    keys, strata = common_strata({name: scores[name] for name in methods})
+    if not keys:
+        return []
+    apart = [method(name).label for name in methods if name not in strata]
+    methods = list(strata)
+    counts = {name: sum(map(len, strata[name])) for name in methods}
+    notes = [
+        f"Over the {len(keys)} configurations of which every method shown has runs; runs per method: "
+        + ", ".join(f"{method(name).label} {count}" for name, count in counts.items())
+        + ".",
+        *(
+            [f"Not shown, for they share no configuration with the others: {', '.join(apart)}."]
+            if apart
+            else []
+        ),
+        f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
+        *settings_note(runs),
+    ]
+    draw: tuple[Callable[..., Drawing], ...] = (_interquartile_means, _profiles, _improvements)
+    return [call(methods, strata, notes) for call in draw]
+
+
+Strata = Mapping[str, Sequence[np.ndarray]]
+
+
+def _interquartile_means(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
+    figure, axes = grid(1, 1, width=4.2, height=0.3 * len(methods) + 0.4)
+    panel, numbers = axes[0, 0], {}
+    for position, name in enumerate(methods):
+        found = interquartile_mean(strata[name])
+        numbers[name] = vars(found)
+        reach = [[max(found.value - found.low, 0.0)], [max(found.high - found.value, 0.0)]]
+        panel.errorbar(found.value, position, xerr=reach, fmt="o", color=method(name).colour, capsize=3)
+    panel.set_yticks(range(len(methods)), [method(name).label for name in methods])
+    panel.set_ylim(len(methods) - 0.5, -0.5)
+    panel.set_xlim(0.0, 1.0)
+    panel.set_xlabel("interquartile mean of the normalised incremental IoU")
+    return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
+
+
+def _profiles(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
+    figure, axes = grid(1, 1, width=4.2, height=2.8)
+    panel, thresholds = axes[0, 0], np.linspace(0.0, 1.0, 101)
+    for name in methods:
+        look = method(name)
+        shares, low, high = performance_profile(strata[name], thresholds)
+        panel.plot(thresholds, shares, color=look.colour, linestyle=look.dashes, label=look.label)
+        panel.fill_between(thresholds, low, high, color=look.colour, alpha=0.18, linewidth=0)
+    panel.set_xlim(0.0, 1.0)
+    panel.set_ylim(0.0, 1.02)
+    panel.set_xlabel("normalised incremental IoU")
+    panel.set_ylabel("share of runs above")
+    legend(figure)
+    return Drawing("performance_profile", figure, ["Share of runs whose score is higher.", *notes])
+
+
+def _improvements(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
+    labels = [method(name).label for name in methods]
+    figure, axes = grid(1, 1, width=0.62 * len(methods) + 1.2, height=0.45 * len(methods) + 0.6)
+    panel, numbers = axes[0, 0], {}
+    values = np.full((len(methods),) * 2, np.nan)
+    for i, one in enumerate(methods):
+        for j, other in enumerate(methods):
+            if i == j:
+                continue
+            found = improvement(strata[one], strata[other])
+            numbers[f"{one} over {other}"] = vars(found)
+            values[i, j] = found.value
+            text = f"{found.value:.2f}\n[{found.low:.2f}, {found.high:.2f}]"
+            shade = "white" if abs(found.value - 0.5) > 0.3 else "black"
+            panel.text(j, i, text, ha="center", va="center", fontsize=5.5, color=shade)
+    panel.imshow(values, vmin=0.0, vmax=1.0, cmap="PuOr", aspect="auto")
+    panel.set_xticks(range(len(methods)), labels)
+    panel.set_yticks(range(len(methods)), labels)
+    panel.set_xlabel("than a run of")
+    panel.set_ylabel("a run is better of")
+    panel.grid(visible=False)
+    what = "Probability that a run of the method on the left scores higher than one of the method below."
+    return Drawing("probability_of_improvement", figure, [what, *notes], numbers)

@@ -1,0 +1,207 @@
+"""Curves from results: bands, aggregates, files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+import synthetic
+from plab.report.__main__ import main
+from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.collect import NAMES, collect, collect_ablation
+from plab.report.methods import method, ordered
+from plab.report.series import band, load_series
+from plab.selection import select
+from plab.suite import PAPER_METHODS
+
+# ------------------------------------------------------------------------------------------------------ bands
+
+
+def test_band_is_mean_and_spread_where_all_runs_are() -> None:
+    one = pd.DataFrame({"episodes": [1, 3, 5], "reward": [0.0, 2.0, 4.0]})
+    other = pd.DataFrame({"episodes": [2, 4], "reward": [3.0, 5.0]})
+    found = band([one, other], "episodes", "reward")
+    assert found.count == 2 and found.x.tolist() == [2, 3, 4]
+    np.testing.assert_allclose(found.mean, [2.0, 3.0, 4.0])
+    np.testing.assert_allclose(found.std, [1.0, 1.0, 1.0])
+
+
+def test_values_below_zero_count_as_zero_run_by_run() -> None:
+    runs = [pd.DataFrame({"episodes": [1, 2], "reward": values}) for values in ([-9.0, 4.0], [1.0, -2.0])]
+    assert band(runs, "episodes", "reward").mean.tolist() == [0.5, 2.0]
+    assert band(runs, "episodes", "reward", floor=None).mean.tolist() == [-4.0, 1.0]
+
+
+def test_no_runs_and_runs_apart_give_no_band() -> None:
+    early = pd.DataFrame({"episodes": [1, 2], "reward": [0.0, 1.0]})
+    late = pd.DataFrame({"episodes": [8, 9], "reward": [0.0, 1.0]})
+    assert band([], "episodes", "reward") is None
+    assert band([early, late], "episodes", "reward") is None
+
+
+def test_long_curves_keep_their_ends() -> None:
+    x = np.arange(1, 5001)
+    found = band([pd.DataFrame({"episodes": x, "reward": np.sqrt(x)})], "episodes", "reward")
+    assert len(found.x) <= 400 and (found.x[0], found.x[-1]) == (1, 5000)
+    np.testing.assert_allclose(found.mean, np.sqrt(found.x))
+
+
+def test_axes_of_a_run(tmp_path: Path) -> None:
+    result = synthetic.run(tmp_path)
+    synthetic.save(result)
+    ((names, table),) = load_series(collect(tmp_path, select([], NAMES)))
+    assert names == {"task": "Rope", "variant": "1", "method": "adam", "seed": "0"}
+    assert table["episodes"].tolist() == [1, 2, 3, 4]
+    assert table["substeps"].tolist() == [950, 1900, 2850, 3800]
+    np.testing.assert_allclose(table["seconds"], np.cumsum(result.iterations["seconds"]))
+
+
+# ------------------------------------------------------------------------------------------------- aggregates
+
+
+def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
+    strata = [np.array([0.0, 0.1, 0.2, 0.3]), np.array([0.4, 0.5, 0.6, 9.0])]
+    found = interquartile_mean(strata)
+    assert found.value == pytest.approx(np.mean([0.2, 0.3, 0.4, 0.5]))
+    assert found.low <= found.value <= found.high
+    assert interquartile_mean(strata) == found
+
+
+def test_bootstrap_stays_within_its_strata() -> None:
+    # No spread within configurations, however different they are: nothing is uncertain.
+    found = interquartile_mean([np.full(3, value) for value in (0.0, 0.2, 0.7, 1.0)])
+    assert found.low == found.value == found.high
+
+
+def test_interval_of_a_mean_is_about_the_normal_one() -> None:
+    scores = np.random.default_rng(0).normal(0.5, 0.1, 400)
+    found = interquartile_mean([scores])
+    middle = scores[(scores > np.quantile(scores, 0.25)) & (scores < np.quantile(scores, 0.75))]
+    assert found.value == pytest.approx(middle.mean(), abs=1e-3)
+    # The trimmed mean of normal numbers has 1.19 times the variance of the mean.
+    reach = 1.96 * scores.std() * np.sqrt(1.19 / 400)
+    assert found.high - found.low == pytest.approx(2 * reach, rel=0.15)
+
+
+def test_performance_profile_is_a_share_of_runs() -> None:
+    shares, low, high = performance_profile(
+        [np.array([0.1, 0.3]), np.array([0.5, 0.9])], np.array([0.0, 0.3, 1.0])
+    )
+    assert shares.tolist() == [1.0, 0.5, 0.0]
+    assert (low <= shares).all() and (shares <= high).all()
+
+
+def test_improvement_is_the_mann_whitney_statistic() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.integers(0, 5, 7).astype(float), rng.integers(0, 4, 5).astype(float)
+    expected = stats.mannwhitneyu(a, b).statistic / (len(a) * len(b))
+    found = improvement([a], [b])
+    assert found.value == pytest.approx(expected) and found.low < expected < found.high
+    assert improvement([a, a], [b, a]).value == pytest.approx((expected + 0.5) / 2)
+    assert improvement([b], [a]).value == pytest.approx(1.0 - expected)
+
+
+def test_methods_are_compared_on_what_they_share() -> None:
+    scores = {
+        "adam": {("Rope", "1"): np.ones(3), ("Rope", "2"): np.zeros(3)},
+        "gd": {("Rope", "2"): np.full(2, 0.5)},
+    }
+    keys, strata = common_strata(scores)
+    assert keys == [("Rope", "2")] and strata["adam"][0].tolist() == [0.0] * 3
+    keys, strata = common_strata(scores | {"sac": {("Move", "1"): np.ones(1)}})
+    assert keys == [("Rope", "2")] and set(strata) == {"adam", "gd"}
+    assert common_strata({}) == ([], {})
+
+
+# ---------------------------------------------------------------------------------------------------- figures
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    results = tmp_path_factory.mktemp("results")
+    for name in ("ppo", "adam"):
+        for task in ("Rope", "Move"):
+            for variant in "12":
+                for seed in range(2):
+                    which = {"task": task, "variant": variant, "method": name, "seed": seed}
+                    synthetic.save(synthetic.run(results, **which))
+    return results
+
+
+def _ablation(folder: Path) -> None:
+    for stress in (10.0, 200.0, 1000.0):
+        for seed in range(2):
+            config = synthetic.config(folder, "Move", "3", "sac", seed)
+            config["task"]["yield_stress"] = stress
+            synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS))
+
+
+def test_ablation_is_found_among_other_runs(folder: Path, tmp_path: Path) -> None:
+    chosen = select([], NAMES)
+    assert collect_ablation(folder, chosen, "task.yield_stress") is None
+    _ablation(tmp_path)
+    found = collect_ablation([folder, tmp_path], chosen, "task.yield_stress")
+    assert (found.task, found.variant, found.method) == ("Move", "3", "sac")
+    assert {value: len(paths) for value, paths in found.paths.items()} == {10.0: 2, 200.0: 2, 1000.0: 2}
+
+
+NAMES_OF_FIGURES = {
+    "reward_per_task",
+    "reward_per_configuration",
+    "score_against_time",
+    "score_against_substeps",
+    "rl_scores",
+    "interquartile_mean",
+    "performance_profile",
+    "probability_of_improvement",
+    "yield_ablation",
+}
+
+
+def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path, capsys) -> None:
+    _ablation(tmp_path / "ablation")
+    out, words = tmp_path / "out", ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac"]
+    sources = ["--results", str(folder), str(tmp_path / "ablation")]
+    assert main(["curves", *words, *sources, "--out", str(out)]) == 0
+    assert "9 figures" in capsys.readouterr().out
+    for suffix in (".pdf", ".png", ".json"):
+        assert {path.stem for path in out.glob(f"*{suffix}")} - {"runs"} == NAMES_OF_FIGURES
+    for path in out.glob("*.pdf"):
+        image = path.read_bytes()
+        assert b"/Type3" not in image and b"/FontFile2" in image
+    for path in out.glob("*.png"):
+        pixels = matplotlib.image.imread(path)
+        assert min(pixels.shape[:2]) > 150 and pixels[..., :3].std() > 0.01
+    beside = json.loads((out / "reward_per_task.json").read_text(encoding="utf-8"))
+    assert beside["digest"] in beside["footer"][1] and beside["notes"]
+
+
+def test_same_runs_give_the_same_files(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    images = []
+    for number in range(2):
+        monkeypatch.chdir(tmp_path)
+        out = tmp_path / str(number)
+        assert main(["curves", "task=Rope", "variant=1", "--results", str(folder), "--out", "out"]) == 0
+        (tmp_path / "out").rename(out)
+        images.append({path.name: path.read_bytes() for path in out.iterdir()})
+    assert images[0] == images[1]
+
+
+def test_nothing_finished_draws_nothing(tmp_path: Path, capsys) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["curves", "--results", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 0
+    assert "0 figures of 0 out of 900 runs" in capsys.readouterr().out
+
+
+def test_every_method_has_a_look_of_its_own() -> None:
+    methods = [method(name) for name in ordered(["apg"])]
+    assert [known.name for known in methods] == [*PAPER_METHODS, "apg"]
+    assert len({known.colour for known in methods}) == len(methods)
+    assert all(known.kind for known in methods)
+    assert method("own").label == "own" and method("own").kind == ""
