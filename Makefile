@@ -3,15 +3,19 @@
 # make test-slow   the slow ones: all fifty configurations at full size, about half an hour on two cores
 # make lint   check style
 # make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
+# make tables   the paper's tables beside ours, from results alone: reports/tables; RESULTS=folder or archive
+# make tex-packages   on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
 # make clean  remove everything that can be made again, except results
 
 PYTHON ?= python3
 VENV ?= .venv
 ARGS ?= task=Rope method=adam seed=0
+RESULTS ?= results
+REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint clean system-packages
+.PHONY: run test test-slow lint clean system-packages tex-packages tables
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
@@ -28,6 +32,12 @@ lint: $(VENV)/.dev.stamp
 
 system-packages:
 	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri
+
+tex-packages:
+	apt-get install -y --no-install-recommends texlive-latex-base texlive-latex-recommended
+
+tables: $(VENV)/.run.stamp
+	$(BIN)/python -m plab.report tables --results $(RESULTS) --out $(REPORTS)/tables
 
 clean:
 	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov

@@ -6,13 +6,41 @@ import os
 
 import pytest
 
+from plab.config import Config
 from plab.run import cuda_is_usable
+from plab.sweep.tally import Outcome
 
 
 @pytest.fixture(scope="session")
 def device() -> str:
     """Device on which the simulator's tests run: ``PLAB_TEST_DEVICE``, cpu unless set."""
     return os.environ.get("PLAB_TEST_DEVICE", "cpu")
+
+
+@pytest.fixture(autouse=True)
+def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep indices of the tests' results out of the user's cache folder."""
+    folder = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
+    """Collect the configurations that reach the runners, instead of running them."""
+    from plab.runners.jobs import outcome
+
+    configs: list[Config] = []
+
+    def collect(cfg: Config) -> float:
+        configs.append(cfg)
+        return 0.5
+
+    def collect_batch(cfgs: list[Config], note: str) -> list[Outcome]:
+        return [outcome(cfg, "finished", collect(cfg)) for cfg in cfgs]
+
+    monkeypatch.setattr("plab.runners.run_config", collect)
+    monkeypatch.setattr("plab.runners.run_batch", collect_batch)
+    return configs
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -38,19 +38,6 @@ def refused(capsys) -> Callable[..., str]:
     return run
 
 
-@pytest.fixture
-def seen(monkeypatch) -> list[Config]:
-    """Collect the configurations that reach the runners, instead of running them."""
-    configs: list[Config] = []
-
-    def collect(cfg: Config) -> float:
-        configs.append(cfg)
-        return 0.5
-
-    monkeypatch.setattr("plab.runners.run_config", collect)
-    return configs
-
-
 def plab(*argv: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "plab.run", *argv], cwd=cwd, capture_output=True, text=True, check=False

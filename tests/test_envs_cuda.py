@@ -5,6 +5,12 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+import torch
+
+from plab.config import load_config
+from plab.envs.core import EpisodeBatch
+from plab.problem import Problem
+from plab.torch import TensorEnv, rollout
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 
@@ -28,3 +34,31 @@ def test_cuda_gives_what_the_cpu_gives() -> None:
         np.testing.assert_allclose(on_cuda[1], on_cpu[1], atol=1e-4)
         np.testing.assert_array_equal(on_cuda[3], on_cpu[3])
     np.testing.assert_allclose(on_cuda[4]["final_info"]["iou"], on_cpu[4]["final_info"]["iou"], atol=1e-5)
+
+
+def test_tensors_stay_on_the_device() -> None:
+    cfgs = [load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2
+    env, arrays = TensorEnv(cfgs), EpisodeBatch(cfgs)
+    first = env.reset()
+    np.testing.assert_array_equal(first.cpu().numpy(), arrays.reset()[0])
+    generator = torch.Generator("cuda").manual_seed(0)
+    for _ in range(4):
+        actions = 2.0 * torch.rand((2, 6), generator=generator, device="cuda", dtype=torch.float64) - 1.0
+        got, want = env.step(actions), arrays.step(actions.cpu().numpy())
+        assert all(tensor.is_cuda for tensor in (got.observation, got.reward, *got.info.values()))
+        np.testing.assert_allclose(got.observation.cpu().numpy(), want.observation, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(got.reward.cpu().numpy(), want.reward, atol=1e-9)
+        np.testing.assert_allclose(got.info["score"].cpu().numpy(), want.info["score"], atol=1e-9)
+
+
+def test_gradients_of_tensors_stay_on_the_device() -> None:
+    problem = Problem([load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2)
+    actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(2, 4, 6)
+    actions.requires_grad_()
+    losses = rollout(problem, actions)
+    losses.sum().backward()
+    want = problem.rollout(actions.detach().cpu().numpy(), gradient=True)
+    assert losses.is_cuda and actions.grad.is_cuda
+    np.testing.assert_allclose(losses.detach().cpu().numpy(), want.loss.sum(axis=1), rtol=1e-10)
+    scale = np.abs(want.gradient).max()
+    np.testing.assert_allclose(actions.grad.cpu().numpy(), want.gradient, atol=1e-9 * scale)

@@ -6,15 +6,18 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from plab.objective import (
     LossWeights,
+    batch_scores,
     observation,
     rewards,
     scores,
+    scores_from_iou,
     soft_iou,
     spread_mass,
     target_sdf,
@@ -186,3 +189,14 @@ def test_observation_of_a_batch(rng):
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
+
+
+def test_scores_of_a_batch_are_those_of_its_episodes() -> None:
+    start, end = np.array([0.2, 0.5, 0.9, 0.9]), np.array([0.1, 0.7, 0.9, 0.8])
+    best = np.array([0.8, 0.8, 0.9, 0.9])
+    alone = [scores_from_iou(*row) for row in zip(start, end, best, strict=True)]
+    score, printed = batch_scores(start, end, best)
+    np.testing.assert_array_equal(score, [one.score for one in alone])
+    np.testing.assert_array_equal(printed, [one.score_printed for one in alone])
+    tensor, _printed = batch_scores(start, torch.from_numpy(end), best)
+    np.testing.assert_array_equal(tensor.numpy(), score)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from plab.config import Config, ConfigError, build_scene, choices, load_config
+from plab.config import ConfigError, build_scene, choices, load_config
 from plab.results import load
 from plab.run import main
 from plab.targets import build_target
@@ -44,14 +44,6 @@ COMMANDS = [
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def seen(monkeypatch) -> list[Config]:
-    """Collect the configurations that reach the runners, instead of running them."""
-    configs: list[Config] = []
-    monkeypatch.setattr("plab.runners.run_config", lambda cfg: configs.append(cfg) or 0.5)
-    return configs
 
 
 @pytest.fixture

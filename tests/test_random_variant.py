@@ -139,12 +139,10 @@ def test_ranges_can_be_overridden():
     assert moved.manipulators["pillar"] == draw(0).manipulators["pillar"]
 
 
-def test_a_sweep_over_scenes(monkeypatch, tmp_path):
+def test_a_sweep_over_scenes(seen, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    seen = []
-    monkeypatch.setattr("plab.runners.run_config", lambda cfg: seen.append(cfg.variant) or 0.5)
     assert main(["-m", "variant=random", "seed_scene=range(3)"]) == 0
-    assert seen == ["random0", "random1", "random2"]
+    assert [cfg.variant for cfg in seen] == ["random0", "random1", "random2"]
 
 
 # ------------------------------------------------------------------------------ refusals

@@ -16,7 +16,17 @@ import pandas as pd
 import pytest
 
 from plab import results
-from plab.results import ResultsError, RunFile, RunResult, config_hash, load, read, result_path, write
+from plab.results import (
+    ResultsError,
+    RunBusyError,
+    RunFile,
+    RunResult,
+    config_hash,
+    load,
+    read,
+    result_path,
+    write,
+)
 
 
 def make_config(folder: Path, **changes) -> dict:
@@ -29,6 +39,7 @@ def make_config(folder: Path, **changes) -> dict:
         "results_dir": str(folder),
         "force": False,
         "progress": False,
+        "checkpoint_seconds": 0.0,
     }
     return config | changes
 
@@ -164,6 +175,7 @@ def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Gene
     assert_same(state["optimizer"], again.result.resume["optimizer"])
     assert again.result.wall_time["optimise"] >= 0.01
     assert again.result.provenance["resumed"] == 1
+    again.release()
     assert RunFile(make_config(tmp_path, force=True)).result.resume is None
 
 
@@ -177,7 +189,7 @@ def _empty(path: Path) -> None:
 
 def _other_version(path: Path) -> None:
     with h5py.File(path, "r+") as file:
-        file.attrs["schema_version"] = results.SCHEMA_VERSION + 1
+        file.attrs["schema_version"] = results.SCHEMA_VERSION - 1
 
 
 def _other_config(path: Path) -> None:
@@ -189,6 +201,7 @@ def _other_config(path: Path) -> None:
 def test_unusable_partial_is_moved_aside(tmp_path: Path, rng, caplog, damage) -> None:
     run = RunFile(make_config(tmp_path))
     run.record(make_row(0), make_state(rng))
+    run.release()
     damage(run.partial_path)
     again = RunFile(make_config(tmp_path))
     assert again.result.resume is None and again.result.iterations.empty
@@ -196,6 +209,68 @@ def test_unusable_partial_is_moved_aside(tmp_path: Path, rng, caplog, damage) ->
     assert run.partial_path.with_name(run.partial_path.name + ".bad").exists()
     assert len(caplog.messages) == 1
     assert str(run.partial_path) in caplog.text and "starting afresh" in caplog.text
+
+
+def test_files_moved_aside_do_not_replace_each_other(tmp_path: Path, rng) -> None:
+    for _ in range(3):
+        run = RunFile(make_config(tmp_path))
+        run.record(make_row(0), make_state(rng))
+        run.release()
+        _truncate(run.partial_path)
+    RunFile(make_config(tmp_path))
+    assert len(list(tmp_path.rglob("*.bad*"))) == 3
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("finished", [False, True])
+def test_a_file_of_a_newer_plab_is_neither_moved_nor_replaced(
+    tmp_path: Path, rng, force: bool, finished: bool
+) -> None:
+    if finished:
+        path = finish_run(tmp_path, rng).path
+    else:
+        run = RunFile(make_config(tmp_path))
+        run.record(make_row(0), make_state(rng))
+        run.release()
+        path = run.partial_path
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = results.SCHEMA_VERSION + 1
+    before = path.read_bytes()
+    with pytest.raises(results.NewerSchemaError, match=r"was written by a newer plab \(schema version 2"):
+        RunFile(make_config(tmp_path, force=force))
+    assert path.read_bytes() == before and not list(tmp_path.rglob("*.bad*"))
+
+
+def test_a_run_is_computed_by_one_at_a_time(tmp_path: Path, rng) -> None:
+    run = RunFile(make_config(tmp_path))
+    with pytest.raises(RunBusyError, match=r"seed3-.* is being computed by another process"):
+        RunFile(make_config(tmp_path))
+    run.record(make_row(0), make_state(rng))
+    run.close("stopped", "interrupted")
+    again = RunFile(make_config(tmp_path))
+    assert len(again.result.iterations) == 1
+    again.finish({"score": 1.0}, {})
+    assert RunFile(make_config(tmp_path)).finished
+    assert [path.name for path in again.path.parent.iterdir()] == [again.path.name]
+
+
+def test_partial_is_written_when_checkpoint_seconds_are_over(tmp_path: Path, rng, monkeypatch) -> None:
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    run = RunFile(make_config(tmp_path, checkpoint_seconds=5.0))
+    written = []
+    for k in range(12):
+        run.record(make_row(k), make_state(rng) | {"next_iteration": k + 1}, best_iteration=k)
+        left = read(run.partial_path)
+        assert int(left.resume["next_iteration"]) == len(left.iterations) == left.best_iteration + 1
+        written.append(len(left.iterations))
+        now += 2.0
+    assert written == [1, 1, 1, 4, 4, 4, 7, 7, 7, 10, 10, 10]
+    run.record(make_row(12), make_state(rng), keep=True)
+    assert len(read(run.partial_path).iterations) == 13
+    run.record(make_row(13), make_state(rng))
+    run.close("failed", "iteration 14: broken")
+    assert read(run.partial_path).iterations["iteration"].tolist() == list(range(14))
 
 
 def test_truncated_final_file_is_run_again(tmp_path: Path, rng, caplog) -> None:
@@ -218,6 +293,7 @@ def test_other_versions_are_mentioned_when_resuming(tmp_path: Path, rng, caplog)
     run = RunFile(make_config(tmp_path))
     run.result.provenance["torch"] = "0.4"
     run.record(make_row(0), make_state(rng))
+    run.release()
     again = RunFile(make_config(tmp_path))
     assert "torch 0.4 ->" in caplog.text
     assert again.result.resume is not None
@@ -237,12 +313,12 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(results.os, "replace", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(ResultsError, match=r"cannot write .*: No space left on device"):
         run.record(make_row(1), make_state(rng))
     assert run.partial_path.read_bytes() == before
     assert not list(run.path.parent.glob("*.tmp"))
-    monkeypatch.setattr(results.Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(ResultsError, match=r"cannot write results to .*No space left"):
         RunFile(make_config(tmp_path))
 

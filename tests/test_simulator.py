@@ -53,7 +53,7 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints() -> None:
     want = base.rollout(u)
     final = base.state()
     # All states were kept: 22 of them. Less is enough with checkpoints.
-    fewer_mb = (base.memory_bytes() - 9 * base._slot_bytes()) / 1e6
+    fewer_mb = (base.memory_bytes() - 9 * base._particles.slot_bytes) / 1e6
     for settings, batch in (
         ({"threads": 1}, 3),
         ({"threads": 2}, 1),
@@ -110,6 +110,24 @@ def test_mass_is_conserved_and_state_round_trips(sim: Simulator) -> None:
     np.testing.assert_allclose(sim.state().x, moved.x, atol=1e-6)
 
 
+def test_other_scenes_in_the_same_simulator_are_as_if_built_anew(sim: Simulator) -> None:
+    """Also between environments: the state, the order of particles and the parameters all follow."""
+    u = actions()
+    sim.set_scenes(SCENES)
+    want = sim.rollout(u)
+    turned = (2, 0, 1)
+    sim.set_scenes([SCENES[e] for e in turned])
+    got = sim.rollout(u[list(turned)])
+    # All environments have the same target.
+    np.testing.assert_allclose(got.step_terms, want.step_terms[list(turned)], rtol=1e-5)
+    with pytest.raises(SceneError, match="2 scenes for a simulator of 3"):
+        sim.set_scenes(SCENES[:2])
+    with pytest.raises(SceneError, match="same substeps"):
+        sim.set_scenes([replace(s, substeps=6) for s in SCENES])
+    sim.set_scenes(SCENES)
+    np.testing.assert_allclose(sim.rollout(u).gradient, want.gradient, rtol=1e-3, atol=1e-9)
+
+
 def test_actions_are_clipped(sim: Simulator) -> None:
     u = np.full((len(SCENES), 6), 3.0)
     sim.reset()
@@ -122,7 +140,7 @@ def test_actions_are_clipped(sim: Simulator) -> None:
 
 def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
     sim.reset()
-    with pytest.raises(ValueError, match=r"actions have shape \(3, 1, 5\), not \(3, 1, 6\)"):
+    with pytest.raises(ValueError, match=r"actions have shape \(3, 5\), not \(3, 6\)"):
         sim.step(np.zeros((3, 5)))
     with pytest.raises(ValueError, match="NaN or infinity"):
         sim.step(np.full((3, 6), math.nan))
@@ -141,6 +159,45 @@ def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
         sim.rollout(actions())
     sim.set_initial_state(start)
     assert np.isfinite(sim.rollout(actions()).gradient).all()
+
+
+def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> None:
+    want = sim.rollout(actions())
+    sim.reset()
+    start = sim.state()
+    broken = sim.state()
+    broken.v[1, 7, 0] = math.nan
+    sim.set_initial_state(broken)
+    with pytest.raises(SimulationError) as caught:
+        sim.rollout(actions())
+    assert list(caught.value.failures) == [1]
+    got = sim.rollout(actions(), strict=False)
+    assert got.failures == caught.value.failures
+    assert got.failures[1].startswith("environment step 1, substep 1: the state is not finite")
+    for name in ("step_terms", "step_iou", "gradient"):
+        np.testing.assert_array_equal(getattr(got, name)[[0, 2]], getattr(want, name)[[0, 2]])
+    sim.set_initial_state(start)
+    again = sim.rollout(actions())
+    assert not again.failures
+    np.testing.assert_array_equal(again.gradient, want.gradient)
+
+
+def test_each_environment_may_have_its_own_contact_model(sim: Simulator) -> None:
+    settings = (("soft", 666.0), ("hard", 666.0), ("soft", 200.0))
+    want = []
+    for model, softness in settings:
+        sim.set_contact(model, softness)
+        want.append(sim.rollout(actions()))
+    sim.set_contact(*zip(*settings, strict=True))
+    got = sim.rollout(actions())
+    for e, alone in enumerate(want):
+        np.testing.assert_array_equal(got.gradient[e], alone.gradient[e])
+        np.testing.assert_array_equal(got.step_terms[e], alone.step_terms[e])
+    assert not np.array_equal(want[0].gradient, want[1].gradient)
+    assert not np.array_equal(want[0].gradient, want[2].gradient)
+    with pytest.raises(ValueError, match="contact 'firm' is not one of soft, hard"):
+        sim.set_contact(["soft", "firm", "hard"])
+    sim.set_contact("soft")
 
 
 def test_memory_budget_is_named(sim: Simulator) -> None:

@@ -20,7 +20,8 @@ WEIGHTS = (10.0, 10.0, 1.0)
 
 @pytest.fixture(scope="module")
 def simulator(device: str) -> Simulator:
-    return Simulator(SCENES, precision="float64", device=device)
+    # With all gradients: tests/verification uses the same kernels.
+    return Simulator(SCENES, precision="float64", device=device, full_gradient=True)
 
 
 def actions(steps: int = STEPS) -> np.ndarray:

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from plab.config import Config, load_config
+from plab.envs.core import EpisodeBatch
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import COLUMNS
-from plab.torch import rollout
+from plab.torch import TensorEnv, rollout
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "rl.md"
 HORIZON = 3
@@ -52,6 +53,18 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem) -> None:
     expected = problem.rollout(actions.detach().numpy(), gradient=True)
     np.testing.assert_array_equal(losses.detach().numpy(), expected.loss.sum(axis=1))
     np.testing.assert_array_equal(actions.grad.numpy(), expected.gradient)
+
+
+def test_environments_of_tensors_do_what_those_of_arrays_do() -> None:
+    cfgs = [load_config([*COARSE, "sim=reference", f"task.yield_stress={s}"]) for s in (20, 50)]
+    env, arrays = TensorEnv(cfgs), EpisodeBatch(cfgs)
+    np.testing.assert_array_equal(env.reset().numpy(), arrays.reset()[0])
+    for t in range(HORIZON):
+        actions = draw(t)[:, t].detach().float()
+        got, want = env.step(actions), arrays.step(actions.numpy())
+        np.testing.assert_array_equal(got.observation.numpy(), want.observation)
+        np.testing.assert_array_equal(got.reward.numpy(), want.reward.astype(np.float32))
+        assert got.info.keys() == want.info.keys() and got.truncated == want.truncated == (t == HORIZON - 1)
 
 
 def test_each_environments_loss_is_weighed_on_its_own(problem: Problem) -> None:

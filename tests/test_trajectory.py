@@ -14,9 +14,12 @@ import pytest
 
 from plab.config import Config, load_config
 from plab.objective import scores
+from plab.problem import Problem
 from plab.results import RunResult, read, result_path
 from plab.runners import RunError, run_config, trajectory
-from plab.runners.trajectory import ActionSequence, Episode
+from plab.runners.common import measures
+from plab.runners.trajectory import ActionSequence, make_problem
+from plab.sim import SimulationError, Simulator
 
 ITERATIONS = 4
 
@@ -150,14 +153,15 @@ def test_best_actions_are_kept(tmp_path: Path) -> None:
     assert result.best_iteration == best
     assert result.best_loss == result.iterations["loss"][best]
     assert np.abs(result.best_actions).max() <= 1.0
-    episode = Episode(cfg)
-    episode.set_contact("soft", cfg.method.softness)
-    again = episode.rollout(result.best_actions, gradient=True)
-    assert again.measures["loss"] == result.best_loss
-    episode.set_contact("hard")
-    hard = episode.rollout(result.best_actions, gradient=False)
-    assert hard.measures == result.evaluation
-    assert np.array_equal(hard.final_mass, result.masses["final"])
+    problem = make_problem([cfg])
+    problem.simulator.set_contact("soft", cfg.method.softness)
+    again = problem.rollout(result.best_actions[None], gradient=True)
+    assert again.loss.sum() == result.best_loss
+    assert again.scores[0].iou_final == pytest.approx(result.iterations["iou"][best], rel=1e-12)
+    problem.simulator.set_contact("hard")
+    hard = problem.rollout(result.best_actions[None], gradient=False)
+    assert measures(hard) == result.evaluation
+    assert np.array_equal(hard.final_mass[0], result.masses["final"])
 
 
 def test_adam_h_rolls_out_in_the_hard_model(tmp_path: Path, finished: RunResult) -> None:
@@ -173,7 +177,7 @@ def test_gd_runs(tmp_path: Path) -> None:
 def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monkeypatch, capsys) -> None:
     cfg = make_config(Path(finished.config["results_dir"]))
     before = finished.path.stat().st_mtime_ns
-    monkeypatch.setattr(trajectory, "Episode", None)
+    monkeypatch.setattr(trajectory, "make_problem", None)
     assert run_config(cfg) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out
@@ -195,13 +199,13 @@ def test_force_repeats_with_the_same_numbers(tmp_path: Path, finished: RunResult
 
 def break_rollout(monkeypatch: pytest.MonkeyPatch, at: int, what) -> None:
     """Let the rollouts from number ``at`` on go through ``what``."""
-    intact, calls = Episode.rollout, iter(range(1_000))
+    intact, calls = Problem.rollout, iter(range(1_000))
 
-    def rollout(self, actions, *, gradient):
-        result = intact(self, actions, gradient=gradient)
+    def rollout(self, actions, **options):
+        result = intact(self, actions, **options)
         return what(result) if next(calls) >= at else result
 
-    monkeypatch.setattr(Episode, "rollout", rollout)
+    monkeypatch.setattr(Problem, "rollout", rollout)
 
 
 def _raise(error: BaseException):
@@ -237,7 +241,7 @@ def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, 
 def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
     cfg = make_config(tmp_path)
     partial = result_path(cfg).with_suffix(".partial.h5")
-    command = [sys.executable, "-m", "plab.run", *COARSE, f"results_dir={tmp_path}"]
+    command = [sys.executable, "-m", "plab.run", *COARSE, f"results_dir={tmp_path}", "checkpoint_seconds=0"]
     process = subprocess.Popen(command)
     try:
         while not partial.exists() and process.poll() is None:
@@ -251,17 +255,17 @@ def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Pat
     assert_same_numbers(read(result_path(cfg)), finished)
 
 
-@pytest.mark.parametrize("error", [trajectory.SimulationError, MemoryError])
+@pytest.mark.parametrize("error", [SimulationError, MemoryError])
 def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: type[Exception]) -> None:
     cfg = make_config(tmp_path)
-    intact, calls = trajectory.Simulator.rollout, iter(range(1_000))
+    intact, calls = Simulator.rollout, iter(range(1_000))
 
     def rollout(self, actions, **options):
         if next(calls) == 2:
             raise error("environment 0, step 2: position is nan")
         return intact(self, actions, **options)
 
-    monkeypatch.setattr(trajectory.Simulator, "rollout", rollout)
+    monkeypatch.setattr(Simulator, "rollout", rollout)
     with pytest.raises(RunError) as caught:
         run_config(cfg)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"

@@ -35,6 +35,14 @@ def pick(name: str, names: Sequence[str]) -> str:
     return f"{guess}choose from: {', '.join(names)}"
 
 
+LAUNCHER_EXTRAS = {
+    "joblib": "joblib",
+    "submitit_local": "submitit",
+    "submitit_slurm": "submitit",
+}
+"""Launchers of other packages, to the extra of plab that installs them."""
+
+
 def explain(error: HydraException | OmegaConfBaseException | YAMLError) -> str:
     """Return one line that says what is wrong with a configuration.
 
@@ -44,6 +52,9 @@ def explain(error: HydraException | OmegaConfBaseException | YAMLError) -> str:
     Returns:
         The line, without a full stop.
     """
+    launcher = re.search(r"Could not (?:load|find) 'hydra/launcher/(\w+)'", str(error))
+    if launcher and launcher[1] in LAUNCHER_EXTRAS:
+        return f"this launcher is not installed: pip install 'plab[{LAUNCHER_EXTRAS[launcher[1]]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return f"{group} '{name}' does not exist; {pick(name, error.options)}"

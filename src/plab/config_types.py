@@ -549,6 +549,7 @@ class Config:
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
         progress: Show a progress bar.
+        checkpoint_seconds: Time between two writings of the state from which a killed run goes on [s].
     """
 
     task: TaskConfig
@@ -561,10 +562,12 @@ class Config:
     results_dir: str
     force: bool
     progress: bool
+    checkpoint_seconds: float
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         _at_least("seed", self.seed, 0)
+        _at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if self.seed >= 2**32:
             raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
         if not self.results_dir.strip():

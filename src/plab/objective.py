@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,7 @@ __all__ = [
     "TARGET_MASS",
     "LossWeights",
     "Scores",
+    "batch_scores",
     "observation",
     "rewards",
     "scores",
@@ -204,18 +206,51 @@ def _gain(start: float, end: float, best: float) -> float:
     return (end - start) / way
 
 
+def batch_scores(start: ArrayLike, end: Any, best: ArrayLike) -> tuple[Any, Any]:
+    """Judge many episodes as :func:`scores_from_iou` judges one.
+
+    Args:
+        start: Soft IoUs of the initial mass tensors, shape [batch].
+        end: Soft IoUs of the final mass tensors, shape [batch]; an array or a tensor.
+        best: Soft IoUs of the targets themselves, shape [batch].
+
+    Returns:
+        ``score`` and ``score_printed``, like ``end``.
+    """
+    start, best = np.asarray(start), np.asarray(best)
+    return _gains(start, end, best).clip(0.0, 1.0), _gains(start, end, np.ones_like(start))
+
+
+def _gains(start: np.ndarray, end: Any, best: np.ndarray) -> Any:
+    way = best - start
+    nothing_to_gain = way <= 1e-12
+    # Divided by infinity the share is 0, to which what counts then is added.
+    share = (end - _like(end, start)) / _like(end, np.where(nothing_to_gain, np.inf, way))
+    return share + (end >= _like(end, best - 1e-12)) * _like(end, nothing_to_gain)
+
+
+def _is_tensor(array: object) -> bool:
+    return hasattr(array, "new_tensor")
+
+
+def _like(array: Any, values: ArrayLike) -> Any:
+    """Return values as a tensor if ``array`` is one, of its type and device."""
+    return array.new_tensor(np.asarray(values)) if _is_tensor(array) else np.asarray(values)
+
+
 def total_loss(terms: ArrayLike, weights: LossWeights) -> np.ndarray:
     """Weigh and add the terms of the step loss.
 
     Args:
-        terms: Density, SDF and contact term, in this order, shape [..., 3].
+        terms: Density, SDF and contact term, in this order, shape [..., 3]; an array or a tensor.
         weights: Their weights.
 
     Returns:
         Loss, shape [...].
     """
+    terms = terms if _is_tensor(terms) else np.asarray(terms)
     # No matrix product: its rounding depends on how many losses are computed at once.
-    return (np.asarray(terms) * [weights.density, weights.sdf, weights.contact]).sum(axis=-1)
+    return (terms * _like(terms, [weights.density, weights.sdf, weights.contact])).sum(-1)
 
 
 def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeights) -> np.ndarray:

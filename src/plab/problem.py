@@ -6,22 +6,24 @@ particles and manipulators, grid); variants of one task do.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plab.config import ConfigError, build_scene, variant_task
-from plab.objective import LossWeights, Scores, rewards, scores, target_sdf, total_loss
-from plab.sim import Simulator
+from plab.objective import LossWeights, Scores, rewards, scores, scores_from_iou, target_sdf, total_loss
+from plab.sim import Rollout, Simulator
 from plab.targets import TargetError, build_targets, load_release_target
 
 if TYPE_CHECKING:
     from plab.config import Config
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem"]
+__all__ = ["Episodes", "Problem", "build_scenes"]
 
 
 @dataclass(frozen=True)
@@ -33,18 +35,37 @@ class Episodes:
         loss: Weighted step losses, shape [batch, T].
         reward: Rewards, shape [batch, T].
         iou: Soft IoU with the target after each step, shape [batch, T].
-        final_mass: Mass tensors of the last states, shape [batch, n, n, n].
+        final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
         scores: How close each environment came.
         gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
+        failures: Environments that broke off, and when and why; their numbers mean nothing.
     """
 
     terms: np.ndarray
     loss: np.ndarray
     reward: np.ndarray
     iou: np.ndarray
-    final_mass: np.ndarray
+    final_mass: np.ndarray | None
     scores: list[Scores]
     gradient: np.ndarray | None
+    failures: dict[int, str]
+
+
+def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
+    """Build the scene of each configuration, one object where they are alike.
+
+    Raises:
+        plab.config.ConfigError: If a variant does not exist.
+        plab.scene.SceneError: If a scene cannot be simulated.
+    """
+    kinds = _kinds(cfgs)
+    scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
+    return [scenes[kind] for kind in kinds]
+
+
+def _kinds(cfgs: Sequence[Config]) -> list[str]:
+    """Return texts that are equal where configurations differ in method, seed and files only."""
+    return [json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.sim)]) for cfg in cfgs]
 
 
 class Problem:
@@ -56,13 +77,14 @@ class Problem:
         weights: Weights of the loss terms.
         initial_mass: Mass tensors of the initial states, shape [batch, n, n, n].
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
+        initial_scores: How close the initial states are.
     """
 
     def __init__(self, cfgs: Sequence[Config], simulator: Simulator | None = None) -> None:
         """Build everything.
 
         Args:
-            cfgs: One configuration per environment, alike in ``sim``, ``method`` and ``targets``.
+            cfgs: One configuration per environment, alike in ``sim``, ``targets`` and the loss weights.
             simulator: Simulator of the very same scenes, if there is one already.
 
         Raises:
@@ -73,52 +95,71 @@ class Problem:
         """
         _require_alike(cfgs)
         sim = cfgs[0].sim
-        # Vectorised environments are many of one configuration: what is alike is made once.
-        kinds = {id(cfg): cfg for cfg in cfgs}
-        scenes = {key: build_scene(cfg) for key, cfg in kinds.items()}
-        self.scenes: list[Scene] = [scenes[id(cfg)] for cfg in cfgs]
+        # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
+        kinds = _kinds(cfgs)
+        first = {kind: kinds.index(kind) for kind in kinds}
+        self.scenes = build_scenes(cfgs)
         self.weights: LossWeights = cfgs[0].method.loss_weights
         self.simulator = simulator or Simulator(
             self.scenes, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
         )
-        self.target_mass = _targets(cfgs, self.simulator)
+        self.target_mass = _targets([cfgs[first[kind]] for kind in kinds], self.scenes, self.simulator)
         # Distances to equal targets are equal.
-        distances = {key: _distance(self.target_mass[cfgs.index(cfg)]) for key, cfg in kinds.items()}
-        self.simulator.set_target(self.target_mass, np.stack([distances[id(cfg)] for cfg in cfgs]))
+        distances = {kind: _distance(self.target_mass[k]) for kind, k in first.items()}
+        self.simulator.set_target(self.target_mass, np.stack([distances[kind] for kind in kinds]))
         self.simulator.set_loss_weights(self.weights.density, self.weights.sdf, self.weights.contact)
         self.simulator.reset()
         self.initial_mass = self.simulator.mass_tensor()
+        judged = {kind: self._score(k, self.initial_mass[k]) for kind, k in first.items()}
+        self.initial_scores = [judged[kind] for kind in kinds]
 
-    def rollout(self, actions: np.ndarray, *, gradient: bool) -> Episodes:
+    def rollout(
+        self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True
+    ) -> Episodes:
         """Run actions from the initial states, in the simulator's current contact model.
 
         Args:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
             gradient: Whether to compute the gradient of the trajectory loss.
+            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
+            exact: Whether to fetch the mass tensors of the last states and to score those, in float64. The
+                simulator's own IoU, which scores are taken from otherwise, agrees to its rounding and takes
+                no time.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            plab.sim.SimulationError: If state, loss or gradient stop being finite.
+            plab.sim.SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
             MemoryError: If the gradient does not fit the memory budget.
         """
-        result = self.simulator.rollout(actions, gradient=gradient)
-        final_mass = self.simulator.mass_tensor()
+        result = self.simulator.rollout(actions, gradient=gradient, strict=strict)
+        final_mass = self.simulator.mass_tensor() if exact else None
         return Episodes(
             terms=result.step_terms,
             loss=total_loss(result.step_terms, self.weights),
             reward=rewards(result.initial_terms, result.step_terms, self.weights),
             iou=result.step_iou,
             final_mass=final_mass,
-            scores=self.scores(final_mass),
+            scores=self._final_scores(result, final_mass),
             gradient=result.gradient,
+            failures=result.failures,
         )
 
     def scores(self, mass: np.ndarray) -> list[Scores]:
         """Judge states by their mass tensors, shape [batch, n, n, n]."""
-        return [
-            scores(initial, final, target)
-            for initial, final, target in zip(self.initial_mass, mass, self.target_mass, strict=True)
-        ]
+        return [self._score(e, final) for e, final in enumerate(mass)]
+
+    def _score(self, e: int, mass: np.ndarray) -> Scores:
+        return scores(self.initial_mass[e], mass, self.target_mass[e])
+
+    def _final_scores(self, result: Rollout, final_mass: np.ndarray | None) -> list[Scores]:
+        """Judge the last states, by their mass tensors if there are any; what broke off has no score."""
+        judged = []
+        for e, (first, iou) in enumerate(zip(self.initial_scores, result.step_iou[:, -1], strict=True)):
+            if final_mass is None or e in result.failures:
+                judged.append(scores_from_iou(first.iou_initial, float(iou), first.iou_target_self))
+            else:
+                judged.append(self._score(e, final_mass[e]))
+        return judged
 
 
 def _distance(mass: np.ndarray) -> np.ndarray:
@@ -129,21 +170,24 @@ def _distance(mass: np.ndarray) -> np.ndarray:
         raise TargetError(f"{error}: raise sim.particles_scale or lower sim.grid_size") from None
 
 
-def _targets(cfgs: Sequence[Config], simulator: Simulator) -> np.ndarray:
-    """Return the mass tensors of the targets, shape [batch, n, n, n], built or from the release's files."""
+def _targets(cfgs: Sequence[Config], scenes: Sequence[Scene], simulator: Simulator) -> np.ndarray:
+    """Return the mass tensors of the targets, shape [batch, n, n, n], built or from the release's files.
+
+    Equal scenes are one object, as are their configurations.
+    """
     source = cfgs[0].targets.source
     if source is None:
         targets = {id(cfg): variant_task(cfg).target for cfg in cfgs}
         return build_targets(simulator, [targets[id(cfg)] for cfg in cfgs])
-    pairs = zip(simulator.scenes, cfgs, strict=True)
+    pairs = zip(scenes, cfgs, strict=True)
     return np.stack([load_release_target(source, scene, cfg.variant) for scene, cfg in pairs])
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """Refuse configurations of which one simulator could only follow the first."""
     for number, cfg in enumerate(cfgs):
-        for part in ("sim", "method", "targets"):
-            first, this = vars(getattr(cfgs[0], part)), vars(getattr(cfg, part))
+        for part in ("sim", "method.loss_weights", "targets"):
+            first, this = (vars(attrgetter(part)(one)) for one in (cfgs[0], cfg))
             if differing := [f"{part}.{key}" for key in first if first[key] != this.get(key)]:
                 raise ConfigError(
                     f"{differing[0]} differs between sub-environments 0 and {number}: "

@@ -1,12 +1,12 @@
 """The command line of runs: ``python -m plab.run task=Rope method=adam seed=0``.
 
 Hydra composes the configuration and sweeps over it; this module turns every mistake of a user into one line
-and exit code 2, and hands a checked configuration to :func:`plab.runners.run_config`.
+and exit code 2, and hands a checked configuration to :func:`plab.runners.run_config`. Sweeps are carried out
+by :class:`hydra_plugins.plab_launcher.BatchLauncher`.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import sys
@@ -19,13 +19,16 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
+from plab.checks import check_device, check_sources, cuda_is_usable
 from plab.cli_help import help_text
-from plab.config import Config, ConfigError, build_scene, check_overrides, conf_folder, finish
+from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
 from plab.scene import SceneError
-from plab.targets import TargetError, check_target, load_release_target
+from plab.sweep.tally import Refusal, Tally
+from plab.targets import TargetError
 
 __all__ = ["cuda_is_usable", "main"]
 
@@ -43,28 +46,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; those of the process by default.
 
     Returns:
-        Exit code: 0, 1 if a run broke off, 2 for a mistake of the user's, 130 after Ctrl-C.
+        Exit code: 0 if every result is there, 1 if a run broke off, 2 for a mistake of the user's, 130 after
+        Ctrl-C.
     """
-    started = False
-    code = 0
-
-    def job(composed: DictConfig) -> float:
-        nonlocal started, code
-        started = True
-        try:
-            return _run(composed)
-        except _Refused as refusal:
-            # Not raised: Hydra would add lines of its own, and the other jobs of a sweep go on.
-            code = max(code, _complain(str(refusal), refusal.code))
-            return math.nan
-
+    tally = Tally()
     try:
         argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
         if arguments.help:
             print(help_text(arguments.config_dir))
             return 0
         with _hydra_raises(argv):
-            hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(job)()
+            hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(
+                _job(tally)
+            )()
+    except Refusal as refusal:
+        return _complain(str(refusal), refusal.code)
     except COMPOSE_ERRORS as error:
         return _complain(explain(error), EXIT_USER_ERROR)
     except ConfigError as error:
@@ -72,45 +68,57 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         # Before the first job these are Hydra's: flags that exclude each other, a sweep's folder that cannot
         # be made.
-        if started:
+        if tally.started:
             raise
         writing = isinstance(error, OSError) and error.filename is not None
         reason = f"cannot write {error.filename}: {error.strerror}" if writing else str(error)
         return _complain(reason, EXIT_USER_ERROR)
     except KeyboardInterrupt:
+        tally.report()
         return _complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
     except SystemExit as stop:
         # Hydra leaves this way after --version and the like.
         return stop.code if isinstance(stop.code, int) else 0
-    return code
+    return max(tally.code, tally.report())
 
 
-class _Refused(Exception):
-    """A run that cannot be done, for a reason that one line explains."""
+def _job(tally: Tally) -> TaskFunction:
+    """Return what Hydra calls with the configuration of a single run, or of a job of another launcher."""
 
-    def __init__(self, reason: Exception, code: int) -> None:
-        super().__init__(str(reason))
-        self.code = code
+    def job(composed: DictConfig) -> float:
+        tally.started = True
+        try:
+            return _run(composed)
+        except Refusal as refusal:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                # It has to get out of the job's process.
+                raise
+            # Not raised: Hydra would add lines of its own.
+            tally.code = _complain(str(refusal), refusal.code)
+            return math.nan
+
+    # For the launcher, which has the outcomes of a sweep.
+    job.tally = tally
+    return job
 
 
 def _run(composed: DictConfig) -> float:
-    """Check one composed configuration and run it; raise :class:`_Refused` for what is no bug."""
+    """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
+    # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
         cfg = finish(composed, HydraConfig.get().overrides.task)
-        _check_target(cfg)
-        _check_device(cfg)
+        check_sources(cfg)
+        check_device(cfg)
+        from plab.runners import run_config
+        from plab.runners.jobs import USER_ERRORS, RunBusyError, RunError
     except _CONFIG_ERRORS as error:
-        raise _Refused(error, EXIT_USER_ERROR) from error
-    # Imported here: torch and taichi take seconds, which no mistake and no --help should have to wait for.
-    from plab.results import ResultsError
-    from plab.runners import RunError, run_config
-
+        raise Refusal(str(error), EXIT_USER_ERROR) from error
     try:
         return run_config(cfg)
-    except (*_CONFIG_ERRORS, ResultsError) as error:
-        raise _Refused(error, EXIT_USER_ERROR) from error
-    except RunError as error:
-        raise _Refused(error, EXIT_BROKE_OFF) from error
+    except (RunBusyError, RunError) as error:
+        raise Refusal(str(error), EXIT_BROKE_OFF) from error
+    except USER_ERRORS as error:
+        raise Refusal(str(error), EXIT_USER_ERROR) from error
 
 
 def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
@@ -138,31 +146,6 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     for override in arguments.overrides:
         rest.remove(override)
     return [*arguments.overrides, *rest], arguments
-
-
-def _check_target(cfg: Config) -> None:
-    """Find mistakes in what the target comes from before anything is compiled."""
-    scene, source = build_scene(cfg), cfg.targets.source
-    if source is None:
-        check_target(scene, cfg.task.target)
-    else:
-        load_release_target(source, scene, cfg.variant)
-
-
-def _check_device(cfg: Config) -> None:
-    if cfg.sim.device == "cuda" and not cuda_is_usable():
-        raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
-
-
-def cuda_is_usable() -> bool:
-    """Return whether there is a CUDA device, by asking the driver: there is no library to import."""
-    count = ctypes.c_int(0)
-    try:
-        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    except OSError:
-        return False
-    answered = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
-    return answered and count.value > 0
 
 
 @contextmanager

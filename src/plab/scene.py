@@ -124,6 +124,18 @@ class Manipulator:
         """Number of action components, 0 for a static manipulator."""
         return len(MANIPULATOR_SHAPES[self.shape].action_names)
 
+    def largest_step(self) -> float:
+        """Bound on how far any of its points moves in an environment step [domain units]."""
+        motion, scale = MANIPULATOR_SHAPES[self.shape].motion, np.abs(self.scale)
+        reach = sum(self.size) + self.gap
+        if motion == "static":
+            return 0.0
+        if motion == "roll":
+            roll, yaw, vertical = scale
+            return float(roll * (ROLL_RADIUS + self.size[1]) + yaw * reach + vertical)
+        length = float(np.linalg.norm(scale[:3]) + np.linalg.norm(scale[3:6]) * reach)
+        return length + 0.5 * float(scale[6]) if motion == "grip" else length
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -201,8 +213,14 @@ class Scene:
 
     @property
     def stable_dt(self) -> float:
-        """Largest admissible time step: the elastic wave of speed sqrt(lambda + 2 mu) crosses one cell."""
-        return self.dx / math.sqrt(self.lame_lambda + 2.0 * self.shear_modulus)
+        """Largest admissible time step [s].
+
+        A lone particle that swells and shrinks has the frequency omega = 2 sqrt(3 lambda + 2 mu) / dx: the
+        kernel's second moment is dx^2 / 4 wherever the particle is, and the density is 1. No mode of a body
+        is faster, because the grid's mass is that of the particles, summed (Irons and Treharne, 1971), and
+        symplectic Euler is stable while omega dt < 2.
+        """
+        return self.dx / math.sqrt(3.0 * self.lame_lambda + 2.0 * self.shear_modulus)
 
     def validate(self) -> None:
         """Check that the scene can be simulated.
@@ -211,7 +229,10 @@ class Scene:
             SceneError: With the reason and a value that would do.
         """
         _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
-        _require(self.youngs_modulus > 0, f"youngs_modulus {self.youngs_modulus:g} must be positive")
+        _require(
+            0 < self.youngs_modulus < math.inf,
+            f"youngs_modulus {self.youngs_modulus:g} must be positive and finite",
+        )
         _require(
             0 <= self.poisson_ratio < 0.5,
             f"poisson_ratio {self.poisson_ratio:g} is outside [0, 0.5)",
@@ -225,11 +246,23 @@ class Scene:
             f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of this material and grid: "
             f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}",
         )
+        _require(
+            self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
+        )
+        self._validate_gravity()
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
             self._validate_body(number, body)
         for number, manipulator in enumerate(self.manipulators):
             self._validate_manipulator(number, manipulator)
+
+    def _validate_gravity(self) -> None:
+        limit = self.dx / self.dt**2
+        strength = math.hypot(*self.gravity)
+        _require(
+            strength <= limit,
+            f"gravity {self.gravity} accelerates by more than a cell per substep: use at most {limit:.3g}",
+        )
 
     def _validate_body(self, number: int, body: Body) -> None:
         label = f"bodies[{number}]"
@@ -239,7 +272,10 @@ class Scene:
             len(body.size) == entries,
             f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}",
         )
-        _require(min(body.size) > 0, f"{label}: sizes must be positive, not {body.size}")
+        _require(
+            all(0 < size < math.inf for size in body.size),
+            f"{label}: sizes must be positive and finite, not {body.size}",
+        )
         _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
         top = 1.0 - 3.0 * self.dx
         low = np.asarray(body.center) - body.half_extent()
@@ -263,8 +299,9 @@ class Scene:
             raise SceneError(f"{label}: shape '{manipulator.shape}' is not one of {names}")
         names = ", ".join(shape.size_names)
         _require(
-            len(manipulator.size) == len(shape.size_names) and min(manipulator.size) > 0,
-            f"{label}: a {manipulator.shape} needs positive sizes ({names}), not {manipulator.size}",
+            len(manipulator.size) == len(shape.size_names)
+            and all(0 < size < math.inf for size in manipulator.size),
+            f"{label}: a {manipulator.shape} needs positive, finite sizes ({names}), not {manipulator.size}",
         )
         _require(
             len(manipulator.scale) == manipulator.action_dim,
@@ -276,8 +313,34 @@ class Scene:
             abs(norm - 1.0) < 1e-3, f"{label}: rotation has length {norm:.4g}, not 1: give a unit quaternion"
         )
         _require(
-            manipulator.friction >= 0, f"{label}: friction {manipulator.friction:g} must not be negative"
+            0 <= manipulator.friction < math.inf,
+            f"{label}: friction {manipulator.friction:g} must be finite and not negative",
         )
+        _require(
+            all(math.isfinite(c) for c in manipulator.position),
+            f"{label}: position {manipulator.position} must be three finite numbers",
+        )
+        low, high = manipulator.lower_bound, manipulator.upper_bound
+        _require(
+            all(a <= b for a, b in zip(low, high, strict=True)),
+            f"{label}: lower_bound {low} must not be above upper_bound {high}",
+        )
+        self._validate_motion(label, manipulator)
+
+    def _validate_motion(self, label: str, manipulator: Manipulator) -> None:
+        """Contact acts on nodes: what passes by more than one of them in a substep would not be felt."""
+        _require(
+            all(math.isfinite(c) for c in manipulator.scale),
+            f"{label}: scale {manipulator.scale} must be finite numbers",
+        )
+        way = manipulator.largest_step()
+        limit = self.substeps * self.dx
+        if way > limit:
+            raise SceneError(
+                f"{label}: scale {manipulator.scale} moves it by up to {way:.3g} per step, more than a cell "
+                f"per substep: scale it by {limit / way:.2g} or less, or use substeps >= "
+                f"{math.ceil(way / self.dx)}"
+            )
 
 
 def _require(condition: bool, message: str) -> None:

@@ -5,10 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["SUITE_VARIANTS", "conf_folder", "suite_tasks", "task_list"]
+__all__ = ["PAPER_METHODS", "PAPER_SEEDS", "SUITE_VARIANTS", "conf_folder", "suite_tasks", "task_list"]
 
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
+
+PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
+"""Methods that the paper compares, in its order."""
+
+PAPER_SEEDS = ("0", "1", "2")
+"""As many seeds as the paper runs of each configuration."""
 
 
 def conf_folder() -> Path:

@@ -17,12 +17,15 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
-from plab.objective import OBSERVED_PARTICLES, scores_from_iou, total_loss
+from plab.objective import OBSERVED_PARTICLES, batch_scores, total_loss
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, Simulator
+from plab.sim.tensors import on_device
 
 if TYPE_CHECKING:
+    import torch
+
     from plab.render import Renderer
 
 __all__ = [
@@ -131,15 +134,15 @@ class Transition:
 
     Attributes:
         observation: Observations, shape [batch, entry], float32.
-        reward: Rewards, shape [batch], float64.
+        reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         truncated: Whether the episodes are over.
-        info: The entries of ``info``, each of shape [batch], float64.
+        info: The entries of ``info``, each of shape [batch], in type like the rewards.
     """
 
-    observation: np.ndarray
-    reward: np.ndarray
+    observation: np.ndarray | torch.Tensor
+    reward: np.ndarray | torch.Tensor
     truncated: bool
-    info: dict[str, np.ndarray]
+    info: dict[str, np.ndarray | torch.Tensor]
 
 
 class EpisodeBatch:
@@ -157,7 +160,7 @@ class EpisodeBatch:
         """Build everything; the episodes start at :meth:`reset`.
 
         Args:
-            cfgs: One configuration per sub-environment, alike in ``sim`` and ``method``.
+            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss weights.
             contact: Contact model, ``hard`` or ``soft``.
 
         Raises:
@@ -180,8 +183,10 @@ class EpisodeBatch:
         self.action_space = Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
-        self._simulator.set_contact(contact, softness=cfgs[0].method.softness)
-        self._judged = self.problem.scores(self.problem.initial_mass)
+        self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
+        judged = self.problem.initial_scores
+        self._start_iou = np.array([start.iou_initial for start in judged])
+        self._best_iou = np.array([start.iou_target_self for start in judged])
         self._initial_info = self._info()
         self._initial_observation = self._observe()
 
@@ -191,8 +196,11 @@ class EpisodeBatch:
             raise RuntimeError("the environment is closed: make a new one")
         return self.problem.simulator
 
-    def reset(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def reset(self, like: torch.Tensor | None = None) -> tuple[Any, dict[str, Any]]:
         """Put all sub-environments into their initial states.
+
+        Args:
+            like: Given a CUDA tensor, everything returned is one too.
 
         Returns:
             Observations, shape [batch, entry], float32; and ``info``, each entry of shape [batch].
@@ -202,14 +210,17 @@ class EpisodeBatch:
         """
         self._simulator.reset()
         self._step = 0
+        if on_device(like):
+            return self._observe(like), self._info(like)
         # Copies: a caller may keep and change what it is given.
         return self._initial_observation.copy(), {name: v.copy() for name, v in self._initial_info.items()}
 
-    def step(self, actions: np.ndarray) -> Transition:
+    def step(self, actions: np.ndarray | torch.Tensor) -> Transition:
         """Advance all sub-environments by one step.
 
         Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1].
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes back
+                are tensors on the same device, and no array crosses to the host.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -223,9 +234,10 @@ class EpisodeBatch:
             raise ResetNeeded(f"{what}: call reset() before step()")
         simulator.step(actions)
         self._step += 1
-        info = self._info()
-        reward = self._initial_info["loss"] - info["loss"]
-        return Transition(self._observe(), reward, self._step == self.horizon, info)
+        info = self._info(actions)
+        start = self._initial_info["loss"]
+        reward = (actions.new_tensor(start) if on_device(actions) else start) - info["loss"]
+        return Transition(self._observe(actions), reward, self._step == self.horizon, info)
 
     def frames(self) -> tuple[np.ndarray, ...]:
         """Draw the current states.
@@ -250,27 +262,29 @@ class EpisodeBatch:
         self._renderers = []
         self.problem = None
 
-    def _observe(self) -> np.ndarray:
-        particles, poses = self._simulator.observe(self._stride), self._simulator.poses()
-        out = np.empty((self.size, *self.observation_space.shape), np.float32)
-        split = particles[0].size
-        out[:, :split] = particles.reshape(self.size, -1)
-        out[:, split:] = poses.reshape(self.size, -1)[:, self._pose_entries]
-        return out
+    def _observe(self, like: object = None) -> Any:
+        particles, poses = self._simulator.observe(self._stride, like), self._simulator.poses(like)
+        rows = particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]
+        if on_device(like):
+            # Whoever gave a tensor has imported torch.
+            import torch
 
-    def _info(self) -> dict[str, np.ndarray]:
-        measures = self._simulator.measure()
-        density, sdf, contact = measures.terms.T.copy()
-        pairs = zip(self._judged, measures.iou, strict=True)
-        scores = [scores_from_iou(first.iou_initial, iou, first.iou_target_self) for first, iou in pairs]
+            return torch.cat(rows, dim=1).float()
+        out = np.empty((self.size, *self.observation_space.shape), np.float32)
+        return np.concatenate(rows, axis=1, out=out, casting="same_kind")
+
+    def _info(self, like: object = None) -> dict[str, Any]:
+        measures = self._simulator.measure(like)
+        terms, iou = measures.terms, measures.iou
+        score, printed = batch_scores(self._start_iou, iou, self._best_iou)
         return {
-            "loss": total_loss(measures.terms, self.problem.weights),
-            "loss_density": density,
-            "loss_sdf": sdf,
-            "loss_contact": contact,
-            "iou": measures.iou,
-            "score": np.array([s.score for s in scores]),
-            "score_printed": np.array([s.score_printed for s in scores]),
+            "loss": total_loss(terms, self.problem.weights),
+            "loss_density": terms[:, 0],
+            "loss_sdf": terms[:, 1],
+            "loss_contact": terms[:, 2],
+            "iou": iou,
+            "score": score,
+            "score_printed": printed,
         }
 
 

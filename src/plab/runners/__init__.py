@@ -1,20 +1,26 @@
-"""Runners: one per family of methods; each turns a configuration into a result file.
+"""Runners: one per family of methods; each turns configurations into result files.
 
 A family is one entry of :data:`RUNNERS`. Its module is imported when it is needed, so that an open-loop
-method does not import a reinforcement-learning library.
+method does not import a reinforcement-learning library. Runs are carried out in batches; a single run is a
+batch of one.
 """
 
 from __future__ import annotations
 
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
-from plab.results import ResultsError, RunFile
+from plab.results import ResultsError, RunBusyError, RunFile
+from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
+from plab.sweep.tally import Outcome
 
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["RUNNERS", "RunError", "Runner", "run_config"]
+__all__ = ["BATCHING", "RUNNERS", "Job", "RunError", "Runner", "run_batch", "run_config"]
 
 RUNNERS = {
     "trajectory": "plab.runners.trajectory:run_trajectory",
@@ -23,15 +29,17 @@ RUNNERS = {
 }
 """Family of methods (``method.family``) to the :class:`Runner` of it, as ``module:name``."""
 
-
-class RunError(RuntimeError):
-    """A run that cannot go on; the message says in which iteration and why."""
+BATCHING = ("trajectory",)
+"""Families whose runs can share a simulator; the others batch the environments of one run."""
 
 
 class Runner(Protocol):
-    """A function that takes a run from where its file stands to the end, and finishes the file."""
+    """A function that takes runs from where their files stand to the end, and finishes the files.
 
-    def __call__(self, cfg: Config, run: RunFile) -> None: ...
+    A run that breaks off is noted in its job and does not disturb the others.
+    """
+
+    def __call__(self, jobs: Sequence[Job], note: str = "") -> None: ...
 
 
 def run_config(cfg: Config) -> float:
@@ -44,32 +52,93 @@ def run_config(cfg: Config) -> float:
         Score of the final evaluation, in [0, 1].
 
     Raises:
-        ResultsError: If the results folder cannot be written.
+        ResultsError: If the results folder cannot be written, or another process computes the run.
         RunError: If the run broke off; what it computed is kept in the partial file.
     """
-    run = RunFile(cfg)
-    if run.finished:
-        return _conclude(run, "finished before")
-    runner = _runner(cfg.method.family)
-    try:
-        runner(cfg, run)
-    except KeyboardInterrupt:
-        run.close("stopped", "interrupted")
-        raise
-    except ResultsError:
-        # The file itself is what failed: nothing more can be written to it.
-        raise
-    except Exception as error:
-        run.close("failed", str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}")
-        raise
-    return _conclude(run, "finished")
-
-
-def _conclude(run: RunFile, what: str) -> float:
-    """Say in one line how the run ended; return its score."""
-    score = run.result.evaluation["score"]
-    print(f"{what}: score {score:.4f}, {run.path}")
+    job = Job(cfg, RunFile(cfg))
+    before = job.run.finished
+    if not before:
+        _carry_out([job])
+    if job.error is not None:
+        raise job.error
+    score = job.run.result.evaluation["score"]
+    print(f"{'finished before' if before else 'finished'}: score {score:.4f}, {job.run.path}")
     return score
+
+
+def run_batch(cfgs: Sequence[Config], note: str = "") -> list[Outcome]:
+    """Run configurations that fit together; see :func:`plab.sweep.plan`.
+
+    Runs that have finished before, or that another process computes, are left out.
+
+    Args:
+        cfgs: The composed and checked configurations.
+        note: How far the sweep has come, shown before the progress.
+
+    Returns:
+        How each run ended, in the order of ``cfgs``.
+    """
+    jobs: dict[int, Job] = {}
+    ended: dict[int, Outcome] = {}
+    for number, cfg in enumerate(cfgs):
+        try:
+            jobs[number] = Job(cfg, RunFile(cfg))
+        except RunBusyError as error:
+            ended[number] = outcome(cfg, "elsewhere", message=str(error))
+        except ResultsError as error:
+            ended[number] = outcome(cfg, "refused", message=str(error))
+    before = {number for number, job in jobs.items() if job.run.finished}
+    if todo := [job for number, job in jobs.items() if number not in before]:
+        _carry_out(todo, note)
+        _print_bugs(todo)
+    for number, job in jobs.items():
+        ended[number] = one = _outcome(job, "before" if number in before else "finished")
+        if one.status == "finished":
+            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
+    return [ended[number] for number in range(len(cfgs))]
+
+
+def _outcome(job: Job, how: str) -> Outcome:
+    if job.error is None:
+        return outcome(job.cfg, how, job.run.result.evaluation["score"])
+    refused = isinstance(job.error, USER_ERRORS)
+    what = str(job.error) if refused or isinstance(job.error, RunError) else describe(job.error)
+    return outcome(job.cfg, "refused" if refused else "failed", message=what)
+
+
+def _print_bugs(jobs: Sequence[Job]) -> None:
+    """Print the traceback of each error that nobody foresaw, once if it ended several runs."""
+    errors = {id(job.error): job.error for job in jobs if job.error is not None}
+    for error in errors.values():
+        if not isinstance(error, (RunError, *USER_ERRORS)):
+            traceback.print_exception(error)
+
+
+def _carry_out(jobs: Sequence[Job], note: str = "") -> None:
+    """Run jobs to their ends; afterwards each has finished or has an error, and holds no lock."""
+    halves: list[Sequence[Job]] = []
+    try:
+        _runner(jobs[0].cfg.method.family)(jobs, note)
+    except KeyboardInterrupt:
+        for job in jobs:
+            if job.open:
+                # The others are to be closed even if this one's file cannot be written.
+                with suppress(ResultsError):
+                    job.run.close("stopped", "interrupted")
+        raise
+    except TogetherError:
+        halves = [jobs[: len(jobs) // 2], jobs[len(jobs) // 2 :]]
+    except Exception as error:
+        for job in jobs:
+            if job.open:
+                job.fail(error)
+    finally:
+        if not halves:
+            for job in jobs:
+                job.run.release()
+    # Not in the handler: there the error still refers to the simulator that was too large.
+    for half in halves:
+        _carry_out(half, note)
 
 
 def _runner(family: str) -> Runner:

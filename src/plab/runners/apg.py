@@ -20,6 +20,7 @@ import torch
 
 from plab.results import RunFile
 from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_threads
+from plab.runners.jobs import Job, title
 from plab.runners.progress import show_progress
 from plab.torch import rollout
 
@@ -30,16 +31,19 @@ if TYPE_CHECKING:
 __all__ = ["PolicyTraining", "run_apg"]
 
 
-def run_apg(cfg: Config, run: RunFile) -> None:
+def run_apg(jobs: Sequence[Job], note: str = "") -> None:
     """Train a policy network, evaluate the best actions in the hard contact model, finish the file.
 
     Args:
-        cfg: The composed configuration; ``cfg.method`` is a :class:`plab.config.ApgConfig`.
-        run: The run's file; an earlier process's state in it is taken up.
+        jobs: One job; ``cfg.method`` is a :class:`plab.config.ApgConfig`. What an earlier process left in its
+            file is taken up.
+        note: Shown before the progress.
 
     Raises:
         plab.runners.RunError: If the loss, the gradient or the state stops being finite.
     """
+    (job,) = jobs
+    cfg, run = job.cfg, job.run
     with torch_threads(cfg.method.torch_threads), simulation_errors():
         with run.phase("build"):
             (episode,) = kept_batches(cfg, (1, cfg.method.contact))
@@ -47,7 +51,7 @@ def run_apg(cfg: Config, run: RunFile) -> None:
             training = PolicyTraining(cfg.method, *sizes, cfg.seed)
             if run.result.resume is not None:
                 training.restore(run.result.resume)
-        _optimise(cfg, episode, training, run)
+        _optimise(cfg, episode, training, run, note)
         problem = episode.problem
         with run.phase("evaluate"):
             problem.simulator.set_contact("hard")
@@ -110,11 +114,10 @@ def _network(widths: Sequence[int]) -> torch.nn.Sequential:
     return torch.nn.Sequential(*layers[:-1], torch.nn.Tanh())
 
 
-def _optimise(cfg: Config, episode: EpisodeBatch, training: PolicyTraining, run: RunFile) -> None:
+def _optimise(cfg: Config, episode: EpisodeBatch, training: PolicyTraining, run: RunFile, note: str) -> None:
     """Do the iterations that the file does not hold yet."""
     start, total = len(run.result.iterations), cfg.method.iterations
-    title = f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
-    with show_progress(title, start, total, enabled=cfg.progress) as report:
+    with show_progress(note + title(cfg), start, total, enabled=cfg.progress) as report:
         for iteration in range(start, total):
             # The first rollout of a process compiles the kernels.
             with run.phase("compile" if iteration == start else "optimise"):

@@ -7,14 +7,14 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 
 from plab.envs.core import EpisodeBatch
 from plab.problem import Episodes
-from plab.runners import RunError
+from plab.runners.jobs import RunError
 from plab.sim import DeviceError, SimulationError
 
 if TYPE_CHECKING:
@@ -23,12 +23,15 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "PolicyEpisode",
+    "kept",
     "kept_batches",
     "measures",
     "policy_episode",
     "simulation_errors",
     "torch_threads",
 ]
+
+Kept = TypeVar("Kept")
 
 COLUMNS = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
 """Columns of the results that every method has: what an episode is measured by."""
@@ -37,16 +40,16 @@ _LAST = ("iou", "score")
 """Columns that judge the last state; the others are sums over the steps."""
 
 
-def measures(result: Episodes) -> dict[str, float]:
-    """Return the scalars of the final evaluation, :data:`COLUMNS` among them, of a batch of one."""
-    density, sdf, contact = result.terms[0].sum(axis=0)
-    judged = result.scores[0]
+def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
+    """Return the scalars of the final evaluation, :data:`COLUMNS` among them, of one environment."""
+    density, sdf, contact = result.terms[environment].sum(axis=0)
+    judged = result.scores[environment]
     return {
-        "loss": float(result.loss[0].sum()),
+        "loss": float(result.loss[environment].sum()),
         "loss_density": float(density),
         "loss_sdf": float(sdf),
         "loss_contact": float(contact),
-        "reward": float(result.reward[0].sum()),
+        "reward": float(result.reward[environment].sum()),
         "iou": judged.iou_final,
         "score": judged.score,
         "score_printed": judged.score_printed,
@@ -90,8 +93,31 @@ def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarra
     return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
 
 
-_kept: dict[str, list[EpisodeBatch]] = {}
-"""The last environments of this process by what they were made for: a sweep over seeds compiles once."""
+_kept: dict[Any, Any] = {}
+"""The last simulator of this process, in whatever it is part of, by what it was made for: a sweep over seeds
+compiles once."""
+
+
+def kept(key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
+    """Return something that holds a simulator: what is kept from the last run, if that is the same.
+
+    Args:
+        key: What it is made for.
+        build: Makes a new one.
+        check: Called with the old one; raises RuntimeError if its memory is gone.
+    """
+    try:
+        if key in _kept:
+            check(_kept[key])
+            return _kept[key]
+    except RuntimeError:
+        # Somebody else restarted Taichi with another precision or device.
+        pass
+    # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels again.
+    _kept.clear()
+    gc.collect()
+    _kept[key] = build()
+    return _kept[key]
 
 
 def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
@@ -106,21 +132,16 @@ def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
     """
     method = asdict(cfg.method)
     parts = [asdict(cfg.task), asdict(cfg.sim), asdict(cfg.targets), method["loss_weights"], kinds]
-    wanted = json.dumps([*parts, cfg.variant])
-    try:
-        for batch, (_, contact) in zip(_kept.get(wanted, []), kinds, strict=False):
+
+    def build() -> list[EpisodeBatch]:
+        return [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]
+
+    def start_again(batches: list[EpisodeBatch]) -> None:
+        for batch, (_, contact) in zip(batches, kinds, strict=True):
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
-        if wanted in _kept:
-            return _kept[wanted]
-    except RuntimeError:
-        # Somebody else restarted Taichi with another precision or device, and the memory is gone.
-        pass
-    # Let go of the old ones before there are new ones: only then does Taichi find its compiled kernels again.
-    _kept.clear()
-    gc.collect()
-    _kept[wanted] = [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]
-    return _kept[wanted]
+
+    return kept(json.dumps([*parts, cfg.variant]), build, check=start_again)
 
 
 @contextmanager
@@ -135,9 +156,9 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 @contextmanager
-def simulation_errors() -> Iterator[None]:
-    """Turn what the simulator raises into a RunError."""
+def simulation_errors(when: str = "") -> Iterator[None]:
+    """Turn what the simulator raises into a RunError; ``when`` goes before its message."""
     try:
         yield
     except (DeviceError, SimulationError, MemoryError) as error:
-        raise RunError(str(error)) from error
+        raise RunError(f"{when}{error}") from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib.util
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +30,7 @@ from plab.runners.common import (
     simulation_errors,
     torch_threads,
 )
+from plab.runners.jobs import Job, title
 from plab.runners.progress import Report, show_progress
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
@@ -39,18 +41,21 @@ if TYPE_CHECKING:
 __all__ = ["Evaluator", "run_rl"]
 
 
-def run_rl(cfg: Config, run: RunFile) -> None:
+def run_rl(jobs: Sequence[Job], note: str = "") -> None:
     """Train a policy, evaluate it now and then, finish the file.
 
     Args:
-        cfg: The composed configuration; ``cfg.method`` is a :class:`plab.config.RlConfig`.
-        run: The run's file; an earlier process's state in it is taken up.
+        jobs: One job; ``cfg.method`` is a :class:`plab.config.RlConfig`. What an earlier process left in its
+            file is taken up.
+        note: Shown before the progress.
 
     Raises:
         plab.config.ConfigError: If something that the configuration asks for is not installed or not there.
         plab.results.ResultsError: If a file cannot be written.
         plab.runners.RunError: If a state stops being finite.
     """
+    (job,) = jobs
+    cfg, run = job.cfg, job.run
     _check_installed(cfg.method)
     replay_path, total = run.path.with_suffix(".replay"), total_steps(cfg.method, cfg.sim.horizon)
     with torch_threads(cfg.method.torch_threads), simulation_errors():
@@ -59,7 +64,7 @@ def run_rl(cfg: Config, run: RunFile) -> None:
             training, evaluation = kept_batches(cfg, *kinds)
             evaluator = Evaluator(evaluation)
         if run.result.resume is None or int(run.result.resume["steps"]) < total:
-            _train(cfg, training, replay_path, evaluator, run)
+            _train(cfg, training, replay_path, evaluator, run, note)
         # The partial file holds the last checkpoint, after which nothing is sampled any more.
         replay_path.unlink(missing_ok=True)
         with run.phase("evaluate"):
@@ -92,7 +97,7 @@ class Evaluator:
 
 
 def _train(
-    cfg: Config, training: EpisodeBatch, replay_path: Path, evaluator: Evaluator, run: RunFile
+    cfg: Config, training: EpisodeBatch, replay_path: Path, evaluator: Evaluator, run: RunFile, note: str
 ) -> None:
     """Train from where the file stands to the end."""
     with run.phase("build"):
@@ -102,16 +107,16 @@ def _train(
         if run.result.resume is None:
             # The untrained policy; the first episode compiles the kernels.
             _look(trainer, evaluator, run, "compile", time.perf_counter())
-        _alternate(cfg, trainer, evaluator, run)
+        _alternate(cfg, trainer, evaluator, run, note)
     finally:
         trainer.close()
 
 
-def _alternate(cfg: Config, trainer: Trainer, evaluator: Evaluator, run: RunFile) -> None:
+def _alternate(cfg: Config, trainer: Trainer, evaluator: Evaluator, run: RunFile, note: str) -> None:
     """Train and evaluate in turn until all episodes are done."""
     total, every = trainer.total_steps // cfg.sim.horizon, cfg.method.evaluate_every
-    title = f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
-    with show_progress(title, trainer.episodes, total, enabled=cfg.progress, plain_every=every) as report:
+    heading = note + title(cfg)
+    with show_progress(heading, trainer.episodes, total, enabled=cfg.progress, plain_every=every) as report:
         watch = _Watch(trainer, run, report)
         while trainer.steps < trainer.total_steps:
             start = time.perf_counter()
@@ -134,7 +139,8 @@ def _look(trainer: Trainer, evaluator: Evaluator, run: RunFile, phase: str, star
     # Written so that the first loss beats the NaN that stands for none.
     better = not row["loss"] >= run.result.best_loss
     best = {"best_actions": done.actions, "best_iteration": number, "best_loss": row["loss"]}
-    run.record(row, trainer.state(), **(best if better else {}))
+    # Each time: the replay buffer's file follows the training, and the state has to follow it.
+    run.record(row, trainer.state(), keep=True, **(best if better else {}))
 
 
 class _Watch(BaseCallback):

@@ -1,137 +1,125 @@
-"""Open-loop trajectory optimisation: a sequence of actions, improved by the gradient through the simulator.
+"""Open-loop trajectory optimisation: sequences of actions, improved by the gradient through the simulator.
 
-The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. To reproduce a result:
+The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. The runs of a batch share one
+simulator, an environment each; nothing else of them is shared, so that each gives the numbers that it would
+give alone. To reproduce a result:
 
     python -m plab.run task=Rope variant=1 method=adam seed=0
 """
 
 from __future__ import annotations
 
-import gc
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from plab.config import build_scene
-from plab.problem import Problem
-from plab.results import RunFile
-from plab.runners import RunError
-from plab.runners.common import COLUMNS, measures
+from plab.problem import Episodes, Problem, build_scenes
+from plab.results import ResultsError
+from plab.runners.common import COLUMNS, kept, measures, simulation_errors
+from plab.runners.jobs import Job, RunError, TogetherError, batch_title
 from plab.runners.progress import show_progress
-from plab.sim import DeviceError, SimulationError, Simulator
+from plab.sim import DeviceError, Simulator
 
 if TYPE_CHECKING:
     from plab.config import Config, TrajectoryConfig
 
-__all__ = ["OPTIMIZERS", "ActionSequence", "Episode", "run_trajectory"]
+__all__ = ["OPTIMIZERS", "ActionSequence", "make_problem", "run_trajectory"]
 
 
-def run_trajectory(cfg: Config, run: RunFile) -> None:
-    """Optimise a sequence of actions, evaluate the best one in the hard contact model, finish the file.
+def run_trajectory(jobs: Sequence[Job], note: str = "") -> None:
+    """Optimise a sequence of actions per job, evaluate the best ones in the hard contact model, finish.
 
     Args:
-        cfg: The composed configuration; ``cfg.method`` is a :class:`plab.config.TrajectoryConfig`.
-        run: The run's file; an earlier process's state in it is taken up.
+        jobs: Runs that share a simulator; ``cfg.method`` is a :class:`plab.config.TrajectoryConfig`. What an
+            earlier process left in their files is taken up. A run whose loss, gradient or state stops being
+            finite gets an error, and the others go on.
+        note: Shown before the progress.
 
     Raises:
-        RunError: If the loss, the gradient or the state stops being finite.
+        TogetherError: If nothing can be built of several jobs: perhaps fewer do.
+        RunError: If a lone job cannot be built, or the gradient needs more memory.
     """
-    with run.phase("build"):
-        episode = Episode(cfg)
-        actions = ActionSequence(cfg.method, episode.horizon, episode.action_dim, cfg.seed)
-        if run.result.resume is not None:
-            actions.restore(run.result.resume)
-    _optimise(cfg, episode, actions, run)
-    with run.phase("evaluate"):
-        evaluation, final_mass = _evaluate(episode, run.result.best_actions)
-    masses = {"initial": episode.initial_mass, "final": final_mass, "target": episode.target_mass}
-    run.finish(evaluation, masses)
+    start = time.perf_counter()
+    try:
+        with simulation_errors():
+            problem = make_problem([job.cfg for job in jobs])
+    except Exception as error:
+        if len(jobs) > 1 and not isinstance(error.__cause__, DeviceError):
+            raise TogetherError(str(error)) from error
+        raise
+    batch = [_Sequence(job, e, problem) for e, job in enumerate(jobs)]
+    for one in batch:
+        one.job.run.result.provenance["batch"] = len(batch)
+    _spend(batch, "build", time.perf_counter() - start)
+    _optimise(problem, batch, note)
+    _evaluate(problem, [one for one in batch if one.job.open])
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """What a rollout gave.
+def make_problem(cfgs: Sequence[Config]) -> Problem:
+    """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
+    scenes, sim = tuple(build_scenes(cfgs)), cfgs[0].sim
+
+    def build() -> Simulator:
+        return Simulator(scenes, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
+
+    key = scenes, sim.precision, sim.device, sim.memory_mb
+    return Problem(cfgs, kept(key, build, check=Simulator.reset))
+
+
+class _Sequence:
+    """One run of a batch: its job, its actions, and its environment.
 
     Attributes:
-        measures: Loss, its terms, reward and scores, as in the columns of the results.
-        gradient: Gradient of the trajectory loss, shape [T, A], or None.
-        final_mass: Mass tensor of the last state, shape [n, n, n].
+        job: Configuration, file, and how it ended.
+        environment: Number of its environment in the batch.
+        actions: Actions and optimiser, as far as the file has come.
     """
 
-    measures: dict[str, float]
-    gradient: np.ndarray | None
-    final_mass: np.ndarray
+    def __init__(self, job: Job, environment: int, problem: Problem) -> None:
+        self.job, self.environment = job, environment
+        scene, result = problem.scenes[environment], job.run.result
+        self.actions = ActionSequence(job.cfg.method, scene.horizon, scene.action_dim, job.cfg.seed)
+        if result.resume is not None:
+            self.actions.restore(result.resume)
+        self.iteration, self.best_loss = len(result.iterations), result.best_loss
 
+    @property
+    def active(self) -> bool:
+        """Whether there are iterations to do."""
+        return self.job.open and self.iteration < self.job.cfg.method.iterations
 
-class Episode:
-    """One task with its simulator: what a sequence of actions is judged by.
-
-    Attributes:
-        initial_mass: Mass tensor of the initial state, shape [n, n, n].
-        target_mass: Mass tensor of the target, shape [n, n, n].
-    """
-
-    def __init__(self, cfg: Config) -> None:
-        """Build scene, target and simulator.
-
-        Raises:
-            RunError: If the device is not there, or the demonstration that makes the target fails.
-        """
-        try:
-            self._problem = Problem([cfg], _simulator(cfg))
-        except (DeviceError, SimulationError) as error:
-            raise RunError(str(error)) from error
-        scene = self._problem.scenes[0]
-        self.horizon, self.action_dim = scene.horizon, scene.action_dim
-        self.initial_mass = self._problem.initial_mass[0]
-        self.target_mass = self._problem.target_mass[0]
-
-    def set_contact(self, model: str, softness: float = 0.0) -> None:
-        """Choose the contact model of the rollouts to come: ``soft``, with its decay rate, or ``hard``."""
-        self._problem.simulator.set_contact(model, softness=softness)
-
-    def rollout(self, actions: np.ndarray, *, gradient: bool) -> Rollout:
-        """Run actions from the initial state.
+    def update(self, tried: np.ndarray, episodes: Episodes, seconds: float) -> dict[str, float]:
+        """Take the result of an iteration: update the actions, write the row.
 
         Args:
-            actions: Actions in [-1, 1], shape [T, A].
-            gradient: Whether to compute the gradient of the trajectory loss.
+            tried: Actions of the rollout, shape [T, A].
+            episodes: What the rollout of the batch gave.
+            seconds: The run's share of the rollout's wall time.
+
+        Returns:
+            The row.
 
         Raises:
-            RunError: If the loss, the gradient or the state is not finite, or the gradient needs more memory.
+            plab.results.ResultsError: If the file cannot be written.
         """
-        try:
-            result = self._problem.rollout(actions[None], gradient=gradient)
-        except (SimulationError, MemoryError) as error:
-            raise RunError(str(error)) from error
-        return Rollout(measures(result), result.gradient[0] if gradient else None, result.final_mass[0])
-
-
-_kept: dict[tuple, Simulator] = {}
-"""The last simulator of this process and what it was made for: a sweep over seeds or methods
-compiles once."""
-
-
-def _simulator(cfg: Config) -> Simulator:
-    """Return the simulator of a configuration's scene, the one kept from the last run if it fits."""
-    scene, sim = build_scene(cfg), cfg.sim
-    wanted = scene, sim.precision, sim.device, sim.memory_mb
-    try:
-        if wanted in _kept:
-            _kept[wanted].reset()
-            return _kept[wanted]
-    except RuntimeError:
-        # Somebody else restarted Taichi with another precision or device, and the memory is gone.
-        pass
-    # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels again.
-    _kept.clear()
-    gc.collect()
-    _kept[wanted] = Simulator([scene], precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
-    return _kept[wanted]
+        start = time.perf_counter()
+        gradient = episodes.gradient[self.environment]
+        self.actions.step(gradient)
+        measured = measures(episodes, self.environment)
+        # What the actions have cost: the rollouts, of an episode each, that led to them.
+        row = {"iteration": self.iteration, "episodes": self.iteration, "steps": self.iteration * len(tried)}
+        row |= {name: measured[name] for name in COLUMNS}
+        row["gradient_norm"] = float(np.linalg.norm(gradient))
+        row["seconds"] = seconds + time.perf_counter() - start
+        # Written so that the first loss beats the NaN that stands for none.
+        better = not row["loss"] >= self.best_loss
+        best = {"best_actions": tried, "best_iteration": self.iteration, "best_loss": row["loss"]}
+        self.job.run.record(row, self.actions.state(), **(best if better else {}))
+        self.iteration, self.best_loss = self.iteration + 1, row["loss"] if better else self.best_loss
+        return row
 
 
 def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
@@ -202,52 +190,89 @@ class ActionSequence:
         self._generator.set_state(torch.from_numpy(state["random"]))
 
 
-def _optimise(cfg: Config, episode: Episode, actions: ActionSequence, run: RunFile) -> None:
-    """Do the iterations that the file does not hold yet."""
-    episode.set_contact(cfg.method.contact, cfg.method.softness)
-    start, total = len(run.result.iterations), cfg.method.iterations
-    title = f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
-    with show_progress(title, start, total, enabled=cfg.progress) as report:
-        for iteration in range(start, total):
-            # The first rollout of a process compiles the kernels.
-            with run.phase("compile" if iteration == start else "optimise"):
-                row, changes = _iterate(episode, actions, iteration, run.result.best_loss)
-            run.record(row, actions.state(), **changes)
-            best = f"best {run.result.best_loss:.5g}"
-            report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best}")
+def _optimise(problem: Problem, batch: Sequence[_Sequence], note: str) -> None:
+    """Do the iterations that the files do not hold yet."""
+    methods = [one.job.cfg.method for one in batch]
+    problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
+    start, total = min(one.iteration for one in batch), max(method.iterations for method in methods)
+    heading = note + batch_title([one.job.cfg for one in batch])
+    # The first rollout of a process compiles the kernels.
+    phase = "compile"
+    with show_progress(heading, start, total, enabled=batch[0].job.cfg.progress) as report:
+        while active := [one for one in batch if one.active]:
+            begin = time.perf_counter()
+            rows = _iterate(problem, batch, active)
+            _spend(active, phase, time.perf_counter() - begin)
+            phase = "optimise"
+            if rows:
+                report(min(one.iteration for one in active), _text(rows, active))
 
 
 def _iterate(
-    episode: Episode, actions: ActionSequence, iteration: int, best_loss: float
-) -> tuple[dict[str, float], dict[str, Any]]:
-    """Do one iteration: rollout with gradient, row, update of the actions.
-
-    Returns:
-        The row of the iteration, and the fields of the result that change: the best so far, if this is it.
-    """
+    problem: Problem, batch: Sequence[_Sequence], active: Sequence[_Sequence]
+) -> list[dict[str, float]]:
+    """Do one iteration of each active run, at whatever iteration it is; return the rows."""
     start = time.perf_counter()
-    tried = actions.numpy()
-    try:
-        rollout = episode.rollout(tried, gradient=True)
-        actions.step(rollout.gradient)
-    except RunError as error:
-        raise RunError(f"iteration {iteration}: {error}") from error
-    # What the actions have cost: the rollouts, of an episode each, that led to them.
-    row = {"iteration": iteration, "episodes": iteration, "steps": iteration * episode.horizon}
-    row |= {name: rollout.measures[name] for name in COLUMNS}
-    row["gradient_norm"] = float(np.linalg.norm(rollout.gradient))
-    row["seconds"] = time.perf_counter() - start
-    # Written so that the first loss beats the NaN that stands for none.
-    better = not row["loss"] >= best_loss
-    best = {"best_actions": tried, "best_iteration": iteration, "best_loss": row["loss"]}
-    return row, best if better else {}
+    tried = _zeros(problem)
+    for one in active:
+        tried[one.environment] = one.actions.numpy()
+    with simulation_errors(f"iteration {active[0].iteration}: "):
+        episodes = problem.rollout(tried, gradient=True, strict=False, exact=False)
+    share = (time.perf_counter() - start) / len(active)
+    rows = []
+    for one in active:
+        if one.environment in episodes.failures:
+            one.job.fail(RunError(f"iteration {one.iteration}: {episodes.failures[one.environment]}"))
+            continue
+        try:
+            rows.append(one.update(tried[one.environment], episodes, share))
+        except ResultsError as error:
+            one.job.fail(error)
+    return rows
 
 
-def _evaluate(episode: Episode, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
-    """Run the best actions in the hard contact model; return its scalars and the last mass tensor."""
-    episode.set_contact("hard")
-    try:
-        rollout = episode.rollout(actions, gradient=False)
-    except RunError as error:
-        raise RunError(f"final evaluation: {error}") from error
-    return rollout.measures, rollout.final_mass
+def _text(rows: Sequence[Mapping[str, float]], active: Sequence[_Sequence]) -> str:
+    """Say how it goes: of several runs on average."""
+    loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
+    best = np.mean([one.best_loss for one in active])
+    return f"{'' if len(rows) == 1 else 'mean '}loss {loss:.5g} score {score:.3f} best {best:.5g}"
+
+
+def _evaluate(problem: Problem, batch: Sequence[_Sequence]) -> None:
+    """Run the best actions in the hard contact model, and finish the files."""
+    if not batch:
+        return
+    start = time.perf_counter()
+    best = _zeros(problem)
+    for one in batch:
+        best[one.environment] = one.job.run.result.best_actions
+    problem.simulator.set_contact("hard")
+    with simulation_errors("final evaluation: "):
+        episodes = problem.rollout(best, gradient=False, strict=False)
+    _spend(batch, "evaluate", time.perf_counter() - start)
+    for one in batch:
+        e = one.environment
+        if e in episodes.failures:
+            one.job.fail(RunError(f"final evaluation: {episodes.failures[e]}"))
+            continue
+        masses = {
+            "initial": problem.initial_mass,
+            "final": episodes.final_mass,
+            "target": problem.target_mass,
+        }
+        try:
+            one.job.run.finish(measures(episodes, e), {name: mass[e] for name, mass in masses.items()})
+        except ResultsError as error:
+            one.job.fail(error)
+
+
+def _zeros(problem: Problem) -> np.ndarray:
+    """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
+    scene = problem.scenes[0]
+    return np.zeros((len(problem.scenes), scene.horizon, scene.action_dim))
+
+
+def _spend(batch: Sequence[_Sequence], phase: str, seconds: float) -> None:
+    """Add to the wall time of a phase, each run its share."""
+    for one in batch:
+        one.job.run.spend(phase, seconds / len(batch))

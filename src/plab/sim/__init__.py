@@ -1,8 +1,9 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
 from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
-from plab.sim.simulator import CONTACT_MODELS, Measures, Rollout, Simulator, State
+from plab.sim.simulator import CONTACT_MODELS, Simulator
 from plab.sim.skips import Skips
+from plab.sim.state import Measures, Rollout, State
 
 __all__ = [
     "CONTACT_MODELS",

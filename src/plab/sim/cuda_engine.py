@@ -15,19 +15,17 @@ import sys
 import taichi as ti
 
 from plab.sim.cuda_phases import NEAREST_GROUPS, CudaPhases
+from plab.sim.cuda_warp import NODE_BITS, NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
 from plab.sim.grid_phases import MASS_MIN
-from plab.sim.storage import BLOCK, BLOCK_BITS, MEASURES, STATE
-from plab.sim.transfer import spline
+from plab.sim.storage import MEASURES, STATE
+from plab.sim.transfer import spline, widen
 
 __all__ = ["CudaEngine"]
-
-NODE_BITS = 3 * BLOCK_BITS
-NODE_MASK = (1 << NODE_BITS) - 1
 
 THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 
-RESIDENT_BLOCK = 128
+RESIDENT_BLOCK = WARP_BLOCK
 """Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
 resident whatever their registers."""
 
@@ -50,7 +48,9 @@ class CudaEngine(CudaPhases):
     """Kernels for CUDA; public methods as those of :class:`plab.sim.engine.CpuEngine`.
 
     ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
-    its length, which must be 0 before every scatter: whatever runs before a scatter sees to that.
+    its length. It is begun anew once per environment step and once per loss, and grows in between: a block
+    that the body leaves within a step costs little, while taking all blocks into the list in every substep
+    would cost an atomic per particle.
     """
 
     def __init__(self, *args: object) -> None:
@@ -61,13 +61,19 @@ class CudaEngine(CudaPhases):
         self.resident_threads = multiprocessors() * RESIDENT_BLOCK
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
 
-    # -- threads ------------------------------------------------------------------------------------
+    @property
+    def resident(self) -> bool:
+        """Whether a step is one launch."""
+        few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
+        return few and self.skips.launches
 
-    @ti.func
-    def particle_of(self, q):
-        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
-        e = q // (self.tiles * self.lanes)
-        return e, q - e * (self.tiles * self.lanes)
+    @property
+    def sorts(self) -> bool:
+        """Whether particles are put into the order of their cells before each step: where there are so many
+        that atomics, not launches, take the time."""
+        return not self.resident
+
+    # -- threads ------------------------------------------------------------------------------------
 
     @ti.func
     def scatter_node(self, e, particle, base):
@@ -104,28 +110,74 @@ class CudaEngine(CudaPhases):
         e, particle = self.particle_of(q)
         tile = particle // self.lanes
         source = self.tile_entry(before, e, tile)
-        entry9 = (e * self.tiles + tile) * 9
         lane = self.sorted_lane(state, source, tile, particle % self.lanes)
         base, fx = self.stencil(self.vector(state, source, lane))
         node = self.scatter_node(e, tile * self.lanes + lane, base)
-        run, first, doublings = self.run_of(node, particle % self.lanes)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+        a = ti.Vector.zero(self.real, 9)
         if node >= 0:
-            self.material_particle(state, source, self.tile_entry(after, e, tile), entry9, lane, e, True)
-        first = first and node >= 0
+            a = self.material_particle(state, source, self.tile_entry(after, e, tile), lane, e, True)
         if first:
             self.mark_shared(e, base, stamp)
-        q4 = self.momentum_field(state, source, entry9, lane, fx)
-        self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+        sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
+        heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
+        self.share_heads(heads, q, node, first, rank)
+        field = self.momentum_field(state, source, a, lane, fx)
+        self.scatter_runs(
+            self.momentum, 4, sums, heads, q, spline(fx), field, run, first, rank, total, doublings
+        )
 
     @ti.func
-    def grid_thread(self, q, s):
-        """Grid update of node q of the active blocks; the node's momentum is cleared."""
-        e, i = self.node_of(q)
-        node = e * self.nodes + self.linear(i)
-        total = self.take(self.momentum, node)
+    def grid_thread(self, w, q, s):
+        """Grid update of node q of the active blocks by thread w; the node's momentum is cleared."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        total = self.take_nodes(self.momentum, stage, w, e, block, r)
         # A test of which manipulators are near would cost a thread as much as contact with them.
-        v = self.update_node(e, s, i, ti.static((1 << self.manipulators) - 1), total)
-        self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+        near = ti.static((1 << self.manipulators) - 1)
+        v = self.update_node(e, s, self.node_of_block(block, r), near, total)
+        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
+
+    @ti.func
+    def grid_thread_adjoint(self, w, q, s):
+        """Grid update of node q of the active blocks by thread w, and its adjoint; the scattered sums are
+        cleared."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        i = self.node_of_block(block, r)
+        total = self.take_nodes(self.momentum, stage, w, e, block, r)
+        bar4 = self.take_nodes(self.velocity_bar, stage, w, e, block, r)
+        near = 0
+        if total[3] > MASS_MIN:
+            near = self.touching(e, s, self.position(i))
+        v, total_bar = self.update_node_adjoint(
+            e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
+        )
+        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
+        self.put_nodes(self.momentum_bar, stage, w, e, block, r, total_bar)
+
+    @ti.func
+    def loss_thread(self, w, q):
+        """Loss terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        mass = self.take_nodes(self.momentum, stage, w, e, block, r)[3]
+        density, sdf, slope, overlap = self.node_loss(e, self.node_of_block(block, r), mass)
+        self.put_nodes(self.velocity, stage, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
+        part = ti.Vector(
+            [ti.cast(density, ti.f64), ti.cast(sdf, ti.f64), ti.cast(overlap, ti.f64), ti.cast(mass, ti.f64)]
+        )
+        # All lanes of a warp have nodes of the same environment.
+        for k in ti.static(range(RUN_BITS)):
+            for c in ti.static(range(3)):
+                part[c] += self.wide_from_above(part[c], 1 << k)
+            part[3] = ti.max(part[3], self.wide_from_above(part[3], 1 << k))
+        if w % WARP == 0:
+            for c in ti.static(range(3)):
+                ti.atomic_add(self.loss_part[e, 0][c], part[c])
+            # Most are below a peak seen already.
+            if part[3] > self.loss_part[e, 0][3]:
+                ti.atomic_max(self.loss_part[e, 0][3], part[3])
 
     @ti.func
     def gather_thread(self, state: ti.template(), before, after, q, time):
@@ -136,28 +188,6 @@ class CudaEngine(CudaPhases):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             self.gather_particle(state, source, target, particle % self.lanes, e, time)
-
-    @ti.func
-    def turns_of(self, w, total):
-        """How many of ``total`` items thread w of a loop over nodes works on."""
-        return (total - w + self.node_threads - 1) // self.node_threads
-
-    @ti.func
-    def active_nodes(self):
-        """Nodes of the active blocks of all environments."""
-        count = self.block_count[0]
-        if ti.static(not self.skips.empty_blocks):
-            count = self.batch * self.blocks
-        return count << NODE_BITS
-
-    @ti.func
-    def node_of(self, q):
-        """Environment and array index (3) of node q of the active blocks."""
-        entry = q >> NODE_BITS
-        if ti.static(self.skips.empty_blocks):
-            entry = self.block_list[entry]
-        e = entry // self.blocks
-        return e, self.node_of_block(entry - e * self.blocks, q & NODE_MASK)
 
     # -- public methods -----------------------------------------------------------------------------
 
@@ -174,14 +204,13 @@ class CudaEngine(CudaPhases):
         stamp: int,
     ) -> None:
         """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
-        few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
-        if few and self.skips.launches:
+        if self.resident:
             self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
             return
         self.advance_kernel(poses, actions, t, pose_before, pose_after)
         for s in range(self.substeps):
             before = slot + s * stride
-            self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp + s)
+            self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp)
 
     def losses(self, state: ti.Ndarray, slot: int, terms: ti.Ndarray, at: int, stamp: int) -> None:
         """Measures (:data:`MEASURES`) of all environments, written to ``terms`` from entry ``at``."""
@@ -212,7 +241,7 @@ class CudaEngine(CudaPhases):
         self.loss_gradient_kernel(state, end, bar)
         for back in range(self.substeps if contact else 0):
             s = self.substeps - 1 - back
-            self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1 + back)
+            self.substep_adjoint_kernel(state, bar, slot + s, slot + s + 1, s, stamp + 1)
         self.retreat_kernel(actions, actions_bar, t)
 
     # -- kernels ------------------------------------------------------------------------------------
@@ -251,14 +280,14 @@ class CudaEngine(CudaPhases):
         stamp: ti.i32,
     ):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
+        ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
             self.scatter_thread(state, before, after, q, stamp)
+        ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
-                self.grid_thread(w + turn * self.node_threads, s)
+                self.grid_thread(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
-            if q == 0:
-                self.block_count[0] = 0
             self.gather_thread(state, before, after, q, time)
 
     @ti.kernel
@@ -294,17 +323,16 @@ class CudaEngine(CudaPhases):
                 before = slot + s * stride
                 for turn in range(self.resident_turns(w, self.particle_threads)):
                     q = w + turn * self.resident_threads
-                    self.scatter_thread(state, before, before + stride, q, stamp + s)
+                    self.scatter_thread(state, before, before + stride, q, stamp)
                 meetings = self.meet(w, meetings)
                 for turn in range(self.resident_turns(w, self.active_nodes())):
-                    self.grid_thread(w + turn * self.resident_threads, s)
+                    self.grid_thread(w, w + turn * self.resident_threads, s)
                 meetings = self.meet(w, meetings)
-                if w == 0:
-                    self.block_count[0] = 0
                 for turn in range(self.resident_turns(w, self.particle_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, t * self.substeps + s)
-                meetings = self.meet(w, meetings)
+                # A warp scatters what it has gathered itself, so that the others need not wait.
+                self.wait_for_warp()
 
     @ti.kernel
     def losses_kernel(
@@ -327,35 +355,16 @@ class CudaEngine(CudaPhases):
             x = self.vector(state, source, lane)
             base, fx = self.stencil(x)
             node = self.scatter_node(e, tile * self.lanes + lane, base)
-            run, first, doublings = self.run_of(node, particle % self.lanes)
-            first = first and node >= 0
+            run, first, _rank, _total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)
             if node >= 0 and self.weighs(2):
                 self.note_distances(e, tile * self.lanes + lane, x)
-        # A row of nodes per thread makes a quarter of the atomics.
+        ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes() // BLOCK)):
-                e, first = self.node_of((w + turn * self.node_threads) * BLOCK)
-                part = ti.Vector.zero(ti.f64, 4)
-                for r in range(BLOCK):
-                    i = ti.Vector([first[0], first[1], first[2] + r])
-                    node = e * self.nodes + self.linear(i)
-                    mass = self.take(self.momentum, node)[3]
-                    density, sdf, slope, overlap = self.node_loss(e, i, mass)
-                    part[0] += density
-                    part[1] += sdf
-                    part[2] += overlap
-                    part[3] = ti.max(part[3], ti.cast(mass, ti.f64))
-                    self.velocity[node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
-                # Written so that NaN is not taken for an empty row.
-                if not (part[0] == 0.0 and part[1] == 0.0 and part[3] == 0.0):
-                    for c in ti.static(range(3)):
-                        ti.atomic_add(self.loss_part[e, 0][c], part[c])
-                    # Most rows are below a peak seen already.
-                    if part[3] > self.loss_part[e, 0][3]:
-                        ti.atomic_max(self.loss_part[e, 0][3], part[3])
+            for turn in range(self.turns_of(w, self.active_nodes())):
+                self.loss_thread(w, w + turn * self.node_threads)
         for q in range(self.pose_threads * NEAREST_GROUPS):
             for m in ti.static(range(self.manipulators)):
                 if ti.static(self.motions[m] != "static"):
@@ -394,6 +403,7 @@ class CudaEngine(CudaPhases):
         stamp: ti.i32,
     ):
         """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
+        ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             tile = particle // self.lanes
@@ -404,33 +414,27 @@ class CudaEngine(CudaPhases):
             x = self.vector(state, source, lane)
             base, fx = self.stencil(x)
             node = self.scatter_node(e, tile * self.lanes + lane, base)
-            run, first, doublings = self.run_of(node, particle % self.lanes)
+            run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+            a = ti.Vector.zero(self.real, 9)
             if node >= 0:
-                self.material_particle(state, source, target, entry9, lane, e, False)
-            first = first and node >= 0
+                a = self.material_particle(state, source, target, lane, e, False)
+                for i in ti.static(range(9)):
+                    self.affine[entry9 + i][lane] = a[i]
             if first:
                 self.mark_shared(e, base, stamp)
-            q4 = self.momentum_field(state, source, entry9, lane, fx)
-            self.scatter_run(self.momentum, node, spline(fx), q4, run, first, doublings)
+            sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
+            heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
+            self.share_heads(heads, q, node, first, rank)
+            field = self.momentum_field(state, source, a, lane, fx)
+            w = spline(fx)
+            self.scatter_runs(self.momentum, 4, sums, heads, q, w, field, run, first, rank, total, doublings)
             h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
-            self.scatter_run(self.velocity_bar, node, spline(fx), h, run, first, doublings)
+            self.scatter_runs(self.velocity_bar, 3, sums, heads, q, w, h, run, first, rank, total, doublings)
+        ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
-                e, i = self.node_of(w + turn * self.node_threads)
-                node = e * self.nodes + self.linear(i)
-                total = self.take(self.momentum, node)
-                bar4 = self.take(self.velocity_bar, node)
-                near = 0
-                if total[3] > MASS_MIN:
-                    near = self.touching(e, s, self.position(i))
-                v, total_bar = self.update_node_adjoint(
-                    e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
-                )
-                self.velocity[node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
-                self.momentum_bar[node] = total_bar
+                self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
-            if q == 0:
-                self.block_count[0] = 0
             e, particle = self.particle_of(q)
             if particle < self.particles:
                 tile = particle // self.lanes
@@ -438,10 +442,10 @@ class CudaEngine(CudaPhases):
                 source = self.tile_entry(before, e, tile)
                 entry = self.tile_entry(0, e, tile)
                 entry9 = (e * self.tiles + tile) * 9
-                self.gather_particle_adjoint(
+                a_bar = self.gather_particle_adjoint(
                     state, source, self.tile_entry(after, e, tile), bar, entry, entry9, lane, e
                 )
-                self.material_particle_adjoint(state, source, bar, entry, entry9, lane, e)
+                self.material_particle_adjoint(state, source, bar, entry, a_bar, lane, e)
 
     @ti.kernel
     def retreat_kernel(
@@ -464,10 +468,11 @@ class CudaEngine(CudaPhases):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
-                e, i = self.node_of(w + turn * self.node_threads)
+                e, block, r = self.node_of(w + turn * self.node_threads)
+                i = self.node_of_block(block, r)
                 index = self.tensor_index(e, i)
                 if index >= 0:
-                    out[index] = self.velocity[e * self.nodes + self.linear(i)][0]
+                    out[index] = self.node4(self.velocity, e * self.nodes + self.linear(i))[0]
 
     @ti.kernel
     def copy_slot(

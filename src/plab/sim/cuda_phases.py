@@ -8,8 +8,22 @@ on timing.
 
 import taichi as ti
 
-from plab.sim.engine import Phases
+from plab.sim.cuda_order import OrderPhases
+from plab.sim.linalg import det
+from plab.sim.material import (
+    flow,
+    flow_adjoint,
+    hencky_strain,
+    log_adjoint,
+    parameter_adjoint,
+    strain_adjoint,
+    stress,
+    stress_adjoint,
+    trial_gradient,
+    yield_factor,
+)
 from plab.sim.motion import advance_pose
+from plab.sim.pose_phases import PosePhases
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
 from plab.sim.transfer import spline, spline_slope
@@ -19,111 +33,11 @@ __all__ = ["NEAREST_GROUPS", "CudaPhases"]
 NEAREST_GROUPS = 128
 """Threads per environment and manipulator in the search for the nearest particle."""
 
-ALL_LANES = 0xFFFFFFFF
-"""Mask of a warp: 32 threads, which are the 32 lanes of one tile of particles."""
-
-RUN_BITS = 5
-"""A run of particles in one cell is as long as a warp at most, 2^5."""
-
 FAR = 1e9
 """Distance of the nearest particle before any was looked at."""
 
 
-@ti.func
-def moments(grid: ti.template(), node, axis: ti.template(), w: ti.template()):
-    """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil, in registers.
-
-    Args:
-        grid: Field of 4-vectors.
-        node: Index of the base node.
-        axis: Nodes along an axis of the grid.
-        w: Spline weights.
-
-    Returns:
-        Sum of w g, and of w g times the node's offset (0, 1, 2) along x, y and z.
-    """
-    m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
-    mx = m0
-    my = m0
-    mz = m0
-    for i in ti.static(range(3)):
-        for j in ti.static(range(3)):
-            row = node + (i * axis + j) * axis
-            wij = w[i][0] * w[j][1]
-            g1 = (wij * w[1][2]) * grid[row + 1]
-            g2 = (wij * w[2][2]) * grid[row + 2]
-            s = (wij * w[0][2]) * grid[row] + g1 + g2
-            m0 += s
-            mz += g1 + 2.0 * g2
-            if ti.static(i > 0):
-                mx += float(i) * s
-            if ti.static(j > 0):
-                my += float(j) * s
-    return m0, mx, my, mz
-
-
-@ti.func
-def moments_adjoint(
-    velocity: ti.template(),
-    momentum_bar: ti.template(),
-    node,
-    axis: ti.template(),
-    w: ti.template(),
-    dw: ti.template(),
-    q: ti.template(),
-    h: ti.template(),
-):
-    """What a particle's adjoint needs of the grid, in registers.
-
-    Args:
-        velocity: Field of grid velocities, 4-vectors whose last entry is ignored.
-        momentum_bar: Field of adjoints of the grid's momentum and mass, 4-vectors.
-        node: Index of the base node.
-        axis: Nodes along an axis of the grid.
-        w: Spline weights.
-        dw: Their derivatives.
-        q: The scattered affine field: value at the base node and increments along x, y, z, mass last.
-        h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
-
-    Returns:
-        Moments of momentum_bar as in :func:`moments`, and the sum over nodes of grad_f w (momentum_bar . q +
-        velocity . h), a 3-vector.
-    """
-    m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
-    mx = m0
-    my = m0
-    mz = m0
-    slope = w[0] * 0.0
-    for i in ti.static(range(3)):
-        for j in ti.static(range(3)):
-            row = node + (i * axis + j) * axis
-            qj = q[0] + float(i) * q[1] + float(j) * q[2]
-            hj = h[0] + float(i) * h[1] + float(j) * h[2]
-            along = w[0][0] * 0.0
-            across = w[0][0] * 0.0
-            s0 = m0 * 0.0
-            s1 = m0 * 0.0
-            for k in ti.static(range(3)):
-                p = momentum_bar[row + k]
-                chi = p.dot(qj + float(k) * q[3]) + velocity[row + k].dot(hj + float(k) * h[3])
-                across += w[k][2] * chi
-                along += dw[k][2] * chi
-                wp = w[k][2] * p
-                s0 += wp
-                if ti.static(k > 0):
-                    s1 += float(k) * wp
-            wij = w[i][0] * w[j][1]
-            slope += ti.Vector([dw[i][0] * w[j][1] * across, w[i][0] * dw[j][1] * across, wij * along])
-            m0 += wij * s0
-            mz += wij * s1
-            if ti.static(i > 0):
-                mx += (float(i) * wij) * s0
-            if ti.static(j > 0):
-                my += (float(j) * wij) * s0
-    return m0, mx, my, mz, slope
-
-
-class CudaPhases(Phases):
+class CudaPhases(OrderPhases, PosePhases):
     """Phases that differ from the CPU's."""
 
     def _allocate(self) -> None:
@@ -148,11 +62,103 @@ class CudaPhases(Phases):
     # -- particles ----------------------------------------------------------------------------------
 
     @ti.func
+    def moments(self, grid: ti.template(), node, w: ti.template()):
+        """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil, in registers.
+
+        Args:
+            grid: Gathered grid.
+            node: Index of the base node.
+            w: Spline weights.
+
+        Returns:
+            Sum of w g, and of w g times the node's offset (0, 1, 2) along x, y and z.
+        """
+        m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        mx = m0
+        my = m0
+        mz = m0
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                row = node + (i * self.axis + j) * self.axis
+                wij = w[i][0] * w[j][1]
+                g1 = (wij * w[1][2]) * self.node4(grid, row + 1)
+                g2 = (wij * w[2][2]) * self.node4(grid, row + 2)
+                s = (wij * w[0][2]) * self.node4(grid, row) + g1 + g2
+                m0 += s
+                mz += g1 + 2.0 * g2
+                if ti.static(i > 0):
+                    mx += float(i) * s
+                if ti.static(j > 0):
+                    my += float(j) * s
+        return m0, mx, my, mz
+
+    @ti.func
+    def moments_adjoint(
+        self,
+        velocity: ti.template(),
+        momentum_bar: ti.template(),
+        node,
+        w: ti.template(),
+        dw: ti.template(),
+        q: ti.template(),
+        h: ti.template(),
+    ):
+        """What a particle's adjoint needs of the grid, in registers.
+
+        Args:
+            velocity: Gathered grid of velocities, 4-vectors whose last entry is ignored.
+            momentum_bar: Gathered grid of adjoints of the grid's momentum and mass, 4-vectors.
+            node: Index of the base node.
+            w: Spline weights.
+            dw: Their derivatives.
+            q: The scattered affine field: value at the base node and increments along x, y, z, mass last.
+            h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
+
+        Returns:
+            Moments of momentum_bar as in :meth:`moments`, and the sum over nodes of grad_f w (momentum_bar
+            . q + velocity . h), a 3-vector.
+        """
+        m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        mx = m0
+        my = m0
+        mz = m0
+        slope = w[0] * 0.0
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                row = node + (i * self.axis + j) * self.axis
+                qj = q[0] + float(i) * q[1] + float(j) * q[2]
+                hj = h[0] + float(i) * h[1] + float(j) * h[2]
+                along = w[0][0] * 0.0
+                across = w[0][0] * 0.0
+                s0 = m0 * 0.0
+                s1 = m0 * 0.0
+                for k in ti.static(range(3)):
+                    p = self.node4(momentum_bar, row + k)
+                    chi = p.dot(qj + float(k) * q[3]) + self.node4(velocity, row + k).dot(
+                        hj + float(k) * h[3]
+                    )
+                    across += w[k][2] * chi
+                    along += dw[k][2] * chi
+                    wp = w[k][2] * p
+                    s0 += wp
+                    if ti.static(k > 0):
+                        s1 += float(k) * wp
+                wij = w[i][0] * w[j][1]
+                slope += ti.Vector([dw[i][0] * w[j][1] * across, w[i][0] * dw[j][1] * across, wij * along])
+                m0 += wij * s0
+                mz += wij * s1
+                if ti.static(i > 0):
+                    mx += (float(i) * wij) * s0
+                if ti.static(j > 0):
+                    my += (float(j) * wij) * s0
+        return m0, mx, my, mz, slope
+
+    @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, e, time):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        m0, mx, my, mz = moments(self.velocity, e * self.nodes + self.node_index(base), self.axis, spline(fx))
+        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.node_index(base), spline(fx))
         scale = 4.0 * self.inv_dx
         speed = 0.0 * fx[0]
         for i in ti.static(range(3)):
@@ -171,18 +177,21 @@ class CudaPhases(Phases):
     def gather_particle_adjoint(
         self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e
     ):
-        """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
+        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``.
+
+        Returns:
+            Adjoint of A, row by row.
+        """
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)
         v_after = self.vector(state, after + 3, lane)
         q = self.affine_field(self.mass * self.vector(state, source + 3, lane), self.mass, a, fx, 1.0)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
-        m0, mx, my, mz, slope = moments_adjoint(
+        m0, mx, my, mz, slope = self.moments_adjoint(
             self.velocity,
             self.momentum_bar,
             e * self.nodes + self.node_index(base),
-            self.axis,
             spline(fx),
             spline_slope(fx),
             q,
@@ -191,6 +200,7 @@ class CudaPhases(Phases):
         c_bar = self.load(bar, target + 6, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
+        a_bar = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(3)):
             # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
             # the scatter.
@@ -199,141 +209,80 @@ class CudaPhases(Phases):
             ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
             bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
             bar[target + 3 + i][lane] = self.mass * m0[i]
-            self.affine[entry9 + 3 * i][lane] = self.dx * (mx[i] - fx[0] * m0[i])
-            self.affine[entry9 + 3 * i + 1][lane] = self.dx * (my[i] - fx[1] * m0[i])
-            self.affine[entry9 + 3 * i + 2][lane] = self.dx * (mz[i] - fx[2] * m0[i])
-
-    # -- scatter by runs ----------------------------------------------------------------------------
-    #
-    # Particles are in the order of their cells at the start, and neighbours stay neighbours, so that the
-    # particles of a tile share few base nodes. A warp takes the particles of its tile in the order of their
-    # nodes; what a run of lanes with the same node adds to the grid is summed in registers first, and its
-    # first lane alone does the atomics. The sums are exact for any order of particles.
+            a_bar[3 * i] = self.dx * (mx[i] - fx[0] * m0[i])
+            a_bar[3 * i + 1] = self.dx * (my[i] - fx[1] * m0[i])
+            a_bar[3 * i + 2] = self.dx * (mz[i] - fx[2] * m0[i])
+        return a_bar
 
     @ti.func
-    def sorted_lane(self, state: ti.template(), source, tile, lane):
-        """Which particle of the tile a lane takes: the one whose base node is the lane-th in order."""
-        base, _fx = self.stencil(self.vector(state, source, lane))
-        node = self.node_index(base)
-        if tile * self.lanes + lane >= self.particles:
-            node = self.nodes
-        # The node and the particle in one number; n = 256 takes 29 bits.
-        packed = node * self.lanes + lane
-        for stage in ti.static(range(1, RUN_BITS + 1)):
-            for step in ti.static(range(stage - 1, -1, -1)):
-                other = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), packed, 1 << step)
-                least, most = ti.min(packed, other), ti.max(packed, other)
-                packed = most
-                # A lane keeps the lesser where it is the lower of a rising pair or the upper of a falling.
-                if (lane >> stage) & 1 == (lane >> step) & 1:
-                    packed = least
-        return packed % self.lanes
-
-    @ti.func
-    def from_lane_above(self, value, offset):
-        """The value that the lane ``offset`` above this one holds."""
-        out = value
-        if ti.static(self.real == ti.f32):
-            out = ti.simt.warp.shfl_down_f32(ti.u32(ALL_LANES), value, offset)
-        else:
-            bits = ti.bit_cast(value, ti.i64)
-            low = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits, ti.i32), offset)
-            high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
-            joined = (ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64)
-            out = ti.bit_cast(joined, ti.f64)
-        return out
-
-    @ti.func
-    def run_of(self, key, lane):
-        """Lanes from this one on that hold the same key, whether this is the first of them, and the number
-        of doublings that the warp's longest run needs."""
-        run = 1
-        for k in ti.static(range(RUN_BITS)):
-            above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), run, 1 << k)
-            key_above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), key, 1 << k)
-            if run == (1 << k) and lane + (1 << k) < self.lanes and key_above == key:
-                run += above
-        key_below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), key, 1)
-        doublings = 0
-        for k in ti.static(range(RUN_BITS)):
-            if ti.simt.warp.any_nonzero(ti.u32(ALL_LANES), ti.cast(run > (1 << k), ti.i32)):
-                doublings = k + 1
-        return run, lane == 0 or key_below != key, doublings
-
-    @ti.func
-    def scatter_run(
-        self, grid: ti.template(), node, w: ti.template(), q: ti.template(), run, first, doublings
-    ):
-        """Scatter an affine field as :meth:`scatter` does; every lane of the warp must take part.
-
-        Args:
-            grid: Field of 4-vectors.
-            node: Index of the base node; what other lanes of the run have is not looked at.
-            w: Spline weights.
-            q: Value at the base node and increments along x, y, z, 4-vectors.
-            run: See :meth:`run_of`.
-            first: Whether this lane does the run's atomics.
-            doublings: See :meth:`run_of`.
-        """
-        for i in ti.static(range(3)):
-            for j in ti.static(range(3)):
-                wij = w[i][0] * w[j][1]
-                r = wij * (q[0] + float(i) * q[1] + float(j) * q[2])
-                z = wij * q[3]
-                r0 = w[0][2] * r
-                r1 = w[1][2] * r + w[1][2] * z
-                r2 = w[2][2] * r + (2.0 * w[2][2]) * z
-                # The same number of rounds for all lanes of the warp.
-                for k in range(doublings):
-                    takes = run > (1 << k)
-                    for c in ti.static(range(4)):
-                        a0 = self.from_lane_above(r0[c], 1 << k)
-                        a1 = self.from_lane_above(r1[c], 1 << k)
-                        a2 = self.from_lane_above(r2[c], 1 << k)
-                        if takes:
-                            r0[c] += a0
-                            r1[c] += a1
-                            r2[c] += a2
-                if first:
-                    row = node + (i * self.axis + j) * self.axis
-                    ti.atomic_add(grid[row], r0)
-                    ti.atomic_add(grid[row + 1], r1)
-                    ti.atomic_add(grid[row + 2], r2)
-
-    @ti.func
-    def scatter_mass_run(self, e, base, fx, run, first, doublings):
-        """Add every lane's mass to its 27 nodes as :meth:`scatter_mass` does, run by run."""
-        w = spline(fx)
-        for i in ti.static(range(3)):
-            for j in ti.static(range(3)):
-                wij = self.mass * w[i][0] * w[j][1]
-                row = ti.Vector([wij * w[0][2], wij * w[1][2], wij * w[2][2]])
-                for k in range(doublings):
-                    takes = run > (1 << k)
-                    for c in ti.static(range(3)):
-                        above = self.from_lane_above(row[c], 1 << k)
-                        if takes:
-                            row[c] += above
-                if first:
-                    for c in ti.static(range(3)):
-                        node = e * self.nodes + self.linear(self.folded_node(base, i, j, c))
-                        ti.atomic_add(self.momentum[node][3], row[c])
-
-    @ti.func
-    def momentum_field(self, state: ti.template(), source, entry9, lane, fx):
-        """The affine field of momentum and mass that a particle scatters."""
-        a = self.load(self.affine, entry9, lane, 9)
+    def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
+        """The affine field of momentum and mass that a particle scatters, given A."""
         v = self.vector(state, source + 3, lane)
         return self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
 
-    # -- grid ---------------------------------------------------------------------------------------
+    # -- material ------------------------------------------------------------------------------------
 
     @ti.func
-    def take(self, grid: ti.template(), at):
-        """Read a node and clear it for the next scatter."""
-        total = grid[at]
-        grid[at] = ti.Vector.zero(self.real, 4)
-        return total
+    def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
+        """:meth:`material_tile` for one particle; returns A, row by row."""
+        out = ti.Vector.zero(self.real, 9)
+        p = self.material[e]
+        c = self.load(state, source + 6, lane, 9)
+        g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
+        j = det(g)
+        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
+        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+        if self.served(z2, j):
+            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
+            for i in ti.static(range(9)):
+                out[i] = a[i]
+            if ti.static(update):
+                if self.flows(k):
+                    f_new = flow(d, g, p[2], self.series)
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i][lane] = f_new[i]
+                else:
+                    for i in ti.static(range(9)):
+                        state[target + 15 + i][lane] = g[i]
+        else:
+            out = self.spectral_material(state, source, target, lane, e, update)
+        return out
+
+    @ti.func
+    def material_particle_adjoint(
+        self, state: ti.template(), source, bar: ti.template(), target, a_bar: ti.template(), lane, e
+    ):
+        """:meth:`material_tile_adjoint` for one particle, given the adjoint of A."""
+        p = self.material[e]
+        c = self.load(state, source + 6, lane, 9)
+        f = self.load(state, source + 15, lane, 9)
+        g_bar = self.load(bar, target + 15, lane, 9)
+        g = trial_gradient(c, f, self.dt)
+        j = det(g)
+        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
+        if self.served(z2, j):
+            tau_bar = self.stress_symmetric(a_bar)
+            d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
+            _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+            if self.flows(k):
+                d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
+                k_bar += k_flow
+                for i in ti.static(range(6)):
+                    d_bar[i] += d_flow[i]
+                for i in ti.static(range(9)):
+                    g_bar[i] = g_flow[i]
+            if ti.static(self.full_gradient):
+                mu_bar, lam_bar, yield_bar = parameter_adjoint(d, j, c2, tau_bar, k_bar, p[2], self.series)
+                self.accumulate_material(e, mu_bar, lam_bar, yield_bar)
+            z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
+            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
+            for i in ti.static(range(9)):
+                bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
+                bar[target + 15 + i][lane] = f_out[i]
+        else:
+            self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
+
+    # -- grid ---------------------------------------------------------------------------------------
 
     @ti.func
     def touching(self, e, s, x):
@@ -345,7 +294,7 @@ class CudaPhases(Phases):
             for m in range(start, stop):
                 p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-                if self.strength(d) > 0.0:
+                if self.strength(e, d) > 0.0:
                     mask = mask | (1 << m)
         return mask
 

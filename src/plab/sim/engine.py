@@ -11,13 +11,10 @@ from collections.abc import Callable, Sequence
 
 import taichi as ti
 
-from plab.scene import Scene
 from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.pose_phases import PosePhases
-from plab.sim.runtime import Runtime
-from plab.sim.skips import Skips
 from plab.sim.storage import BLOCK, MEASURES, STAGE, STATE, WORK
 from plab.sim.transfer import spline
 
@@ -88,10 +85,12 @@ class CpuEngine(Phases):
     :class:`plab.sim.cuda_engine.CudaEngine` has the same.
     """
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips) -> None:
+    sorts = False
+
+    def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
-        super().__init__(scenes, runtime, skips)
-        sizes = (self.team_size, 1) if skips.waiting else (self.team_size,)
+        super().__init__(*args)
+        sizes = (self.team_size, 1) if self.skips.waiting else (self.team_size,)
         self._teams = {name: TeamChoice(sizes) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, *args: object) -> None:

@@ -45,9 +45,9 @@ class GridPhases(Storage):
         return (ti.cast(i, self.real) - 1.0) * self.dx
 
     @ti.func
-    def strength(self, d):
+    def strength(self, e, d):
         """Contact strength at distance d; 0 where contact is not applied."""
-        alpha = self.alpha[None]
+        alpha = self.alpha[e]
         s = d * 0.0
         if d <= 0.0:
             s = 1.0 + 0.0 * d
@@ -67,7 +67,7 @@ class GridPhases(Storage):
         if ti.static(not self.skips.far_manipulators):
             mask = ti.static((1 << self.manipulators) - 1)
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
-        alpha = self.alpha[None]
+        alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
         if alpha > 0.0:
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
@@ -129,7 +129,7 @@ class GridPhases(Storage):
         out = v
         p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
         d, n_local = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-        strength = self.strength(d)
+        strength = self.strength(e, d)
         if strength > 0.0:
             # What touches a manipulator that cannot move does not touch an action.
             if ti.static(MANIPULATOR_SHAPES[shape].motion != "static"):
@@ -164,7 +164,7 @@ class GridPhases(Storage):
         p = self.into_frame(shape, e, s, m, offset)
         gap = self.frame_gap[e, s, m]
         d, n_local = signed_distance(shape, p, self.size[e, m], gap)
-        strength = self.strength(d)
+        strength = self.strength(e, d)
         if strength > 0.0:
             normal = self.out_of_frame(shape, e, s, m, n_local)
             r = v - self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
@@ -191,7 +191,7 @@ class GridPhases(Storage):
                 normal_bar = rn_bar * r - rn * t0_bar
                 d_bar = 0.0 * d
                 if d > 0.0:
-                    d_bar = -self.alpha[None] * strength * bar.dot(t - r)
+                    d_bar = -self.alpha[e] * strength * bar.dot(t - r)
                 self.frame_adjoint(
                     shape, grid_index, e, s, m, offset, p, n_local, normal_bar, d_bar, bar - r_bar
                 )

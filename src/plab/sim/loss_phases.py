@@ -80,6 +80,11 @@ class LossPhases(Storage):
         return density, sdf, slope, overlap
 
     @ti.func
+    def node_slope(self, grid: ti.template(), node):
+        """The loss's slope at a node."""
+        return grid[node][3]
+
+    @ti.func
     def mass_slope(self, grid: ti.template(), e, base, fx):
         """Gradient of the weighted density and SDF terms with respect to one particle's position."""
         w = spline(fx)
@@ -89,7 +94,8 @@ class LossPhases(Storage):
             for j in ti.static(range(3)):
                 for k in ti.static(range(3)):
                     at = self.folded_node(base, i, j, k)
-                    value = grid[e * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]][3]
+                    node = (at[0] * self.axis + at[1]) * self.axis + at[2]
+                    value = self.node_slope(grid, e * self.nodes + node)
                     out += value * ti.Vector(
                         [
                             dw[i][0] * w[j][1] * w[k][2],

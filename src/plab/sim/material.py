@@ -52,6 +52,7 @@ __all__ = [
     "flow_adjoint",
     "hencky_strain",
     "log_adjoint",
+    "parameter_adjoint",
     "strain_adjoint",
     "stress",
     "stress_adjoint",
@@ -385,6 +386,31 @@ def stress_adjoint(
     k_bar = t1 * tau_d + 2.0 * k * (t2 * tau_d2 + q * qk_bar) + 3.0 * k * k * det_d * dk_bar
     d_bar = polynomial_adjoint(d, tau_bar, t1 * k, t2 * k * k, k * k * qk_bar, k * k * k * dk_bar)
     return d_bar, k_bar, j * j3_bar, lam * t0_bar * (2.0 * j - 1.0) + c2 * j3_bar
+
+
+@ti.func
+def parameter_adjoint(
+    d: ti.template(), j, c2, tau_bar: ti.template(), k_bar, yield_strain, series: ti.template()
+):
+    """Adjoints of mu, lambda and yield strain under return mapping and stress.
+
+    Args:
+        d: Deviatoric Hencky strain, 6 components.
+        j: J.
+        c2: J^(-2/3).
+        tau_bar: Symmetric part of the adjoint of tau, 6 components.
+        k_bar: Adjoint of the factor k of return mapping, from stress and flow together.
+        yield_strain: Yield stress / (2 mu).
+        series: :class:`Series`.
+
+    Returns:
+        Adjoints of mu, lambda and yield strain.
+    """
+    # The stress is linear in mu and lambda.
+    mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
+    _q, _det, norm, k = yield_factor(d, yield_strain)
+    yield_bar = ti.select(k < 1.0, k_bar / norm, 0.0 * k)
+    return mu_bar, (tau_bar[0] + tau_bar[1] + tau_bar[2]) * j * (j - 1.0), yield_bar
 
 
 @ti.func

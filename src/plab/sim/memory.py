@@ -1,28 +1,80 @@
-"""How much memory Taichi's fields and arrays take."""
+"""How much memory gradients will take, and what fields and arrays do."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import taichi as ti
 
-__all__ = ["array_bytes", "held_bytes"]
+from plab.scene import Scene
+from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE
 
-SIZES = {ti.f32: 4, ti.f64: 8, ti.i32: 4}
+__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
+
+ENTRIES_MAX = 2**31 - 1
+"""Entries of one array: Taichi counts them in 32 bits."""
+
+REAL_BYTES = {"float32": 4, "float64": 8}
+
+BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
+
+
+def kept_states(steps: int, slots_per_step: int, length: int) -> int:
+    """Return how many states a gradient keeps if every ``length`` environment steps are one segment.
+
+    All states of one segment are kept, the first one of every segment, and two more.
+    """
+    segments = -(-steps // length)
+    return length * slots_per_step + 2 + (segments if segments > 1 else 0)
+
+
+def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> int:
+    """Return how many environments a simulator should have at most for gradients of whole episodes.
+
+    On the CPU as many as need not compute any state twice: more would run no faster. On CUDA as many as there
+    is memory for if few states are kept: what it costs to compute the others again is less than what a full
+    device gains.
+
+    Args:
+        scene: One of the scenes, which are alike in size.
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+        memory_mb: Memory for states, grids and targets [MB].
+
+    Returns:
+        Number of environments, at least 1.
+    """
+    real, lanes = REAL_BYTES[precision], LANES[device]
+    entries = -(-scene.particle_count // lanes) * lanes * STATE
+    lengths = range(1, scene.horizon + 1)
+    # On CUDA a step's start may be kept in two orders of the particles.
+    slots_per_step = scene.substeps + (0 if device == "cpu" else 1)
+    states = [kept_states(scene.horizon, slots_per_step, length) + 1 for length in lengths]
+    kept = states[-1] if device == "cpu" else min(states)
+    # Current and initial state, stress, adjoints, orders and what goes with them: less than six more states.
+    kept += 6
+    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts by cell; target and
+    # distance.
+    nodes = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
+    grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
+    fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
+    # The sparsest way to keep states, by the entries of the longer of its two arrays.
+    longest = min(max(length * slots_per_step + 1, -(-scene.horizon // length)) for length in lengths)
+    return max(1, min(fitting, ENTRIES_MAX // (longest * entries)))
 
 
 def array_bytes(data: ti.Field | ti.Ndarray) -> int:
     """Bytes of a field's or an array's entries."""
     scalars = data.element_shape if isinstance(data, ti.Ndarray) else _entry_shape(data)
-    return math.prod(data.shape) * math.prod(scalars) * SIZES[data.dtype]
+    return math.prod(data.shape) * math.prod(scalars) * BYTES[data.dtype]
 
 
 def _entry_shape(field: ti.Field) -> tuple[int, ...]:
     return (field.n, field.m) if isinstance(field, ti.MatrixField) else ()
 
 
-def held_bytes(attributes: Iterable[object]) -> int:
-    """Bytes of all fields and arrays among an object's attributes, each counted once."""
-    held = {id(a): a for a in attributes if isinstance(a, ti.Field | ti.Ndarray)}
-    return sum(array_bytes(a) for a in held.values())
+def held_bytes(*holders: object) -> int:
+    """Bytes of all fields and arrays among the attributes of objects, each counted once."""
+    values = [value for holder in holders for value in vars(holder).values()]
+    held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
+    return sum(array_bytes(value) for value in held.values())

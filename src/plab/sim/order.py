@@ -1,14 +1,22 @@
-"""The order of particles in memory: along a Hilbert curve through the grid.
+"""The order of particles in memory: at first along a Hilbert curve through the grid.
 
 Neighbours on the curve are neighbours in space, whichever way the grid's cells come to lie over them later:
-particles that are close in memory go on to share grid nodes while the plasticine moves and deforms.
+particles that are close in memory go on to share grid nodes while the plasticine moves and deforms. With many
+particles on CUDA the order is made anew before every environment step.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-__all__ = ["curve_order", "hilbert_index"]
+import numpy as np
+import taichi as ti
+
+if TYPE_CHECKING:
+    from plab.sim.engine import CpuEngine
+
+__all__ = ["ParticleOrder", "curve_order", "hilbert_index"]
 
 PARTS = 4
 """Steps of the curve per grid cell and axis."""
@@ -62,3 +70,86 @@ def curve_order(x: np.ndarray, n: int) -> np.ndarray:
     # Cells are those of the particles' base nodes, of which the lowest is -1.
     cell = np.floor((x * n + 0.5) * PARTS).astype(np.int64)
     return np.argsort(hilbert_index(cell, int(PARTS * (n + 1)).bit_length()), kind="stable")
+
+
+class ParticleOrder:
+    """Which particle of those given is at which place of the tiles.
+
+    Attributes:
+        initial: The order after :meth:`reset`, shape [batch, particle].
+        numbers: Numbers of the given particles on the device, by place; those at and beyond the number of
+            particles are padding, shape [batch * place].
+    """
+
+    def __init__(self, engine: CpuEngine) -> None:
+        """Allocate; :meth:`start_from` comes next.
+
+        Args:
+            engine: The kernels that find and follow another order, where ``engine.sorts``.
+        """
+        self._engine = engine
+        self.numbers = self._array(1)
+        if engine.sorts:
+            engine.allocate_order()
+            self._spare = self._array(1)
+            self._moves = self.allocate(1)
+
+    def start_from(self, positions: Sequence[np.ndarray]) -> None:
+        """Start with the curve's order.
+
+        Args:
+            positions: Initial positions of each environment [domain units], each [particle, 3].
+        """
+        engine = self._engine
+        self.initial = np.stack([curve_order(x, engine.n) for x in positions])
+        batch, particles = self.initial.shape
+        padding = np.arange(particles, engine.tiles * engine.lanes)
+        rows = np.concatenate([self.initial, np.broadcast_to(padding, (batch, padding.size))], axis=1)
+        self._start = rows.astype(np.int32).reshape(-1)
+        self._changed = True
+        self.reset()
+
+    @property
+    def places(self) -> int:
+        """Places in all environments, padding included."""
+        return self._engine.batch * self._engine.tiles * self._engine.lanes
+
+    def _array(self, steps: int) -> ti.Ndarray:
+        return ti.ndarray(ti.i32, shape=steps * self.places)
+
+    def allocate(self, steps: int) -> ti.Ndarray:
+        """Allocate the moves of several environment steps, for :meth:`find`."""
+        return self._array(steps)
+
+    def reset(self) -> None:
+        """Return to the initial order."""
+        if self._changed:
+            self.numbers.from_numpy(self._start)
+            self._changed = False
+
+    def current(self) -> np.ndarray:
+        """The order at present, shape [batch, particle]."""
+        batch, particles = self.initial.shape
+        return self.numbers.to_numpy().reshape(batch, -1)[:, :particles].astype(np.int64)
+
+    def find(
+        self, state: ti.Ndarray, slot: int, t: int, stamp: int, moves: ti.Ndarray | None = None
+    ) -> ti.Ndarray:
+        """Find the order of the cells for a state and take it as the current one.
+
+        Args:
+            state: Particle states.
+            slot: Time slot of the state.
+            t: Environment step, the entry of ``moves`` that is written.
+            stamp: A fresh stamp.
+            moves: From :meth:`allocate`; the order's own, with room for step 0, if None.
+
+        Returns:
+            The array that holds the move; the caller moves the state.
+        """
+        moves = self._moves if moves is None else moves
+        self._engine.find_order(state, slot, moves, t, stamp)
+        self._engine.follow(self.numbers, self._spare, moves, t)
+        self.numbers, self._spare = self._spare, self.numbers
+        self._changed = True
+        return moves

@@ -9,14 +9,19 @@ from plab.sim.material import (
     flow_adjoint,
     hencky_strain,
     log_adjoint,
+    parameter_adjoint,
     strain_adjoint,
     stress,
     stress_adjoint,
     trial_gradient,
     yield_factor,
 )
-from plab.sim.spectral import spectral_return_map, spectral_return_map_adjoint
-from plab.sim.storage import BLOCK, BLOCK_BITS, STATE, Storage
+from plab.sim.spectral import (
+    spectral_parameter_adjoint,
+    spectral_return_map,
+    spectral_return_map_adjoint,
+)
+from plab.sim.storage import BLOCK, BLOCK_BITS, STAGE, STATE, Storage
 from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
 
 __all__ = ["ParticlePhases"]
@@ -66,18 +71,20 @@ class ParticlePhases(Storage):
     def observe(
         self,
         state: ti.types.ndarray(ndim=1),
-        places: ti.types.ndarray(ndim=1),
-        count: ti.i32,
+        order: ti.types.ndarray(ndim=1),
+        stride: ti.i32,
         out: ti.types.ndarray(ndim=1),
     ):
-        """Write position and velocity of ``count`` particles per environment, at their places in the tiles'
-        order."""
-        for q in range(self.batch * count):
-            tile = places[q] // self.lanes
-            lane = places[q] % self.lanes
-            entry = self.tile_entry(0, q // count, tile)
-            for i in ti.static(range(6)):
-                out[q * 6 + i] = state[entry + i][lane]
+        """Write position and velocity of every ``stride``-th particle, as ``order`` numbers them."""
+        for q in range(self.batch * self.tiles * self.lanes):
+            e = q // (self.tiles * self.lanes)
+            place = q - e * (self.tiles * self.lanes)
+            number = order[q]
+            if place < self.particles and number % stride == 0:
+                entry = self.tile_entry(0, e, place // self.lanes)
+                row = e * ((self.particles + stride - 1) // stride) + number // stride
+                for i in ti.static(range(6)):
+                    out[row * 6 + i] = state[entry + i][place % self.lanes]
 
     @ti.func
     def stencil(self, x):
@@ -187,45 +194,23 @@ class ParticlePhases(Storage):
                         state[target + 15 + i] = self.stage[at + i]
         else:
             for lane in range(self.lanes):
-                self.spectral_material(state, source, target, entry9, lane, e, update)
+                a = self.spectral_material(state, source, target, lane, e, update)
+                for i in ti.static(range(9)):
+                    self.affine[entry9 + i][lane] = a[i]
 
     @ti.func
-    def spectral_material(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle, by singular values."""
+    def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
+        """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.material[e]
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
+        out = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(9)):
             if ti.static(update):
                 state[target + 15 + i][lane] = f_new[i // 3, i % 3]
-            self.affine[entry9 + i][lane] = (
-                self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
-            )
-
-    @ti.func
-    def material_particle(self, state: ti.template(), source, target, entry9, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle on CUDA."""
-        p = self.material[e]
-        c = self.load(state, source + 6, lane, 9)
-        g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
-        j = det(g)
-        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
-        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
-        if self.served(z2, j):
-            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
-            for i in ti.static(range(9)):
-                self.affine[entry9 + i][lane] = a[i]
-            if ti.static(update):
-                if self.flows(k):
-                    f_new = flow(d, g, p[2], self.series)
-                    for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = f_new[i]
-                else:
-                    for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = g[i]
-        else:
-            self.spectral_material(state, source, target, entry9, lane, e, update)
+            out[i] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
+        return out
 
     @ti.func
     def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
@@ -244,10 +229,13 @@ class ParticlePhases(Storage):
             else:
                 for i in ti.static(range(9)):
                     self.stage[at + STAGE_G_BAR + i] = bar[target + 15 + i]
+            if ti.static(self.full_gradient):
+                self.parameter_tile_adjoint(entry9, p[2], at)
             self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
         else:
             for lane in range(self.lanes):
-                self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
+                a_bar = self.load(self.affine, entry9, lane, 9)
+                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, at // STAGE)
 
     @ti.func
     def strain_tile(self, state: ti.template(), source, at):
@@ -308,6 +296,31 @@ class ParticlePhases(Storage):
             self.stage[at + STAGE_G_BAR + i] = g_bar[i]
 
     @ti.func
+    def parameter_tile_adjoint(self, entry9, yield_strain, at):
+        """Add a tile's adjoints of the material's parameters, from ``stage``."""
+        mu_bar, lam_bar, yield_bar = parameter_adjoint(
+            [self.stage[at + STAGE_D + i] for i in range(6)],
+            self.stage[at + STAGE_SCALARS],
+            self.stage[at + STAGE_SCALARS + 1],
+            self.stress_symmetric([self.affine[entry9 + i] for i in range(9)]),
+            self.stage[at + STAGE_BARS],
+            yield_strain,
+            self.series,
+        )
+        self.accumulate_material(at // STAGE, mu_bar.sum(), lam_bar.sum(), yield_bar.sum())
+
+    @ti.func
+    def accumulate_material(self, grid_index, mu_bar, lam_bar, yield_bar):
+        """Add to the material's adjoint: plainly where one thread owns it, atomically on CUDA."""
+        bars = (mu_bar, lam_bar, yield_bar)
+        for i in ti.static(range(3)):
+            wide = ti.cast(bars[i], ti.f64)
+            if ti.static(self.cuda):
+                ti.atomic_add(self.material_bar[grid_index, i], wide)
+            else:
+                self.material_bar[grid_index, i] = self.material_bar[grid_index, i] + wide
+
+    @ti.func
     def strain_tile_adjoint(
         self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at
     ):
@@ -348,54 +361,34 @@ class ParticlePhases(Storage):
 
     @ti.func
     def spectral_material_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
+        self,
+        state: ti.template(),
+        source,
+        bar: ti.template(),
+        target,
+        a_bar9: ti.template(),
+        lane,
+        e,
+        grid_index,
     ):
-        """:meth:`material_tile_adjoint` for one particle, by singular values."""
+        """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
         p = self.material[e]
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
-        a_bar = as_matrix(self.load(self.affine, entry9, lane, 9))
+        a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
-        g_bar = spectral_return_map_adjoint(f + self.dt * (c @ f), f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
+        g = f + self.dt * (c @ f)
+        g_bar = spectral_return_map_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
+        if ti.static(self.full_gradient):
+            mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
+            self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
         c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
         f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
         for i in ti.static(range(9)):
             bar[target + 6 + i][lane] = c_bar[i // 3, i % 3]
             bar[target + 15 + i][lane] = f_bar[i // 3, i % 3]
-
-    @ti.func
-    def material_particle_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, entry9, lane, e
-    ):
-        """:meth:`material_tile_adjoint` for one particle on CUDA."""
-        p = self.material[e]
-        c = self.load(state, source + 6, lane, 9)
-        f = self.load(state, source + 15, lane, 9)
-        g_bar = self.load(bar, target + 15, lane, 9)
-        a_bar = self.load(self.affine, entry9, lane, 9)
-        g = trial_gradient(c, f, self.dt)
-        j = det(g)
-        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
-        if self.served(z2, j):
-            tau_bar = self.stress_symmetric(a_bar)
-            d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
-            _q, _det, _norm, k = yield_factor(d, p[2], self.series)
-            if self.flows(k):
-                d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
-                k_bar += k_flow
-                for i in ti.static(range(6)):
-                    d_bar[i] += d_flow[i]
-                for i in ti.static(range(9)):
-                    g_bar[i] = g_flow[i]
-            z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
-            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
-            for i in ti.static(range(9)):
-                bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
-                bar[target + 15 + i][lane] = f_out[i]
-        else:
-            self.spectral_material_adjoint(state, source, bar, target, entry9, lane, e)
 
     # -- transfers ----------------------------------------------------------------------------------
 
@@ -596,7 +589,11 @@ class ParticlePhases(Storage):
         block, crossing = self.block_of(base)
         for corner in ti.static(range(8)):
             if (crossing & corner) == corner:
-                entry = e * self.blocks + self.neighbour(block, corner)
-                if self.block_stamp[entry] < stamp:
-                    if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
-                        self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry
+                self.list_block(e * self.blocks + self.neighbour(block, corner), stamp)
+
+    @ti.func
+    def list_block(self, entry, stamp):
+        """Take a block into the list on CUDA, unless it is in it."""
+        if self.block_stamp[entry] < stamp:
+            if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
+                self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry

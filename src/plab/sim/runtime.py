@@ -7,6 +7,7 @@ import contextlib
 import io
 import os
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 # Taichi prints a banner on standard output unless told so before it is imported.
@@ -25,7 +26,15 @@ class DeviceError(RuntimeError):
 
 
 class SimulationError(RuntimeError):
-    """The state or a gradient stopped being finite; the message says where and when."""
+    """The state or a gradient stopped being finite; the message says where and when.
+
+    Attributes:
+        failures: Which environments broke off, and when and why.
+    """
+
+    def __init__(self, message: str, failures: Mapping[int, str] | None = None) -> None:
+        super().__init__(message)
+        self.failures = dict(failures or {})
 
 
 @dataclass(frozen=True)

@@ -2,80 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.engine import CpuEngine
+from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.memory import held_bytes
-from plab.sim.order import curve_order
-from plab.sim.runtime import SimulationError, is_current, register_user, start_runtime
+from plab.sim.parameters import parameter_gradient
+from plab.sim.particles import Particles
+from plab.sim.runtime import is_current, register_user, start_runtime
 from plab.sim.skips import Skips
-from plab.sim.storage import MEASURES, STATE
+from plab.sim.state import Measures, Rollout, State, rest_state
+from plab.sim.storage import MEASURES
+from plab.sim.tape import Tape
+from plab.sim.tensors import on_device, tensor_from, write_numbers
 
-__all__ = ["CONTACT_MODELS", "Measures", "Rollout", "Simulator", "State"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["CONTACT_MODELS", "Simulator"]
 
 CONTACT_MODELS = ("soft", "hard")
-
-STAMP_MAX = 2**31 - 2**20
-
-
-@dataclass(frozen=True)
-class State:
-    """Particles and manipulators of all environments, float64.
-
-    Attributes:
-        x: Particle positions [domain units], shape [batch, particle, 3].
-        v: Particle velocities, shape [batch, particle, 3].
-        C: APIC velocity gradients, shape [batch, particle, 3, 3].
-        F: Deformation gradients, shape [batch, particle, 3, 3].
-        poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, manipulator, 8].
-    """
-
-    x: np.ndarray
-    v: np.ndarray
-    C: np.ndarray
-    F: np.ndarray
-    poses: np.ndarray
-
-
-@dataclass(frozen=True)
-class Measures:
-    """What a state is judged by.
-
-    Attributes:
-        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
-            their weight is.
-        iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
-            NaN before :meth:`Simulator.set_target`.
-    """
-
-    terms: np.ndarray
-    iou: np.ndarray
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """What a rollout of T environment steps gives.
-
-    Attributes:
-        initial_terms: Unweighted loss terms (density, SDF, contact) of the initial state, shape [batch, 3].
-        step_terms: The same after each environment step, shape [batch, T, 3].
-        initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
-        step_iou: The same after each environment step, shape [batch, T].
-        gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
-            [batch, T, action], or None if it was not asked for.
-    """
-
-    initial_terms: np.ndarray
-    step_terms: np.ndarray
-    initial_iou: np.ndarray
-    step_iou: np.ndarray
-    gradient: np.ndarray | None
 
 
 class Simulator:
@@ -95,6 +48,7 @@ class Simulator:
         memory_mb: float = 4000.0,
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
+        full_gradient: bool = False,
         skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
@@ -107,6 +61,8 @@ class Simulator:
                 recomputed to stay in it.
             threads: CPU threads; all that the process may use if None. Results do not depend on it.
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            full_gradient: Whether a rollout's gradient includes those with respect to the initial state
+                (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
             skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
@@ -122,26 +78,17 @@ class Simulator:
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
         self._skips = skips
-        self._engine = _engine_class(device)(self.scenes, self._runtime, skips)
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
-        self._stamp = 0
-        self._history: ti.Ndarray | None = None
-        self._checkpoints: ti.Ndarray | None = None
-        self._bar: ti.Ndarray | None = None
-        self._current = self._state_array(1)
-        self._initial = self._state_array(1)
         self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
-        self._observed: dict[int, tuple[ti.Ndarray, ti.Ndarray]] = {}
+        self._observed: dict[int, ti.Ndarray] = {}
         self._target_scale = np.full((2, self.batch), np.nan)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
-        positions = [sample_particles(s) for s in scenes] if particles is None else list(particles)
-        self._order = np.stack([curve_order(x, scenes[0].grid_size) for x in positions])
-        self._initial_poses = np.array(
-            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
-            dtype=np.float64,
-        ).reshape(self.batch, self.manipulator_count, 8)
-        self._initial.from_numpy(self._pack(_rest_state(np.stack(positions), self._initial_poses)))
+        self._particles = Particles(self._engine, self._numpy_real)
+        self._tape = Tape(self._particles)
+        self._initial = self._particles.array(1)
+        self._start_from(particles)
         self.set_contact("soft")
         self.set_loss_weights(10.0, 10.0, 1.0)
         self.reset()
@@ -188,20 +135,29 @@ class Simulator:
         """Substeps per environment step."""
         return self.scenes[0].substeps
 
+    def memory_bytes(self) -> int:
+        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
+        its compiled kernels and what is on the way to or from the host."""
+        return held_bytes(self, self._engine, self._particles, self._particles.order, self._tape)
+
     # -- settings -----------------------------------------------------------------------------------
 
-    def set_contact(self, model: str, softness: float = 666.0) -> None:
+    def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
         """Choose the contact model; nothing is compiled anew.
 
         Args:
-            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``.
-            softness: Decay rate of the soft model [1 / domain unit].
+            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one for all
+                environments, or one for each.
+            softness: Decay rate of the soft model [1 / domain unit]; one for all, or one for each.
         """
-        if model not in CONTACT_MODELS:
-            raise ValueError(f"contact '{model}' is not one of {', '.join(CONTACT_MODELS)}")
-        if model == "soft" and not softness > 0:
-            raise ValueError(f"softness {softness:g} must be positive")
-        self._engine.alpha[None] = softness if model == "soft" else 0.0
+        models = np.broadcast_to(model, self.batch)
+        decay = np.broadcast_to(np.asarray(softness, float), self.batch)
+        for name, rate in zip(models, decay, strict=True):
+            if name not in CONTACT_MODELS:
+                raise ValueError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
+            if name == "soft" and not rate > 0:
+                raise ValueError(f"softness {rate:g} must be positive")
+        self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
     def set_loss_weights(self, density: float, sdf: float, contact: float) -> None:
         """Set the weights of the three loss terms in the trajectory loss and its gradient.
@@ -209,6 +165,66 @@ class Simulator:
         The SDF and the contact term are not computed where their weight is 0: they are given as 0 then.
         """
         self._engine.loss_weights[None] = [density, sdf, contact]
+
+    def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
+        """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
+
+        Contact model, weights and targets stay.
+
+        Args:
+            scenes: One scene per environment.
+            particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+        """
+        self._require_runtime()
+        if len(scenes) != self.batch:
+            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
+        for scene in scenes:
+            scene.validate()
+        _require_alike([self.scenes[0], *scenes])
+        self._engine.require_kept(scenes)
+        self.scenes = tuple(scenes)
+        self._engine.fill_parameters(scenes)
+        self._start_from(particles)
+        self.reset()
+
+    def set_material(
+        self,
+        youngs_modulus: ArrayLike | None = None,
+        poisson_ratio: ArrayLike | None = None,
+        yield_stress: ArrayLike | None = None,
+    ) -> None:
+        """Change the material; nothing is compiled anew.
+
+        Args:
+            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None.
+            poisson_ratio: Poisson ratio, likewise.
+            yield_stress: von Mises yield stress, likewise.
+
+        Raises:
+            SceneError: If a scene could not be simulated with it; nothing is changed then.
+        """
+        given = {
+            "youngs_modulus": youngs_modulus,
+            "poisson_ratio": poisson_ratio,
+            "yield_stress": yield_stress,
+        }
+        values = {
+            name: np.broadcast_to(np.asarray(value, float), self.batch).tolist()
+            for name, value in given.items()
+            if value is not None
+        }
+        scenes = tuple(
+            replace(scene, **{name: column[e] for name, column in values.items()})
+            for e, scene in enumerate(self.scenes)
+        )
+        for scene in scenes:
+            scene.validate()
+        self._engine.require_kept(scenes)
+        self.scenes = scenes
+        self._engine.fill_material(scenes)
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Set the targets of all environments.
@@ -236,66 +252,110 @@ class Simulator:
     def reset(self) -> None:
         """Put all environments into their initial states."""
         self._require_runtime()
-        self._engine.copy_slot(self._initial, 0, self._current, 0)
+        self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
+        self._particles.order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
         self._engine.touched.fill(0)
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self, actions: np.ndarray | torch.Tensor) -> None:
         """Advance all environments by one environment step, without keeping history.
 
         Args:
-            actions: Actions, shape [batch, action]; clipped to [-1, 1].
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. A CUDA tensor is taken as it is.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
             SimulationError: If the state stops being finite.
         """
         self._require_runtime()
-        array = self._action_array(np.asarray(actions, np.float64)[:, None])
-        self._engine.step(self._current, self._pose, array, 0, 0, 0, 0, 0, self._take_stamps(self.substeps))
-        self._check_fault()
+        array = self._action_array(
+            actions if on_device(actions) else np.asarray(actions, np.float64), steps=1
+        )
+        self._particles.step(self._pose, array)
+        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
 
-    def rollout(self, actions: np.ndarray, gradient: bool = True) -> Rollout:
+    def rollout(
+        self, actions: np.ndarray | torch.Tensor, gradient: bool = True, *, strict: bool = True
+    ) -> Rollout:
         """Run environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
-            actions: Actions, shape [batch, T, action]; clipped to [-1, 1].
+            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, the gradient
+                is one too, of its type.
             gradient: Whether to compute the gradient.
+            strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
 
         Returns:
             Loss terms per step and the gradient; the simulator is left in the final state.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            SimulationError: If state, loss or gradient stop being finite.
+            SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         self.reset()
-        array = self._action_array(np.asarray(actions, np.float64))
-        steps = np.shape(actions)[1]
-        plan = self._plan(steps) if gradient or not self._skips.history else None
+        array = self._action_array(actions if on_device(actions) else np.asarray(actions, np.float64))
+        steps = actions.shape[1] if on_device(actions) else np.shape(actions)[1]
+        kept = gradient or not self._skips.history
+        plan = self._tape.plan(steps, self.memory_mb) if kept else None
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
         whole[0] = self._initial_poses
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
-        self._losses(self._current, 0, terms, 0)
-        self._run_forward(array, poses, terms, steps, plan)
+        self._particles.losses(terms, 0)
+        self._tape.forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
-        self._check_fault()
-        self._check_terms(values)
-        actions_bar = self._run_backward(array, poses, steps, plan) if gradient else None
+        failures = broken_terms(values) | broken_states(self._engine.fault.to_numpy(), self.substeps)
+        if strict:
+            require_none(failures)
+        actions_bar = None
+        if gradient:
+            contact_free = self._steps_before_contact(steps)
+            bars = self._tape.backward(array, poses, steps, contact_free)
+            actions_bar = self._given(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
+            failures = broken_gradients(actions_bar) | failures
+            if strict:
+                require_none(failures)
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
         judged = self._measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
-        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar)
+        return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
-    def measure(self) -> Measures:
-        """Loss terms and soft IoU of the current state."""
+    def state_gradient(self) -> State:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
+
+        The backward pass ends with it; asking for it copies it from the device. The gradient with respect to
+        a quaternion is that of the rotation matrix's polynomial, to be projected on its tangent space.
+
+        Raises:
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no rollout
+                with a gradient.
+        """
+        self._require_gradient()
+        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
+        return self._particles.unpack(self._tape.bar.to_numpy(), poses, self._particles.order.initial)
+
+    def material_gradient(self) -> np.ndarray:
+        """Gradient of the last :meth:`rollout`'s loss with respect to the material.
+
+        Returns:
+            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3].
+
+        Raises:
+            RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
+                rollout with a gradient.
+        """
+        self._require_gradient()
+        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
+        return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
+
+    def measure(self, like: torch.Tensor | None = None) -> Measures:
+        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type."""
         self._require_runtime()
-        self._losses(self._current, 0, self._scratch_terms, 0)
-        return self._measures(self._scratch_terms.to_numpy().reshape(self.batch, MEASURES))
+        self._particles.losses(self._scratch_terms, 0)
+        return self._measures(self._given(self._scratch_terms, (self.batch, MEASURES), like))
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
@@ -304,7 +364,7 @@ class Simulator:
     def mass_tensor(self) -> np.ndarray:
         """Mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
         self._require_runtime()
-        self._losses(self._current, 0, self._scratch_terms, 0)
+        self._particles.losses(self._scratch_terms, 0)
         n = self.grid_size
         out = np.zeros(self.batch * n**3, self._numpy_real)
         self._engine.export_mass(out)
@@ -315,31 +375,33 @@ class Simulator:
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
         poses = self.poses()
-        return self._unpack(self._current.to_numpy(), poses)
+        return self._particles.unpack(self._particles.current.to_numpy(), poses)
 
-    def observe(self, stride: int) -> np.ndarray:
+    def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Position and velocity of every ``stride``-th particle, in the order in which they were given.
 
         Only these are copied from the device.
 
         Args:
             stride: Distance of the observed particles' numbers, at least 1.
+            like: Given a CUDA tensor, the result is one too, of its type, and nothing is copied to the host.
 
         Returns:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
         """
         self._require_runtime()
+        count = -(-self.particle_count // stride)
         if stride not in self._observed:
-            self._observed[stride] = self._allocate_observation(stride)
-        places, out = self._observed[stride]
-        count = places.shape[0] // self.batch
-        self._engine.observe(self._current, places, count, out)
-        return out.to_numpy().reshape(self.batch, count, 6)
+            self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
+        out = self._observed[stride]
+        self._engine.observe(self._particles.current, self._particles.order.numbers, stride, out)
+        return self._given(out, (self.batch, count, 6), like)
 
-    def poses(self) -> np.ndarray:
-        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`."""
+    def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
+        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
+        tensor if ``like`` is one, of its type."""
         self._require_runtime()
-        return self._pose.to_numpy()[: self._initial_poses.size].reshape(self._initial_poses.shape)
+        return self._given(self._pose, self._initial_poses.shape, like)
 
     def set_state(self, state: State) -> None:
         """Replace the current state.
@@ -359,7 +421,8 @@ class Simulator:
                 )
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
-        self._current.from_numpy(self._pack(state))
+        self._particles.current.from_numpy(self._particles.pack(state))
+        self._particles.order.reset()
         self._place(np.asarray(state.poses, np.float64))
         self._engine.fault.fill(0)
 
@@ -368,14 +431,32 @@ class Simulator:
         :class:`State`."""
         self.set_state(state)
         self._initial_poses = np.array(state.poses, np.float64)
-        self._engine.copy_slot(self._current, 0, self._initial, 0)
+        self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
 
     # -- internals ----------------------------------------------------------------------------------
 
-    def _measures(self, values: np.ndarray) -> Measures:
+    def _given(self, array: ti.Ndarray, shape: tuple[int, ...], like: object) -> np.ndarray | torch.Tensor:
+        """What an array on the device holds, as a tensor like a CUDA tensor or else as an array."""
+        if on_device(like):
+            return tensor_from(array, shape, like)
+        return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
+
+    def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
+        """Make the scenes' start the initial state."""
+        positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
+        self._particles.order.start_from(positions)
+        self._initial_poses = np.array(
+            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in self.scenes],
+            dtype=np.float64,
+        ).reshape(self.batch, self.manipulator_count, 8)
+        start = rest_state(np.stack(positions), self._initial_poses)
+        self._initial.from_numpy(self._particles.pack(start))
+
+    def _measures(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""
         overlap, peak = values[..., 3], values[..., 4]
-        target_sum, target_peak = self._target_scale
+        scale = values.new_tensor(self._target_scale) if on_device(values) else self._target_scale
+        target_sum, target_peak = scale
         total = self.scenes[0].particle_mass * self.particle_count
         # Without a target there is no IoU: NaN.
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -383,189 +464,45 @@ class Simulator:
             iou = both / (total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
 
-    def _allocate_observation(self, stride: int) -> tuple[ti.Ndarray, ti.Ndarray]:
-        """Places of the observed particles in the tiles' order, and room for what is observed of them."""
-        where = np.argsort(self._order, axis=1)[:, ::stride]
-        places = ti.ndarray(ti.i32, shape=where.size)
-        places.from_numpy(where.astype(np.int32).reshape(-1))
-        return places, ti.ndarray(self._runtime.real, shape=where.size * 6)
-
-    def _state_array(self, slots: int) -> ti.Ndarray:
-        engine = self._engine
-        return ti.ndarray(engine.lane_type, shape=slots * self.batch * engine.tiles * STATE)
-
-    def memory_bytes(self) -> int:
-        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
-        its compiled kernels and what is on the way to or from the host."""
-        return held_bytes((*vars(self._engine).values(), *vars(self).values()))
-
-    def _slot_bytes(self) -> int:
-        engine = self._engine
-        return self.batch * engine.tiles * STATE * engine.lanes * np.dtype(self._numpy_real).itemsize
-
-    def _plan(self, steps: int) -> int:
-        """Environment steps per segment whose every state is kept, so that all fits into the memory
-        budget."""
-        budget = self.memory_mb * 1e6
-        self._engine.allocate_adjoint()
-        fixed = held_bytes(vars(self._engine).values()) + held_bytes((self._current, self._initial))
-
-        def cost(length: int) -> int:
-            segments = -(-steps // length)
-            slots = length * self.substeps + 2 + (segments if segments > 1 else 0)
-            return fixed + slots * self._slot_bytes()
-
-        # Taichi counts the entries of an array in 32 bits.
-        slots = (2**31 - 1) // (self._slot_bytes() // np.dtype(self._numpy_real).itemsize)
-        fitting = [
-            length
-            for length in range(1, steps + 1)
-            if cost(length) <= budget and max(length * self.substeps + 1, -(-steps // length)) <= slots
-        ]
-        if not fitting:
-            need = math.ceil(min(cost(length) for length in range(1, steps + 1)) / 1e6)
-            raise MemoryError(
-                f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is "
-                f"{self.memory_mb:g}: "
-                f"set sim.memory_mb={need} or more"
-            )
-        # Fewest recomputed steps first: as few segments as possible, of even length.
-        segments = -(-steps // max(fitting))
-        return -(-steps // segments)
-
-    def _allocate_gradient(self, length: int, segments: int) -> None:
-        slots = length * self.substeps + 1
-        size = slots * self._current.shape[0]
-        if self._history is None or self._history.shape[0] < size:
-            self._history = None
-            self._history = self._state_array(slots)
-        if segments > 1 and (
-            self._checkpoints is None or self._checkpoints.shape[0] < segments * self._current.shape[0]
-        ):
-            self._checkpoints = None
-            self._checkpoints = self._state_array(segments)
-        if self._bar is None:
-            self._bar = self._state_array(1)
-
-    def _run_forward(self, actions, poses, terms, steps: int, length: int | None) -> None:
-        if length is None:
-            for t in range(steps):
-                self._advance(self._current, 0, 0, t, actions, poses)
-                self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-            return
-        segments = -(-steps // length)
-        self._allocate_gradient(length, segments)
-        for k in range(segments):
-            if segments > 1:
-                self._engine.copy_slot(self._current, 0, self._checkpoints, k)
-            last = k == segments - 1
-            if last:
-                self._engine.copy_slot(self._current, 0, self._history, 0)
-            for t in range(k * length, min(steps, (k + 1) * length)):
-                if last:
-                    slot = (t - k * length) * self.substeps
-                    self._advance(self._history, slot, 1, t, actions, poses)
-                    self._losses(self._history, slot + self.substeps, terms, (t + 1) * self.batch * MEASURES)
-                else:
-                    self._advance(self._current, 0, 0, t, actions, poses)
-                    self._losses(self._current, 0, terms, (t + 1) * self.batch * MEASURES)
-        end = (steps - (segments - 1) * length) * self.substeps
-        self._engine.copy_slot(self._history, end, self._current, 0)
-
-    def _run_backward(self, actions, poses, steps: int, length: int) -> np.ndarray:
-        segments = -(-steps // length)
-        actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
-        actions_bar.fill(0.0)
-        self._bar.fill(0.0)
-        self._engine.pose_bar.fill(0.0)
-        self._engine.frame_bar.fill(0.0)
-        contact_free = self._steps_before_contact(steps)
-        for k in reversed(range(segments)):
-            stop = min(steps, (k + 1) * length)
-            if k < segments - 1:
-                self._engine.copy_slot(self._checkpoints, k, self._history, 0)
-                for t in range(k * length, stop):
-                    self._advance(self._history, (t - k * length) * self.substeps, 1, t, actions, poses)
-            for t in reversed(range(k * length, stop)):
-                slot = (t - k * length) * self.substeps
-                self._engine.step_adjoint(
-                    self._history,
-                    self._bar,
-                    poses,
-                    actions,
-                    actions_bar,
-                    self._scratch_terms,
-                    slot,
-                    t,
-                    self._take_stamps(self.substeps + 1),
-                    int(t >= contact_free),
-                )
-        gradient = actions_bar.to_numpy()[: steps * self.batch * self.action_dim]
-        gradient = gradient.reshape(steps, self.batch, self.action_dim).transpose(1, 0, 2)
-        for t in reversed(range(steps)):
-            bad = np.flatnonzero(~np.isfinite(gradient[:, t]).all(axis=1))
-            if bad.size:
-                raise SimulationError(
-                    f"the gradient is not finite: environment {bad[0]}, environment step {t + 1}"
-                )
-        return gradient
-
     def _steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done before a manipulator touches any environment's body."""
-        if not self._skips.adjoints:
+        if self._engine.full_gradient or not self._skips.adjoints:
             return 0
         touched = self._engine.touched.to_numpy() != 0
         return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
-
-    def _advance(self, state, slot: int, stride: int, t: int, actions, poses) -> None:
-        self._engine.step(state, poses, actions, slot, stride, t, t, t + 1, self._take_stamps(self.substeps))
-
-    def _losses(self, state, slot: int, terms, at: int) -> None:
-        self._engine.losses(state, slot, terms, at, self._take_stamps(1))
 
     def _place(self, poses: np.ndarray) -> None:
         if self.manipulator_count:
             self._pose.from_numpy(np.ascontiguousarray(poses).reshape(-1))
             self._engine.place(self._pose, 0)
 
-    def _take_stamps(self, count: int) -> int:
-        """The first of ``count`` fresh stamps."""
-        if self._stamp + count >= STAMP_MAX:
-            self._engine.block_stamp.fill(0)
-            self._engine.mark_stamp.fill(0)
-            self._stamp = 0
-        first = self._stamp + 1
-        self._stamp += count
-        return first
-
-    def _action_array(self, actions: np.ndarray) -> ti.Ndarray:
-        expected = (self.batch, actions.shape[1] if actions.ndim == 3 else "T", self.action_dim)
-        if actions.shape != expected:
-            raise ValueError(f"actions have shape {actions.shape}, not {expected} (batch, steps, components)")
-        if not np.isfinite(actions).all():
+    def _action_array(self, actions: np.ndarray | torch.Tensor, steps: int | None = None) -> ti.Ndarray:
+        """Actions for the kernels; shape [batch, T, action], or [batch, action] if ``steps`` is 1."""
+        expected = (self.batch, self.action_dim)
+        if steps is None:
+            expected = (self.batch, actions.shape[1] if actions.ndim == 3 else "T", self.action_dim)
+        if tuple(actions.shape) != expected:
+            named = " (batch, steps, components)" if steps is None else " (batch, components)"
+            raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected}{named}")
+        finite = actions.isfinite() if on_device(actions) else np.isfinite(actions)
+        if not finite.all():
             raise ValueError("actions contain NaN or infinity")
-        flat = np.ascontiguousarray(actions.transpose(1, 0, 2)).reshape(-1)
-        array = ti.ndarray(ti.f64, shape=max(1, flat.size))
-        if flat.size:
-            array.from_numpy(flat)
+        flat = actions.swapaxes(0, 1).reshape(-1) if steps is None else actions.reshape(-1)
+        array = ti.ndarray(ti.f64, shape=max(1, flat.shape[0]))
+        if not flat.shape[0]:
+            return array
+        if on_device(actions) and self.device == "cuda":
+            write_numbers(flat.detach().contiguous(), array)
+        else:
+            array.from_numpy(np.ascontiguousarray(flat.cpu().double() if on_device(flat) else flat))
         return array
 
-    def _check_fault(self) -> None:
-        faults = self._engine.fault.to_numpy()
-        bad = np.flatnonzero(faults)
-        if bad.size:
-            step, substep = divmod(int(faults[bad[0]]) - 1, self.substeps)
-            raise SimulationError(
-                f"the state is not finite or a particle crosses the domain in one substep: "
-                f"environment {bad[0]}, "
-                f"environment step {step + 1}, substep {substep + 1}"
-            )
-
-    def _check_terms(self, terms: np.ndarray) -> None:
-        bad = np.argwhere(~np.isfinite(terms))
-        if bad.size:
-            when = f"after environment step {bad[0][0]}" if bad[0][0] else "at the start"
-            raise SimulationError(f"the loss is not finite: environment {bad[0][1]}, {when}")
+    def _require_gradient(self) -> None:
+        self._require_runtime()
+        if not self._engine.full_gradient:
+            raise RuntimeError("build the simulator with full_gradient=True for this gradient")
+        if self._tape.bar is None:
+            raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):
@@ -574,37 +511,6 @@ class Simulator:
                 "number of "
                 "threads; build the simulator again"
             )
-
-    def _pack(self, state: State) -> np.ndarray:
-        """User arrays to tiles along the curve, the last tile padded with particles at rest."""
-        engine = self._engine
-        b, n = self.batch, self.particle_count
-        flat = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
-        flat[:, :, [15, 19, 23]] = 1.0
-        parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
-        values = np.concatenate(parts, axis=2)
-        flat[:, :n] = np.take_along_axis(values, self._order[:, :, None], axis=1)
-        tiles = flat.reshape(b, engine.tiles, engine.lanes, STATE).transpose(0, 1, 3, 2)
-        return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
-
-    def _unpack(self, tiles: np.ndarray, poses: np.ndarray) -> State:
-        engine = self._engine
-        b, n = self.batch, self.particle_count
-        flat = (
-            tiles.reshape(b, engine.tiles, STATE, engine.lanes)
-            .transpose(0, 1, 3, 2)
-            .reshape(b, -1, STATE)[:, :n]
-        )
-        values = np.empty((b, n, STATE))
-        np.put_along_axis(values, self._order[:, :, None], flat.astype(np.float64), axis=1)
-        shape = (b, n, 3, 3)
-        return State(
-            values[..., 0:3],
-            values[..., 3:6],
-            values[..., 6:15].reshape(shape),
-            values[..., 15:24].reshape(shape),
-            poses,
-        )
 
 
 def _engine_class(device: str) -> type:
@@ -619,12 +525,6 @@ def _unit(rotation: Sequence[float]) -> list[float]:
     """A quaternion of length 1; YAML files round theirs."""
     q = np.asarray(rotation, float)
     return list(q / np.linalg.norm(q))
-
-
-def _rest_state(x: np.ndarray, poses: np.ndarray) -> State:
-    shape = (*x.shape, 3)
-    identity = np.broadcast_to(np.eye(3), shape)
-    return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)
 
 
 def _require_alike(scenes: Sequence[Scene]) -> None:

@@ -10,7 +10,13 @@ import taichi as ti
 
 from plab.sim.material import NORM_SHIFT
 
-__all__ = ["SINGULAR_VALUE_MIN", "spectral_return_map", "spectral_return_map_adjoint", "svd_signed"]
+__all__ = [
+    "SINGULAR_VALUE_MIN",
+    "spectral_parameter_adjoint",
+    "spectral_return_map",
+    "spectral_return_map_adjoint",
+    "svd_signed",
+]
 
 SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
@@ -203,6 +209,27 @@ def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_stra
         x[a, b] = sym + skew
         x[b, a] = sym - skew
     return u @ x @ v.transpose()
+
+
+@ti.func
+def spectral_parameter_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strain):
+    """Adjoints of mu, lambda and yield strain under :func:`spectral_return_map`; arguments as for
+    :func:`spectral_return_map_adjoint`."""
+    u, s, v = svd_signed(f_trial)
+    g, _t, e, k, n = mapped_values(s, mu, lam, yield_strain)
+    p = u.transpose() @ f_new_bar @ v
+    q = u.transpose() @ tau_bar @ u
+    j = g[0] * g[1] * g[2]
+    trace_q = q[0, 0] + q[1, 1] + q[2, 2]
+    mean = (e[0] + e[1] + e[2]) / 3.0
+    mu_bar = 0.0 * mu
+    yield_bar = 0.0 * mu
+    for i in ti.static(range(3)):
+        mu_bar += 2.0 * (g[i] * g[i] - g[i]) * q[i, i]
+        if k < 1.0:
+            # The factor k of the deviator is yield_strain / n; J does not depend on it.
+            yield_bar += (p[i, i] + 2.0 * mu * (2.0 * g[i] - 1.0) * q[i, i]) * g[i] * (e[i] - mean) / n
+    return mu_bar, trace_q * j * (j - 1.0), yield_bar
 
 
 @ti.func

@@ -21,8 +21,9 @@ from dataclasses import replace
 import numpy as np
 import taichi as ti
 
-from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.scene import MANIPULATOR_SHAPES, Scene, SceneError
 from plab.sim.material import Series
+from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.skips import Skips
 
@@ -57,14 +58,18 @@ LANES = {"cpu": 8, "cuda": 32}
 class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
-    def __init__(self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips) -> None:
+    def __init__(
+        self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips, full_gradient: bool = False
+    ) -> None:
         """Allocate what forward simulation needs.
 
         Args:
             scenes: One per environment, alike in all but the per-environment data.
             runtime: The Taichi runtime in force.
             skips: What is not computed where it is not needed.
+            full_gradient: Whether gradients include those with respect to initial state and material.
         """
+        self.full_gradient = full_gradient
         first = scenes[0]
         self.skips = skips
         self.cuda = runtime.device == "cuda"
@@ -80,7 +85,7 @@ class Storage:
         self._set_threads(runtime.threads)
         self._set_manipulators(scenes)
         self._allocate()
-        self._fill_parameters(scenes)
+        self.fill_parameters(scenes)
 
     def _set_grid(self, scene: Scene) -> None:
         self.n = scene.grid_size
@@ -102,6 +107,16 @@ class Storage:
         yields = any(math.isfinite(s.yield_stress) for s in scenes)
         self.series = replace(series, plastic=yields or not self.skips.plasticity)
         self.floor_rubs = not self.skips.friction or any(s.floor_friction > 0 for s in scenes)
+
+    def left_out(self, scenes: Sequence[Scene]) -> list[str]:
+        """Names of the :class:`Skips` because of which these scenes cannot be simulated any more."""
+        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
+        needed = {
+            "plasticity": any(math.isfinite(s.yield_stress) for s in scenes) and not self.series.plastic,
+            "friction": (any(s.floor_friction > 0 for s in scenes) and not self.floor_rubs)
+            or (rub and not self.manipulators_rub),
+        }
+        return [name for name, missing in needed.items() if missing]
 
     def _set_threads(self, threads: int) -> None:
         self.threads = threads
@@ -141,7 +156,8 @@ class Storage:
         self.low = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.high = ti.Vector.field(3, ti.f64, shape=(b, m))
         self.minimal_gap = ti.field(ti.f64, shape=(b, m))
-        self.alpha = ti.field(real, shape=())
+        # Decay rate of the soft contact model; 0 is the hard one.
+        self.alpha = ti.field(real, shape=b)
         self.loss_weights = ti.Vector.field(3, real, shape=())
         # Poses of one environment step, and what contact needs of them.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
@@ -156,7 +172,7 @@ class Storage:
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
-        self.velocity = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.velocity = self.gathered_grid(b * self.nodes)
         self._allocate_blocks(grids)
         self.target = ti.field(real, shape=b * self.n**3)
         self.target_sdf = ti.field(real, shape=b * self.n**3)
@@ -172,6 +188,10 @@ class Storage:
         # whose start none had.
         self.touched = ti.field(ti.i32, shape=b)
         self.untouched_step = ti.field(ti.i32, shape=b)
+
+    def gathered_grid(self, nodes: int) -> ti.Field:
+        """Allocate a grid of 4-vectors that particles gather from."""
+        return ti.Vector.field(4, self.real, shape=nodes)
 
     def _allocate_blocks(self, grids: int) -> None:
         b = self.batch
@@ -195,28 +215,38 @@ class Storage:
             return
         real, b, m = self.real, self.batch, max(1, self.manipulators)
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
-        self.momentum_bar = ti.Vector.field(4, real, shape=b * self.nodes)
+        self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+        # Adjoints of mu, lambda and yield strain.
+        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
 
-    def _fill_parameters(self, scenes: Sequence[Scene]) -> None:
+    def require_kept(self, scenes: Sequence[Scene]) -> None:
+        """Check that the kernels compute what other scenes need.
+
+        Raises:
+            SceneError: If they leave it out, because the scenes that they were made for did not need it.
+        """
+        lacking = {
+            "a finite yield stress": not self.series.plastic
+            and any(math.isfinite(s.yield_stress) for s in scenes),
+            "floor friction": not self.floor_rubs and any(s.floor_friction > 0 for s in scenes),
+            "friction of a manipulator": not self.manipulators_rub
+            and any(m.friction > 0 for s in scenes for m in s.manipulators),
+        }
+        for what, lacks in lacking.items():
+            if lacks:
+                raise SceneError(f"this simulator was built without {what}: build one that has it")
+
+    def fill_material(self, scenes: Sequence[Scene]) -> None:
+        """Write material, floor friction and gravity of all environments."""
+        rows = [[*material_parameters(s), s.floor_friction, *s.gravity] for s in scenes]
+        self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
+
+    def fill_parameters(self, scenes: Sequence[Scene]) -> None:
+        """Write everything in which environments may differ, targets excepted."""
         numpy_real = np.float32 if self.real == ti.f32 else np.float64
-        self.material.from_numpy(
-            np.array(
-                [
-                    [
-                        s.shear_modulus,
-                        s.lame_lambda,
-                        # An infinite yield stress would turn the unused branch into infinity times zero.
-                        min(s.yield_stress / (2.0 * s.shear_modulus), 1e30),
-                        s.floor_friction,
-                        *s.gravity,
-                    ]
-                    for s in scenes
-                ],
-                dtype=numpy_real,
-            )
-        )
+        self.fill_material(scenes)
         if self.manipulators == 0:
             return
 

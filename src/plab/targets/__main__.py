@@ -21,12 +21,12 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from plab.cache import cache_dir
 from plab.config import ConfigError, build_scene, load_config, variant_task
 from plab.scene import SceneError
 from plab.sim import DeviceError, SimulationError, Simulator
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
 from plab.targets import TargetError, build_targets
-from plab.targets.store import cache_dir
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -13,13 +13,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from plab.cache import cache_dir
 from plab.scene import Scene
 from plab.targets.recipe import TargetError
 
 if TYPE_CHECKING:
     from plab.sim import Simulator
 
-__all__ = ["TargetStore", "cache_dir", "load_release_target"]
+__all__ = ["TargetStore", "load_release_target"]
 
 PHYSICS_VERSION = 1
 """To be raised when the simulator's results change by more than rounding: cached targets are then stale."""
@@ -29,15 +30,6 @@ RELEASE_PARTICLES = 10000
 
 MASS_TOLERANCE = 0.02
 """Largest relative error of a release target's total mass."""
-
-
-def cache_dir() -> Path:
-    """Return the folder of what plab can make again: ``PLAB_CACHE_DIR``, or ``plab`` in the user's cache."""
-    chosen = os.environ.get("PLAB_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "plab"
 
 
 class TargetStore:

@@ -1,0 +1,124 @@
+"""Hydra's side of plab's sweeps: a launcher that runs jobs in batches, and the sweeper that goes with it.
+
+Hydra looks for plugins in this namespace package and imports all it finds at every start, so that everything
+else is imported when it is needed.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, open_dict
+
+if TYPE_CHECKING:
+    from plab.config import Config
+    from plab.sweep.tally import Outcome
+
+__all__ = ["BatchLauncher", "BatchSweeper"]
+
+
+class BatchSweeper(BasicSweeper):
+    """Hydra's own sweeper, but for the check of all jobs, which the launcher does much faster."""
+
+    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
+        """Leave it to :class:`BatchLauncher`."""
+
+
+class BatchLauncher(Launcher):
+    """Runs the jobs of a sweep in batches that share a simulator.
+
+    How they ended is noted in the :class:`plab.sweep.tally.Tally` that the task function has as ``tally``:
+    Hydra gives a launcher no other way to tell the command line.
+    """
+
+    def __init__(self, batch_size: int | None, inner: DictConfig | None) -> None:
+        """Keep the settings.
+
+        Args:
+            batch_size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
+            inner: Configuration of the launcher that carries out the batches, as jobs of its own; this
+                process does if None.
+        """
+        self._size, self._inner = batch_size, inner
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Take what Hydra gives to launchers."""
+        self._context, self._task, self._config = hydra_context, task_function, config
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        """Run all jobs; see :meth:`hydra.plugins.launcher.Launcher.launch`."""
+        from plab.checks import check_device
+        from plab.config import ConfigError
+        from plab.results import result_path
+        from plab.sweep.carry import carry_here, run_sweep
+        from plab.sweep.compose import Refused, compose_jobs
+        from plab.sweep.tally import Outcome, Tally
+
+        if self._size is not None and self._size < 1:
+            raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")
+        entries = compose_jobs(job_overrides, self._compose)
+        refused = [entry for entry in entries if isinstance(entry, Refused)]
+        if len(refused) == len(entries) and len({entry.reason for entry in refused}) == 1:
+            # A mistake in what all jobs have in common.
+            raise ConfigError(refused[0].reason)
+        cfgs = {n: entry for n, entry in enumerate(entries) if not isinstance(entry, Refused)}
+        paths = {n: str(result_path(cfg)) for n, cfg in cfgs.items()}
+        carry = carry_here
+        if self._inner is not None:
+            carry = self._carry_elsewhere({paths[n]: job_overrides[n] for n in cfgs})
+        else:
+            for cfg in cfgs.values():
+                check_device(cfg)
+        tally = getattr(self._task, "tally", Tally())
+        tally.started = True
+        tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]
+        scores: dict[str, float] = {}
+        for one in run_sweep(list(cfgs.values()), carry, self._size):
+            tally.outcomes.append(one)
+            scores[one.path] = one.score
+        return [_job_return(scores[paths[n]] if n in paths else math.nan) for n in range(len(entries))]
+
+    def _compose(self, overrides: list[str]) -> DictConfig:
+        return self._context.config_loader.load_sweep_config(self._config, overrides)
+
+    def _carry_elsewhere(
+        self, overrides: dict[str, Sequence[str]]
+    ) -> Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]:
+        """Return what hands batches to the inner launcher, one job each; ``overrides`` are by result file."""
+        from plab.results import result_path
+        from plab.sweep.carry import BatchTask, look_up
+
+        def carry(batches: list[list[Config]], _progress: Callable[[], str]) -> Iterator[Outcome]:
+            config = copy.deepcopy(self._config)
+            with open_dict(config.hydra):
+                config.hydra.launcher = self._inner
+            inner = Plugins.instance().instantiate_launcher(
+                hydra_context=self._context, task_function=BatchTask(batches), config=config
+            )
+            # A job composes the configuration of its first run and then computes the whole batch.
+            jobs = [overrides[str(result_path(batch[0]))] for batch in batches]
+            runs, name = sum(len(batch) for batch in batches), type(inner).__name__
+            print(f"{runs} runs go to {name} in {len(batches)} jobs", flush=True)
+            try:
+                returns = inner.launch(jobs, initial_job_idx=0)
+                outcomes = [one for job in returns for one in job.return_value]
+            except Exception as error:
+                # A job's process was killed, say, or the queue refused the jobs: the files know how far they
+                # came.
+                print(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}", flush=True)
+                outcomes = [look_up(cfg) for batch in batches for cfg in batch]
+            yield from outcomes
+
+        return carry
+
+
+def _job_return(value: Any) -> JobReturn:
+    return JobReturn(_return_value=value, status=JobStatus.COMPLETED)

@@ -1,0 +1,107 @@
+"""One kind of scene for all tasks of the suite, so that one compiled simulator serves them all.
+
+A simulator's environments must have the same manipulators and as many particles. Here every scene has all
+manipulators that any task has, those that its task lacks parked outside the domain and without motion, and
+its bodies share a given number of particles. The physics inside the domain is the task's own; the contact
+term of the loss is not, because the parked manipulators are far from everything: leave its weight at 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+
+__all__ = ["PLACES", "common_actions", "common_scene", "own_components"]
+
+PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
+"""Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""
+
+PARKED_SIZES = {
+    "Sphere": (0.03,),
+    "Capsule": (0.06, 0.03),
+    "RollingPin": (0.3, 0.03),
+    "Chopsticks": (0.2, 0.02),
+    "Torus": (0.05, 0.03),
+    "Cylinder": (0.1, 0.2),
+    "Box": (0.05, 0.05, 0.05),
+}
+
+
+def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -> Scene:
+    """Give a scene all manipulators of a common kind of scene, and a number of particles.
+
+    Args:
+        scene: A scene with no more manipulators of a shape than there are places for.
+        particles: Particles of all its bodies together, at least as many as there are bodies.
+        places: Shapes of the manipulators of the common kind.
+
+    Raises:
+        ValueError: If there are too many manipulators or too few particles.
+    """
+    tools = [_parked(shape) for shape in places]
+    for number, place in enumerate(_places(scene, places)):
+        tools[place] = scene.manipulators[number]
+    return replace(scene, manipulators=tuple(tools), bodies=_shared(scene.bodies, particles))
+
+
+def common_actions(scene: Scene, actions: np.ndarray, places: Sequence[str] = PLACES) -> np.ndarray:
+    """Turn a scene's actions into those of its :func:`common_scene`.
+
+    Args:
+        scene: The scene.
+        actions: Its actions, shape [..., A].
+        places: Shapes of the manipulators of the common kind.
+
+    Returns:
+        Actions of the common scene, 0 for parked manipulators, shape [..., A'].
+    """
+    out = np.zeros((*actions.shape[:-1], sum(len(MANIPULATOR_SHAPES[p].action_names) for p in places)))
+    out[..., own_components(scene, places)] = actions
+    return out
+
+
+def own_components(scene: Scene, places: Sequence[str] = PLACES) -> list[int]:
+    """Where a scene's action components are among those of its :func:`common_scene`."""
+    dims = [len(MANIPULATOR_SHAPES[shape].action_names) for shape in places]
+    starts = [sum(dims[:place]) for place in range(len(places))]
+    return [starts[p] + i for p in _places(scene, places) for i in range(dims[p])]
+
+
+def _places(scene: Scene, places: Sequence[str]) -> list[int]:
+    """Return the place of each of the scene's manipulators."""
+    free = list(range(len(places)))
+    taken = []
+    for manipulator in scene.manipulators:
+        place = next((p for p in free if places[p] == manipulator.shape), None)
+        if place is None:
+            raise ValueError(f"{scene.name} has more manipulators of shape {manipulator.shape} than places")
+        free.remove(place)
+        taken.append(place)
+    return taken
+
+
+def _parked(shape: str) -> Manipulator:
+    """Return a manipulator that stays far outside the domain."""
+    position = (0.5, 4.0, 0.5)
+    return Manipulator(
+        shape,
+        PARKED_SIZES[shape],
+        position,
+        scale=(0.0,) * len(MANIPULATOR_SHAPES[shape].action_names),
+        lower_bound=position,
+        upper_bound=position,
+    )
+
+
+def _shared(bodies: tuple[Body, ...], particles: int) -> tuple[Body, ...]:
+    """Return the bodies with a number of particles shared out in proportion to what they had."""
+    if particles < len(bodies):
+        raise ValueError(f"{particles} particles are too few for {len(bodies)} bodies")
+    had = np.array([body.particles for body in bodies], dtype=float)
+    shares = 1 + np.floor((particles - len(bodies)) * had / had.sum()).astype(int)
+    shares[0] += particles - shares.sum()
+    return tuple(replace(body, particles=int(n)) for body, n in zip(bodies, shares, strict=True))

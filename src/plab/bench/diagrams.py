@@ -1,0 +1,91 @@
+"""Work-precision diagrams from the table of :mod:`plab.bench.accuracy`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+__all__ = ["draw"]
+
+PANELS = {
+    "positions": "final positions, RMS",
+    "mass": "mass tensor, L1 / mass",
+    "score": "score",
+    "gradient": "gradient, relative norm",
+    "angle_deg": "gradient, angle [deg]",
+}
+"""Columns and what their axes say."""
+
+COLOURS = {"float32": "tab:orange", "float64": "tab:blue"}
+MARKERS = {"series": "o", "singular values": "s"}
+FLOOR = 1e-16
+"""Errors are drawn no smaller than this: those of a reference with itself, say."""
+
+
+def draw(table: pd.DataFrame, folder: Path) -> Iterator[Path]:
+    """Draw a figure per task and axis.
+
+    Args:
+        table: The rows of :data:`plab.bench.accuracy.COLUMNS`.
+        folder: Where the figures go.
+
+    Yields:
+        The files, PNG and PDF.
+    """
+    table = table.astype(dict.fromkeys(("ms_per_step", *PANELS), float))
+    for (axis, task), rows in table.groupby(["axis", "task"], sort=False):
+        names = [name for name in PANELS if rows[name].notna().any()]
+        figure, axes = plt.subplots(
+            2, len(names), figsize=(3.1 * len(names), 5.6), squeeze=False, layout="constrained"
+        )
+        for line, (contact, some) in zip(axes, rows.groupby("contact", sort=False), strict=False):
+            for place, name in zip(line, names, strict=True):
+                _panel(place, some, name, axis)
+                place.set_ylabel(PANELS[name])
+            line[0].set_title(f"{task}, {contact} contact", loc="left", fontsize=10)
+            for place in line:
+                place.set_xlabel("ms per step with gradient", fontsize=8)
+        axes[0][-1].legend(fontsize=7)
+        for suffix in ("png", "pdf"):
+            path = folder / f"{task}_{axis}.{suffix}"
+            figure.savefig(path, dpi=110)
+            yield path
+        plt.close(figure)
+
+
+def _panel(place: Axes, rows: pd.DataFrame, name: str, axis: str) -> None:
+    """Draw the errors of one quantity, a line per precision and material."""
+    place.set_xscale("log")
+    place.set_yscale("log")
+    label = "substeps" if axis == "substeps" else "grid"
+    for (precision, material), line in rows.groupby(["precision", "material"], sort=False):
+        stable = line[line["outcome"] == "stable"]
+        style = {"color": COLOURS[precision], "marker": MARKERS[material], "markersize": 4, "linewidth": 1}
+        text = f"{precision}, {material}"
+        place.plot(stable["ms_per_step"], stable[name].clip(lower=FLOOR), label=text, **style)
+        for _, row in stable.iterrows():
+            spot = (row["ms_per_step"], max(row[name], FLOOR))
+            place.annotate(str(row[label]), spot, fontsize=6, xytext=(2, 2), textcoords="offset points")
+        for _, row in line[line["outcome"] != "stable"].iterrows():
+            # At the upper edge, whatever the scale: there is no error to show.
+            place.plot(
+                row["ms_per_step"], 0.97, "x", color=COLOURS[precision], transform=place.get_xaxis_transform()
+            )
+            place.annotate(
+                f"{row[label]} diverges",
+                (row["ms_per_step"], 0.97),
+                xycoords=place.get_xaxis_transform(),
+                fontsize=6,
+                xytext=(4, -3),
+                textcoords="offset points",
+            )
+    place.tick_params(labelsize=7)
+    place.grid(True, which="major", alpha=0.3)

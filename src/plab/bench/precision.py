@@ -1,0 +1,207 @@
+"""float32 against float64 on the fifty configurations: demonstrations and random actions.
+
+    python -m plab.bench.precision --csv precision.csv --markdown precision.md
+    python -m plab.bench.precision --particles 10000                     # as many as the tasks have
+
+prints a row per configuration and kind of actions: the score in both precisions in the hard contact model,
+and how far apart the gradients of the trajectory loss are in the soft one, over 50 steps. All configurations
+share one compiled simulator per precision, see :mod:`plab.bench.common_scene`; the loss has no contact term.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from plab.bench.common_scene import common_actions, common_scene, own_components
+from plab.bench.table import report
+from plab.config import build_scene, load_config
+from plab.demonstrations import known_actions
+from plab.objective import scores, spread_mass, target_sdf
+from plab.scene import Scene, sample_particles
+from plab.sim import Simulator
+from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
+from plab.targets import EPISODE_STEPS
+
+__all__ = ["angle", "main"]
+
+COLUMNS = (
+    "task",
+    "variant",
+    "actions",
+    "score_float32",
+    "score_float64",
+    "difference",
+    "positions_rms",
+    "gradient_norm",
+    "norm_ratio",
+    "angle_deg",
+    "failures",
+)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A configuration in the common kind of scene.
+
+    Attributes:
+        task: Task.
+        variant: Variant.
+        scene: The common scene.
+        components: Where the task's own action components are.
+        actions: Demonstration and random actions, each [T, A'].
+    """
+
+    task: str
+    variant: str
+    scene: Scene
+    components: list[int]
+    actions: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one precision made of some actions.
+
+    Attributes:
+        x: Final positions in the hard contact model, shape [particle, 3].
+        gradient: Gradient in the soft contact model, shape [T, A].
+        failures: What went wrong.
+    """
+
+    x: np.ndarray
+    gradient: np.ndarray
+    failures: str
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too."""
+    a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
+    return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
+
+
+def starts(tasks: Sequence[str], variants: Sequence[str], particles: int) -> list[Start]:
+    """Return all configurations of some tasks."""
+    out = []
+    for task in tasks:
+        for variant in variants:
+            cfg = load_config([f"task={task}", f"variant={variant}"])
+            scene, known = build_scene(cfg), known_actions(cfg)
+            rng = np.random.default_rng(len(out))
+            shown = np.zeros((EPISODE_STEPS, scene.action_dim)) if known is None else known[:EPISODE_STEPS]
+            drawn = rng.uniform(-1.0, 1.0, size=(EPISODE_STEPS, scene.action_dim))
+            actions = {"demonstration": common_actions(scene, shown), "random": common_actions(scene, drawn)}
+            common = common_scene(scene, particles)
+            out.append(Start(task, variant, common, own_components(scene), actions))
+    return out
+
+
+def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarray] | None) -> Iterator:
+    """Run all configurations in one precision.
+
+    Args:
+        configurations: The configurations.
+        precision: ``float32`` or ``float64``.
+        targets: A mass tensor for each, or None to make them: what the demonstration ends with.
+
+    Yields:
+        For each configuration its target and an :class:`Outcome` per kind of actions.
+    """
+    simulator = Simulator([configurations[0].scene], precision=precision)
+    simulator.set_loss_weights(10.0, 10.0, 0.0)
+    for number, start in enumerate(configurations):
+        simulator.set_scenes([start.scene])
+        final = {}
+        for kind, actions in start.actions.items():
+            simulator.set_contact("hard")
+            hard = simulator.rollout(actions[None], gradient=False, strict=False)
+            final[kind] = simulator.state().x[0], list(hard.failures.values())
+        target = targets[number] if targets else spread(start.scene, final["demonstration"][0])
+        simulator.set_target(target[None], target_sdf(target)[None])
+        outcomes = {}
+        for kind, actions in start.actions.items():
+            simulator.set_contact("soft")
+            soft = simulator.rollout(actions[None], strict=False)
+            x, failures = final[kind]
+            text = "; ".join([*failures, *soft.failures.values()])
+            outcomes[kind] = Outcome(x, soft.gradient[0][:, start.components], text)
+        yield target, outcomes
+
+
+def spread(scene: Scene, x: np.ndarray) -> np.ndarray:
+    """Mass tensor of positions."""
+    return spread_mass(x, scene.grid_size, scene.particle_mass)
+
+
+def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
+    """Run all in both precisions; yields a row of :data:`COLUMNS` per configuration and kind of actions.
+
+    The target is what the demonstration ends with in float64: for simulated targets, the task's own.
+    """
+    exact = list(run(configurations, "float64", None))
+    targets = [target for target, _ in exact]
+    rounded = run(configurations, "float32", targets)
+    for start, (target, right), (_, got) in zip(configurations, exact, rounded, strict=True):
+        initial = spread(start.scene, sample_particles(start.scene))
+        for kind in start.actions:
+            a, b = got[kind], right[kind]
+            at = [scores(initial, spread(start.scene, o.x), target).score for o in (a, b)]
+            norm = np.linalg.norm(b.gradient)
+            yield {
+                "task": start.task,
+                "variant": start.variant,
+                "actions": kind,
+                "score_float32": round(at[0], 5),
+                "score_float64": round(at[1], 5),
+                "difference": f"{at[0] - at[1]:.1e}",
+                "positions_rms": f"{np.sqrt(((a.x - b.x) ** 2).sum(axis=1).mean()):.1e}",
+                "gradient_norm": f"{norm:.3g}",
+                "norm_ratio": f"{np.linalg.norm(a.gradient) / norm:.6f}",
+                "angle_deg": f"{angle(a.gradient, b.gradient):.2g}",
+                "failures": " / ".join(o.failures for o in (a, b) if o.failures),
+            }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line, run, print, write the files asked for; return the exit code."""
+    parser = argparse.ArgumentParser(prog="plab.bench.precision", description=__doc__.splitlines()[0])
+    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
+    parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
+    parser.add_argument("--particles", type=int, default=1000, help="particles per environment")
+    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    parser.add_argument("--markdown", type=Path, help="file to write a table to, a row per task")
+    options = parser.parse_args(argv)
+    rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
+    if options.markdown is not None:
+        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles))
+    return 0
+
+
+def markdown(table: pd.DataFrame, particles: int) -> str:
+    """Return the table of a row per task and kind of actions: the worst of its variants, and the median."""
+    numbers = table.copy()
+    for name in ("difference", "angle_deg", "norm_ratio", "positions_rms"):
+        numbers[name] = numbers[name].astype(float)
+    lines = [
+        f"float32 against float64, {particles} particles, 50 steps, five variants each.",
+        "",
+        "| task | actions | largest score difference | median | largest angle of gradients | median |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (task, kind), rows in numbers.groupby(["task", "actions"], sort=False):
+        score, turn = rows["difference"].abs(), rows["angle_deg"]
+        lines.append(
+            f"| {task} | {kind} | {score.max():.1e} | {score.median():.1e} | {turn.max():.2g}° "
+            f"| {turn.median():.2g}° |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

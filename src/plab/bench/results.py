@@ -1,0 +1,169 @@
+"""Time to load thousands of result files, with and without the index, and from an archive.
+
+    python -m plab.bench.results --runs 5000 --rows 5
+    python -m plab.bench.results --runs 1000 --archive
+
+writes so many small result files to a folder that is removed afterwards, and loads them: for the first time,
+again, after one of them has changed. The index goes to a folder of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import itertools
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sized
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from plab.bench.table import report
+from plab.config import load_config
+from plab.objective import scores_from_iou
+from plab.provenance import provenance
+from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
+from plab.results.schema import COLUMNS, FAMILY_COLUMNS
+from plab.selection import Selection
+from plab.status import survey
+from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
+
+__all__ = ["main", "synthetic_run", "template"]
+
+SETTLE = 2.5
+"""Seconds to wait after writing: the index leaves out files that have changed just now."""
+
+
+def template(method: str, overrides: list[str] | None = None) -> dict[str, Any]:
+    """Return a configuration of a method, from which :func:`synthetic_run` makes others."""
+    return config_dict(load_config([f"method={method}", *(overrides or [])]))
+
+
+def synthetic_run(
+    config: dict[str, Any], *, rows: int = 5, score: float | None = None, finished: bool = True
+) -> RunResult:
+    """Return a result with made-up numbers in the right places, fit for :func:`plab.results.write`.
+
+    Args:
+        config: The configuration; a gradient method's ``iterations`` must be ``rows``.
+        rows: Number of iterations, or evaluations.
+        score: Score of the final evaluation; drawn if it is not given.
+        finished: Whether the run has come to its end.
+    """
+    rng = np.random.default_rng(int(config_hash(config)[:8], 16))
+    method, horizon = config["method"], config["sim"]["horizon"]
+    score = float(rng.uniform()) if score is None else score
+    episodes = (
+        np.arange(rows) if "iterations" in method else np.linspace(0, method["episodes"], rows).astype(int)
+    )
+    curve = score * (1.0 - np.exp(-3.0 * np.arange(rows) / max(rows - 1, 1)))
+    columns = (*COLUMNS, *FAMILY_COLUMNS[method["family"]])
+    table = pd.DataFrame({name: rng.uniform(0.0, 1.0, rows) for name in columns})
+    table["iteration"], table["episodes"], table["steps"] = np.arange(rows), episodes, episodes * horizon
+    table["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)
+    table["reward"] = 40.0 * table["score"]
+    table["loss"] = 100.0 - table["reward"]
+    table["seconds"] = rng.uniform(0.9, 1.1, rows)
+    best = int(table["loss"].idxmin()) if rows else -1
+    judged = scores_from_iou(0.1, 0.1 + 0.3 * score, 0.4)
+    terms = {"loss": 50.0, "loss_density": 3.0, "loss_sdf": 2.0, "loss_contact": 0.0, "reward": 40.0 * score}
+    evaluation = terms | {
+        "iou": judged.iou_final,
+        "score": judged.score,
+        "score_printed": judged.score_printed,
+        "iou_initial": judged.iou_initial,
+        "iou_target_self": judged.iou_target_self,
+    }
+    return RunResult(
+        config,
+        config_hash(config),
+        status="finished" if finished else "running",
+        provenance=_provenance(config),
+        wall_time={"build": 1.0, "compile": 5.0, "optimise": float(table["seconds"].sum()), "evaluate": 0.5},
+        iterations=table,
+        best_actions=rng.uniform(-1.0, 1.0, (horizon, 6)) if rows else None,
+        best_iteration=best,
+        best_loss=float(table["loss"].min()) if rows else float("nan"),
+        evaluation=evaluation if finished else {},
+    )
+
+
+_origin: dict[str, Any] = {}
+
+
+def _provenance(config: dict[str, Any]) -> dict[str, Any]:
+    # Asking git for every one of thousands of files would take minutes.
+    if not _origin:
+        _origin.update(provenance(config))
+    return _origin | {"seed": config["seed"]}
+
+
+def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield configurations of the whole suite, of seed after seed."""
+    bases = {method: template(method, [f"results_dir={folder}"]) for method in PAPER_METHODS}
+    cells = list(itertools.product(suite_tasks(), SUITE_VARIANTS, PAPER_METHODS))
+    for number in range(runs):
+        seed, cell = divmod(number, len(cells))
+        task, variant, method = cells[cell]
+        config = copy.deepcopy(bases[method])
+        config["task"]["name"], config["variant"], config["seed"] = task, variant, seed
+        if "iterations" in config["method"]:
+            config["method"]["iterations"] = rows
+        yield config
+
+
+def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str, object]]:
+    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
+    results = folder / "results"
+    for config in _configs(runs, rows, results):
+        path = result_path(config)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(synthetic_run(config, rows=rows), path, compress=False)
+    time.sleep(SETTLE)
+
+    def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:
+        start = time.perf_counter()
+        count = len(call())
+        seconds = time.perf_counter() - start
+        first.setdefault("seconds", seconds)
+        ratio = round(first["seconds"] / seconds, 1)
+        return {"what": what, "runs": count, "seconds": round(seconds, 3), "times_faster": ratio}
+
+    first: dict[str, float] = {}
+    yield timed("first time", lambda: load(results))
+    yield timed("again", lambda: load(results))
+    changed = load(results)["path"].iloc[runs // 2]
+    Path(changed).touch()
+    yield timed("one changed", lambda: load(results))
+    yield timed("with a key", lambda: load(results, keys=["method.family"]))
+    yield timed("without index", lambda: load(results, index=False))
+    yield timed("plab.status", lambda: survey(results, Selection()).runs)
+    if not packed:
+        return
+    archive = folder / "all.plab.zip"
+    yield timed("pack", lambda: range(pack(results, archive).runs))
+    time.sleep(SETTLE)
+    yield timed("archive", lambda: load(archive))
+    yield timed("archive again", lambda: load(archive))
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Parse the command line, measure, print, and write a CSV file if asked to."""
+    parser = argparse.ArgumentParser(prog="plab.bench.results", description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=5000, help="number of result files")
+    parser.add_argument("--rows", type=int, default=5, help="iterations of each")
+    parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
+    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    options = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
+        table = _rows(options.runs, options.rows, Path(folder), options.archive)
+        report(("what", "runs", "seconds", "times_faster"), table, options.csv)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,407 @@
+"""The cases of :mod:`plab.bench.stability`: what a simulator must survive, and what it must refuse.
+
+All cases of one kind of scene share a compiled simulator, see :mod:`plab.bench.common_scene`.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from plab.bench.common_scene import common_actions, common_scene
+from plab.config import build_scene, load_config
+from plab.scene import Body, Manipulator, Scene
+from plab.suite import SUITE_VARIANTS, suite_tasks
+
+__all__ = ["Case", "Plan", "refusals", "stress_cases"]
+
+STEP_TIME = 19e-4
+"""Simulated time of an environment step of the suite [s]."""
+
+DEFORMED = 512
+"""Substeps per environment step of bodies that start strongly deformed."""
+
+HOLD = 10
+"""Longest that a bang-bang action is held [environment steps]."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is run.
+
+    Attributes:
+        particles: Particles per environment.
+        variants: Variants of each task.
+        long_tasks: Tasks that are run over the long horizon.
+        long_horizon: Environment steps of the long horizon.
+        horizon: Environment steps otherwise.
+    """
+
+    particles: int
+    variants: tuple[str, ...] = SUITE_VARIANTS
+    long_tasks: tuple[str, ...] = ()
+    long_horizon: int = 1000
+    horizon: int = 50
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing to survive.
+
+    Attributes:
+        family: What it is about.
+        name: Which one of the family.
+        scene: The scene.
+        actions: Actions, shape [T, A].
+        contact: Contact model.
+        state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
+        contact_weight: Weight of the loss's contact term.
+    """
+
+    family: str
+    name: str
+    scene: Scene
+    actions: np.ndarray
+    contact: str
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
+    contact_weight: float = 0.0
+
+
+def stress_cases(plan: Plan) -> list[Case]:
+    """Return all cases of a plan."""
+    families = (suite_actions, long_horizons, materials, crushing, walls, overlaps, deformations)
+    return [case for family in families for case in family(plan)] + [*stiff(plan), *few_particles(plan)]
+
+
+# ---------------------------------------------------------------------------------------------------- actions
+
+
+def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """Uniform and independent, shape [steps, size]."""
+    return rng.uniform(-1.0, 1.0, size=(steps, size))
+
+
+def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """Every component at one end of its range or the other, held for up to :data:`HOLD` steps."""
+    out = np.empty((steps, size))
+    for column in out.T:
+        lengths = rng.integers(1, HOLD + 1, size=steps)
+        column[:] = np.repeat(rng.choice([-1.0, 1.0], size=steps), lengths)[:steps]
+    return out
+
+
+ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
+
+
+@functools.cache
+def task_scene(task: str, variant: str) -> Scene:
+    """Return the scene of a configuration of the suite."""
+    return build_scene(load_config([f"task={task}", f"variant={variant}"]))
+
+
+def suite_actions(plan: Plan) -> Iterator[Case]:
+    """All configurations under random and bang-bang actions, in both contact models."""
+    kinds = itertools.product(suite_tasks(), plan.variants, ACTIONS, ("soft", "hard"))
+    for number, (task, variant, kind, contact) in enumerate(kinds):
+        scene = task_scene(task, variant)
+        own = ACTIONS[kind](np.random.default_rng(number), plan.horizon, scene.action_dim)
+        yield Case(
+            "suite",
+            f"{task}-v{variant} {kind} {contact}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, own),
+            contact,
+        )
+
+
+def long_horizons(plan: Plan) -> Iterator[Case]:
+    """The long horizon, forwards and backwards."""
+    kinds = itertools.product(plan.long_tasks, ACTIONS, ("soft", "hard"))
+    for number, (task, kind, contact) in enumerate(kinds):
+        scene = task_scene(task, "1")
+        own = ACTIONS[kind](np.random.default_rng(1000 + number), plan.long_horizon, scene.action_dim)
+        yield Case(
+            f"{plan.long_horizon} steps",
+            f"{task}-v1 {kind} {contact}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, own),
+            contact,
+        )
+
+
+# ----------------------------------------------------------------------------------------------------- scenes
+
+
+def box_scene(*manipulators: Manipulator, center: tuple = (0.5, 0.1, 0.5), **changes: object) -> Scene:
+    """Return a cube of plasticine with edge 0.2, on the floor unless moved."""
+    values = {"substeps": 19, "dt": STEP_TIME / 19, **changes}
+    return Scene("cube", (Body("box", center, (0.2,) * 3, 1000),), manipulators, **values)
+
+
+def sphere(*position: float) -> Manipulator:
+    """Return a ball as the tasks have it, a little faster."""
+    return Manipulator("Sphere", (0.04,), position, scale=(0.03,) * 3)
+
+
+def squeezing(plan: Plan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
+    """Two balls at the cube's sides, and actions that press them together and pull them apart again."""
+    wave = np.where(np.arange(plan.horizon) % 24 < 12, 1.0, -1.0)
+    actions = np.zeros((plan.horizon, 6))
+    actions[:, 0], actions[:, 3] = wave, -wave
+    return (sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)), actions
+
+
+def materials(plan: Plan) -> Iterator[Case]:
+    """Yield stress from none to infinite, Poisson ratio up to what the suite's time step allows, E."""
+    tools, actions = squeezing(plan)
+    for young, nu, flow in itertools.product(
+        (50.0, 5000.0), (0.0, 0.2, 0.35), (0.0, 1.0, 50.0, 1e4, math.inf)
+    ):
+        scene = box_scene(*tools, youngs_modulus=young, poisson_ratio=nu, yield_stress=flow)
+        yield Case(
+            "material",
+            f"E {young:g}, nu {nu:g}, yield stress {flow:g}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, actions),
+            "soft",
+        )
+
+
+def stiff(plan: Plan) -> Iterator[Case]:
+    """Materials that need all the substeps that they are given: E times 100, and nu up to 0.49."""
+    tools, actions = squeezing(plan)
+    substeps = math.ceil(STEP_TIME / replace(box_scene(), youngs_modulus=5e5).stable_dt)
+    time_step = {"substeps": substeps, "dt": STEP_TIME / substeps}
+    kinds = itertools.product((0.2, 0.45, 0.49), (0.0, 50.0, 1e4, math.inf), ("soft", "hard"))
+    for nu, flow, contact in kinds:
+        scene = box_scene(*tools, poisson_ratio=nu, yield_stress=flow, **time_step)
+        # The stability limit falls with the root of E.
+        limit = scene.youngs_modulus * (scene.stable_dt / scene.dt) ** 2
+        scene = replace(scene, youngs_modulus=0.9999 * limit, bodies=_counted(scene, plan))
+        name = f"E {limit:.0f}, nu {nu:g}, yield stress {flow:g}, {contact}"
+        yield Case("stiff", name, scene, actions[:10], contact, contact_weight=1.0)
+
+
+def _counted(scene: Scene, plan: Plan) -> tuple[Body, ...]:
+    """The scene's one body with the plan's number of particles."""
+    return (replace(scene.bodies[0], particles=plan.particles),)
+
+
+def crushing(plan: Plan) -> Iterator[Case]:
+    """Manipulators that crush the cube against the floor or each other, and stay there."""
+    lying = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
+    tools = {
+        "Sphere": (sphere(0.5, 0.25, 0.5), (0, -1, 0)),
+        "Capsule": (Manipulator("Capsule", (0.06, 0.04), (0.5, 0.3, 0.5), scale=(0.03,) * 3), (0, -1, 0)),
+        "RollingPin": (
+            Manipulator("RollingPin", (0.3, 0.04), (0.5, 0.25, 0.5), lying, scale=(0.7, 0.07, 0.01)),
+            (0.5, 0.2, -1),
+        ),
+        "Chopsticks": (
+            Manipulator(
+                "Chopsticks",
+                (0.2, 0.02),
+                (0.5, 0.25, 0.5),
+                scale=(0.02,) * 3 + (0.04,) * 3 + (0.02,),
+                gap=0.24,
+            ),
+            (0, -0.3, 0, 0, 0, 0, 1),
+        ),
+        "Torus": (Manipulator("Torus", (0.05, 0.03), (0.5, 0.25, 0.5), scale=(0.03,) * 3), (0, -1, 0)),
+        "Box": (
+            Manipulator("Box", (0.08, 0.05, 0.08), (0.5, 0.26, 0.5), scale=(0.03,) * 3 + (0.04,) * 3),
+            (0, -1, 0, 0, 0.5, 0),
+        ),
+    }
+    pillar = Manipulator("Cylinder", (0.1, 0.3), (0.29, 0.1, 0.5))
+    scenes = {shape: ((tool,), action) for shape, (tool, action) in tools.items()}
+    scenes["two balls"] = ((sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)), (1, 0, 0, -1, 0, 0))
+    scenes["ball and pillar"] = ((sphere(0.65, 0.1, 0.5), pillar), (-1, 0, 0))
+    scenes["six balls"] = (
+        tuple(
+            sphere(0.5 + dx, 0.12 + dy, 0.5 + dz)
+            for dx, dy, dz in np.concatenate([np.eye(3), -np.eye(3)]) * 0.15
+        ),
+        tuple(-np.concatenate([np.eye(3), -np.eye(3)]).reshape(-1)),
+    )
+    for (name, (used, action)), flow, contact in itertools.product(
+        scenes.items(), (50.0, math.inf), ("soft", "hard")
+    ):
+        scene = box_scene(*used, yield_stress=flow)
+        yield Case(
+            "crush",
+            f"{name}, yield stress {flow:g}, {contact}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, np.tile(np.array(action, float), (plan.horizon, 1))),
+            contact,
+        )
+
+
+def walls(plan: Plan) -> Iterator[Case]:
+    """Cubes thrown and pushed into the walls and corners."""
+    for number, direction in enumerate(itertools.product((-1.0, 0.0, 1.0), repeat=3)):
+        if not any(direction):
+            continue
+        speed = 40.0 * np.array(direction)
+        scene = box_scene(center=(0.45, 0.4, 0.45), yield_stress=math.inf if number % 2 else 50.0)
+        case = Case(
+            "walls",
+            f"thrown along {direction}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, np.zeros((plan.horizon, 0))),
+            "hard",
+        )
+        yield replace(case, state={"v": np.tile(speed, (plan.particles, 1))})
+    for corner, contact in itertools.product(itertools.product((0.12, 0.8), repeat=2), ("soft", "hard")):
+        place = (corner[0], 0.1, corner[1])
+        inwards = np.array([0.5 - corner[0], 0.0, 0.5 - corner[1]])
+        scene = box_scene(sphere(*(np.array(place) + 0.4 * inwards)), center=(*place[:1], 0.1, *place[2:]))
+        push = np.tile(-np.sign(inwards), (plan.horizon, 1))
+        yield Case(
+            "walls",
+            f"pushed into {place}, {contact}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, push),
+            contact,
+        )
+
+
+def overlaps(plan: Plan) -> Iterator[Case]:
+    """Bodies in each other, manipulators in a body, all particles at one point."""
+    cube = Body("box", (0.5, 0.3, 0.5), (0.2,) * 3, 1000)
+    ball = Body("sphere", (0.55, 0.35, 0.5), (0.12,), 1000)
+    tools, actions = squeezing(plan)
+    inside = (sphere(0.5, 0.3, 0.5), sphere(0.52, 0.3, 0.5))
+    starts = {
+        "two bodies": ((cube, ball), (), None),
+        "the same body twice": ((cube, cube), (), None),
+        "manipulators in the body and in each other": ((cube,), inside, None),
+        "bodies between manipulators": (
+            (replace(cube, center=(0.5, 0.1, 0.5)), replace(ball, center=(0.55, 0.15, 0.5))),
+            tools,
+            None,
+        ),
+        "all particles at one point": ((cube,), (), np.tile([0.5, 0.3, 0.5], (plan.particles, 1))),
+        "all particles in a corner": ((cube,), (), np.zeros((plan.particles, 3))),
+        "all particles in the upper corner": ((cube,), (), np.full((plan.particles, 3), 1.0 - 3.0 / 64)),
+        "all particles on a line": (
+            (cube,),
+            (),
+            np.linspace([0.3, 0.3, 0.3], [0.7, 0.3, 0.3], plan.particles),
+        ),
+    }
+    for (name, (bodies, used, x)), contact in itertools.product(starts.items(), ("soft", "hard")):
+        scene = replace(box_scene(*used), bodies=bodies)
+        own = actions if used else np.zeros((plan.horizon, 0))
+        yield Case(
+            "overlap",
+            f"{name}, {contact}",
+            common_scene(scene, plan.particles),
+            common_actions(scene, own),
+            contact,
+            {} if x is None else {"x": x},
+        )
+
+
+def deformations(plan: Plan) -> Iterator[Case]:
+    """Initial deformation gradients that are inverted, singular, tiny or huge, with and without flow.
+
+    They store a lot of energy, and the material stiffens while it is let go, hence the substeps.
+    """
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(plan.particles, 3, 3)))[0]
+    shapes = {
+        "inverted along one axis": np.diag([1.0, 1.0, -1.0]),
+        "inverted and stretched": np.diag([1.3, 0.7, -0.9]),
+        "turned inside out": -np.eye(3),
+        "rank two": np.diag([1.0, 1.0, 0.0]),
+        "rank one": np.diag([1.0, 0.0, 0.0]),
+        "zero": np.zeros((3, 3)),
+        "all singular values 1e-3": 1e-3 * np.eye(3),
+        "all singular values 3": 3.0 * np.eye(3),
+        "flat": np.diag([5.0, 5.0, 0.04]),
+        "rod": np.diag([25.0, 0.2, 0.2]),
+    }
+    tools, actions = squeezing(plan)
+    for (name, shape), flow in itertools.product(shapes.items(), (0.0, 50.0, math.inf)):
+        scene = box_scene(*tools, yield_stress=flow, substeps=DEFORMED, dt=STEP_TIME / DEFORMED)
+        yield Case(
+            "deformation",
+            f"{name}, yield stress {flow:g}",
+            replace(scene, bodies=_counted(scene, plan)),
+            actions[:3],
+            "soft",
+            {"F": turn @ shape @ turn.transpose(0, 2, 1)},
+            contact_weight=1.0,
+        )
+
+
+def few_particles(plan: Plan) -> Iterator[Case]:
+    """A single particle, and a handful."""
+    tools, actions = squeezing(plan)
+    for count, flow, contact in itertools.product((1, 5), (50.0, math.inf), ("soft", "hard")):
+        scene = box_scene(*tools, yield_stress=flow)
+        scene = replace(scene, bodies=(replace(scene.bodies[0], size=(0.02,) * 3, particles=count),))
+        name = f"{count} particle(s), yield stress {flow:g}, {contact}"
+        yield Case("few particles", name, scene, actions, contact, contact_weight=1.0)
+
+
+# --------------------------------------------------------------------------------------------------- refusals
+
+
+def refusals() -> dict[str, Scene]:
+    """Scenes that cannot be simulated, by what is wrong with them."""
+    nan, inf = math.nan, math.inf
+    tool = sphere(0.5, 0.3, 0.5)
+    scene = box_scene(tool)
+    body = scene.bodies[0]
+
+    def with_body(**changes: object) -> Scene:
+        return replace(scene, bodies=(replace(body, **changes),))
+
+    def with_tool(**changes: object) -> Scene:
+        return replace(scene, manipulators=(replace(tool, **changes),))
+
+    return {
+        "E times 100 without more substeps": replace(scene, youngs_modulus=5e5),
+        "nu 0.49 without more substeps": replace(scene, poisson_ratio=0.49),
+        "a finer grid without more substeps": replace(scene, grid_size=256),
+        "incompressible": replace(scene, poisson_ratio=0.5),
+        "auxetic": replace(scene, poisson_ratio=-0.2),
+        "no stiffness": replace(scene, youngs_modulus=0.0),
+        "E is NaN": replace(scene, youngs_modulus=nan),
+        "infinite E": replace(scene, youngs_modulus=inf),
+        "negative yield stress": replace(scene, yield_stress=-1.0),
+        "yield stress is NaN": replace(scene, yield_stress=nan),
+        "negative floor friction": replace(scene, floor_friction=-1.0),
+        "floor friction is NaN": replace(scene, floor_friction=nan),
+        "gravity is NaN": replace(scene, gravity=(0.0, nan, 0.0)),
+        "gravity of a cell per substep": replace(scene, gravity=(0.0, -2e6, 0.0)),
+        "no substeps": replace(scene, substeps=0),
+        "time step 0": replace(scene, dt=0.0),
+        "time step is NaN": replace(scene, dt=nan),
+        "grid too coarse": replace(scene, grid_size=4),
+        "no bodies": replace(scene, bodies=()),
+        "no particles": with_body(particles=0),
+        "body outside the domain": with_body(center=(0.95, 0.1, 0.5)),
+        "body's centre is NaN": with_body(center=(nan, 0.1, 0.5)),
+        "flat body": with_body(size=(0.2, 0.0, 0.2)),
+        "body's size is NaN": with_body(size=(0.2, nan, 0.2)),
+        "unknown body": with_body(shape="cone"),
+        "unknown manipulator": with_tool(shape="Cone"),
+        "manipulator of no size": with_tool(size=(0.0,)),
+        "manipulator's size is NaN": with_tool(size=(nan,)),
+        "manipulator's position is NaN": with_tool(position=(nan, 0.3, 0.5)),
+        "manipulator's rotation is not a rotation": with_tool(rotation=(2.0, 0.0, 0.0, 0.0)),
+        "manipulator's friction is NaN": with_tool(friction=nan),
+        "manipulator's scale is NaN": with_tool(scale=(nan, 0.0, 0.0)),
+        "manipulator moves by cells per substep": with_tool(scale=(1.0, 0.0, 0.0)),
+        "manipulator's bounds are the wrong way round": with_tool(
+            lower_bound=(0.9, 0.0, 0.0), upper_bound=(0.1, 1.0, 1.0)
+        ),
+    }

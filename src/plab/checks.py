@@ -1,0 +1,47 @@
+"""What can be found wrong with a run before anything is compiled, beyond the configuration itself."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+from plab.config import Config, ConfigError, build_scene
+from plab.targets import check_target, load_release_target
+
+__all__ = ["check_device", "check_sources", "cuda_is_usable"]
+
+
+def check_sources(cfg: Config) -> None:
+    """Find mistakes in the scene and in what the target comes from.
+
+    Raises:
+        plab.config.ConfigError: If the variant does not exist.
+        plab.scene.SceneError: If the scene cannot be simulated.
+        plab.targets.TargetError: If the target cannot be built or read.
+    """
+    scene, source = build_scene(cfg), cfg.targets.source
+    if source is None:
+        check_target(scene, cfg.task.target)
+    else:
+        load_release_target(source, scene, cfg.variant)
+
+
+def check_device(cfg: Config) -> None:
+    """Find out whether this computer has the device.
+
+    Raises:
+        plab.config.ConfigError: If not.
+    """
+    if cfg.sim.device == "cuda" and not cuda_is_usable():
+        raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
+
+
+def cuda_is_usable() -> bool:
+    """Return whether there is a CUDA device, by asking the driver: there is no library to import."""
+    count = ctypes.c_int(0)
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    answered = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    return answered and count.value > 0

@@ -1,0 +1,137 @@
+"""The paper's tables and curves from result files alone.
+
+python -m plab.report tables --results results --out reports/tables
+python -m plab.report tables --results runs.plab.zip task=Rope,Move seed=0,1,2
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+import plab
+from plab.report.collect import NAMES, MixedRunsError, Runs, collect
+from plab.report.hyperparameters import hyperparameters
+from plab.report.table import Table, write_index, write_table
+from plab.report.tables import iou_per_configuration, iou_per_task, solvability
+from plab.report.times import timing
+from plab.results import ResultsError
+from plab.selection import SelectionError, select
+
+__all__ = ["main", "write_tables"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    options = _parse(arguments)
+    command = shlex.join(["python", "-m", "plab.report", *arguments])
+    try:
+        runs = collect(options.results, select(options.words, NAMES))
+        benchmark = None if options.speed is None else _benchmark(options.speed)
+        written = write_tables(runs, options.out, command, benchmark)
+    except (ResultsError, SelectionError, MixedRunsError) as error:
+        print(f"plab: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    _tell(runs, written, options.out)
+    return 0
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="plab.report",
+        description=__doc__.partition("\n\n")[0],
+        epilog=__doc__.partition("\n\n")[2],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=["tables"], help="what to make")
+    parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
+    what = "folder of results, archive, or several of them (default: results)"
+    parser.add_argument("--results", nargs="+", default=["results"], help=what)
+    parser.add_argument("--out", type=Path, default=Path("reports/tables"), help="folder to write to")
+    what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
+    parser.add_argument("--speed", type=Path, help=what)
+    options = parser.parse_intermixed_args(argv)
+    # Words after --results are taken for folders.
+    options.words += [item for item in options.results if "=" in item]
+    options.results = [item for item in options.results if "=" not in item]
+    return options
+
+
+def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | None = None) -> list[Table]:
+    """Write all tables.
+
+    Args:
+        runs: Our runs.
+        out: Folder to write to.
+        command: What is given as the command that makes them.
+        benchmark: What ``python -m plab.bench.speed --paper --csv`` measured, or None.
+
+    Returns:
+        The tables.
+    """
+    groups = (
+        iou_per_task(runs),
+        iou_per_configuration(runs),
+        timing(runs, benchmark),
+        solvability(runs),
+        hyperparameters(),
+    )
+    tables = [table for group in groups for table in group]
+    from_runs, from_paper = _origin(runs, command), {"command": command, "footer": [f"Made by: {command}"]}
+    for table in tables:
+        uses_runs = table.form != "paper" and table.name not in ("solvability", "hyperparameters")
+        write_table(table, out, from_runs if uses_runs else from_paper)
+    write_index(tables, out)
+    return tables
+
+
+def _origin(runs: Runs, command: str) -> dict[str, Any]:
+    digest = runs.digest
+    footer = [f"Made by: {command}", f"From {len(runs.table)} run(s), SHA-256 over them {digest}"]
+    return {
+        "footer": footer,
+        "command": command,
+        "plab": plab.__version__,
+        "digest": digest,
+        "unfinished": runs.unfinished,
+        "others": runs.others,
+        "unusual": runs.unusual,
+        "runs": runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else [],
+    }
+
+
+def _benchmark(path: Path) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path, comment="#")
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"cannot read {path}: {error}") from error
+    wanted = {"task", "device", "batch", "forward_ms", "gradient_ms"}
+    if missing := sorted(wanted - set(table)):
+        raise ResultsError(f"{path} lacks {', '.join(missing)}: make it with plab.bench.speed --paper --csv")
+    return table
+
+
+def _tell(runs: Runs, written: Sequence[Table], out: Path) -> None:
+    expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
+    print(f"{out}: {len(written)} tables of {len(runs.table)} out of {expected} runs; tables.md has all")
+    for count, what in (
+        (runs.unfinished, "are not finished, hence not in the tables"),
+        (runs.others, "are of other tasks, variants, methods or seeds, hence not in the tables"),
+        (len(runs.unreadable), "cannot be read: python -m plab.results check"),
+    ):
+        if count:
+            print(f"{count} run(s) {what}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,232 @@
+"""The runs that tables and curves are made of: finished, of the suite, and all of the same settings."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from plab.report.methods import ordered
+from plab.results import Row, lookup, rows
+from plab.selection import Selection
+from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
+
+__all__ = ["KEYS", "NAMES", "MixedRunsError", "Runs", "collect"]
+
+NAMES = ("task", "variant", "method", "seed")
+
+KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
+"""Configuration keys that the table of runs has as columns."""
+
+_HARMLESS = (
+    "seed",
+    "results_dir",
+    "force",
+    "progress",
+    "checkpoint_seconds",
+    "sim.device",
+    "sim.memory_mb",
+    "method.tensorboard",
+    "method.torch_device",
+    "method.torch_threads",
+)
+"""Keys in which the runs of one mean may differ."""
+
+
+class MixedRunsError(ValueError):
+    """Runs that do not belong into one mean; the message is one line that says how to choose."""
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Finished runs, and which ones there should be.
+
+    Attributes:
+        table: As :func:`plab.results.load` gives it, a row per run.
+        tasks: Tasks asked for.
+        variants: Variants asked for.
+        methods: Methods asked for, in the order of tables.
+        seeds: Seeds asked for.
+        unfinished: Number of runs of theirs that are not finished, hence not in ``table``.
+        others: Number of finished runs that belong to nothing asked for.
+        unusual: Settings other than plab's own: key to the values that occur.
+        unreadable: What could not be read.
+    """
+
+    table: pd.DataFrame
+    tasks: list[str]
+    variants: list[str]
+    methods: list[str]
+    seeds: list[str]
+    unfinished: int
+    others: int
+    unusual: dict[str, list[Any]]
+    unreadable: list[str]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256, in hex, over the runs' configurations, evaluations and times, wherever their files are."""
+        lines = sorted(_fingerprint(row) for row in self.table.drop(columns="path").to_dict("records"))
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Runs:
+    """Find the runs for tables and curves.
+
+    Args:
+        source: Folder of results, archive, or several of them.
+        chosen: Which runs; what it leaves open is the suite's tasks and variants, the paper's methods and
+            seeds, and further methods and seeds that the results have.
+
+    Raises:
+        MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
+        plab.results.ResultsError: If there is nothing at ``source``.
+    """
+    found, unreadable = rows(source)
+    fitting = [row for row in found if chosen(row.values, row.config)]
+    asked = _asked(fitting, chosen)
+    inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
+    finished = [row for row in inside if row.values["status"] == "finished"]
+    _refuse_mixed(finished)
+    values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
+    table = pd.DataFrame(values, columns=None if finished else [*NAMES, "score", "path", *KEYS])
+    return Runs(
+        table=table.astype({"seed": str}),
+        tasks=asked["task"],
+        variants=asked["variant"],
+        methods=asked["method"],
+        seeds=asked["seed"],
+        unfinished=len(inside) - len(finished),
+        others=sum(row.values["status"] == "finished" for row in fitting) - len(finished),
+        unusual=_unusual(finished),
+        unreadable=[str(error) for error in unreadable],
+    )
+
+
+def _asked(found: Sequence[Row], chosen: Selection) -> dict[str, list[str]]:
+    seeds = {str(row.values["seed"]) for row in found} | set(PAPER_SEEDS)
+    free = {
+        "task": suite_tasks(),
+        "variant": list(SUITE_VARIANTS),
+        "method": ordered(row.values["method"] for row in found),
+        "seed": sorted(seeds, key=int),
+    }
+    return {name: chosen.choices.get(name, free[name]) for name in NAMES}
+
+
+# --------------------------------------------------------------------------------------------------- settings
+
+
+def _refuse_mixed(found: Sequence[Row]) -> None:
+    """Refuse runs of one configuration, or of one task and method, that differ in what matters."""
+    groups: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    for row in found:
+        groups[row.values["task"], row.values["method"]].append(row)
+    for (task, method), own in groups.items():
+        sections = ("sim", "method")
+        _refuse_differing(f"{task} {method}", [{name: row.config[name] for name in sections} for row in own])
+        variants: dict[str, list[Row]] = defaultdict(list)
+        for row in own:
+            variants[row.values["variant"]].append(row)
+        for variant, same in variants.items():
+            _refuse_differing(f"{task}-v{variant} {method}", [row.config for row in same])
+            _refuse_repeated(same)
+
+
+def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]]) -> None:
+    for key, values in _differences(configs).items():
+        if key not in _HARMLESS:
+            texts = " and ".join(map(str, values))
+            advice = f"choose one, for example {key}={values[0]}"
+            raise MixedRunsError(f"runs of {what} differ in {key}, which is {texts}: {advice}")
+
+
+def _refuse_repeated(found: Sequence[Row]) -> None:
+    by_seed: dict[str, Row] = {}
+    for row in found:
+        other = by_seed.setdefault(str(row.values["seed"]), row)
+        if other is row:
+            continue
+        keys = [key for key in _differences([other.config, row.config]) if key != "results_dir"]
+        how = f"choose one by {keys[0]}=" if keys else "remove one"
+        raise MixedRunsError(f"{other.path} and {row.path} have the same seed: {how}")
+
+
+def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return the dotted keys in which configurations differ, with the values that occur."""
+    first = configs[0]
+    if all(config == first for config in configs[1:]):
+        return {}
+    seen: dict[str, dict[str, Any]] = defaultdict(dict)
+    flat = [dict(_leaves(config)) for config in configs]
+    for key in dict.fromkeys(key for leaves in flat for key in leaves):
+        for leaves in flat:
+            value = leaves.get(key)
+            seen[key].setdefault(json.dumps(value), value)
+    return {key: list(values.values()) for key, values in seen.items() if len(values) > 1}
+
+
+def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in node.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+def _unusual(found: Sequence[Row]) -> dict[str, list[Any]]:
+    """Return the settings that are not those of plab's own files: key to the values that occur."""
+    usual: dict[str, dict[str, Any]] = {}
+    unusual: dict[str, set[str]] = defaultdict(set)
+    for row in found:
+        name = row.values["method"]
+        if name not in usual:
+            usual[name] = _usual(name)
+        for key, value in usual[name].items():
+            own = lookup(row.config, key)
+            if key not in _HARMLESS and own != value:
+                unusual[key].add(json.dumps(own))
+        for key, value in _usual_task(row.values["task"]).items():
+            if lookup(row.config, f"task.{key}") != value and key not in _changed_by_variant(row.config):
+                unusual[f"task.{key}"].add(json.dumps(lookup(row.config, f"task.{key}")))
+    return {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
+
+
+def _usual(method: str) -> dict[str, Any]:
+    """Return method and sim as plab's files have them; only sim of a method that plab does not know."""
+    # Imported here: composing needs Hydra.
+    from plab.config import choices, load_config
+    from plab.results import config_dict
+
+    known = method in choices("method")
+    config = config_dict(load_config([f"method={method}"] if known else []))
+    sections = ("sim", "method") if known else ("sim",)
+    return dict(_leaves({name: config[name] for name in sections}))
+
+
+def _usual_task(task: str) -> dict[str, Any]:
+    """Return the numbers of a task that are no part of bodies, manipulators, target or variants."""
+    if task not in _tasks:
+        path = conf_folder() / "task" / f"{task}.yaml"
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        _tasks[task] = {key: value for key, value in content.items() if not isinstance(value, dict)}
+    return _tasks[task]
+
+
+_tasks: dict[str, dict[str, Any]] = {}
+
+
+def _changed_by_variant(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    variants = config["task"].get("variants") or {}
+    return variants.get(str(config["variant"]), {})
+
+
+def _fingerprint(values: Mapping[str, Any]) -> str:
+    return json.dumps({name: value for name, value in values.items() if value == value}, sort_keys=True)

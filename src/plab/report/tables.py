@@ -1,0 +1,360 @@
+"""The tables of scores: IoU per task and per configuration, solvability."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from plab.report.collect import Runs
+from plab.report.methods import GRADIENT, RL, method
+from plab.report.reference import PAPER_SEED_COUNT, paper_table
+from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
+from plab.report.table import NOTHING, Table, number, spread
+
+__all__ = [
+    "INTERVAL",
+    "ends",
+    "iou_per_configuration",
+    "iou_per_task",
+    "ordered_tasks",
+    "settings_note",
+    "solvability",
+]
+
+_INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
+_BOLD = "Bold: best RL method and best gradient method."
+_DIFFERENCE = (
+    "Difference: ours minus the paper's, mean over the variants that have runs, with the "
+    f"{CONFIDENCE:.0%} interval of Welch's t, its variance estimated within variants on both sides; no "
+    "interval where a variant has one run."
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number of a table.
+
+    Attributes:
+        summary: What the runs gave.
+        expected: How many runs there should be.
+    """
+
+    summary: Summary
+    expected: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether there are all runs."""
+        return self.summary.count >= self.expected
+
+    @property
+    def text(self) -> str:
+        """Mean and spread, and how many runs there are where some are missing."""
+        count = f"{self.summary.count}/{self.expected}"
+        if not self.summary.count:
+            return count
+        text = spread(self.summary)
+        return text if self.complete else f"{text} ({count})"
+
+
+class Cells:
+    """Scores by task, variant and method, of our runs or of the paper's.
+
+    Attributes:
+        source: Where the numbers come from, ``ours`` or ``paper``.
+    """
+
+    def __init__(self, source: str, runs: Runs) -> None:
+        """Take the numbers.
+
+        Args:
+            source: ``ours`` or ``paper``.
+            runs: Our runs; also says what is asked for.
+        """
+        self.source, self._runs = source, runs
+        self._scores: dict[tuple[str, str, str], np.ndarray] = {}
+        if source == "ours":
+            for key, own in runs.table.groupby(["task", "variant", "method"]):
+                self._scores[key] = own["score"].to_numpy(float)
+        self._configurations = paper_table("iou_per_configuration").set_index(["task", "variant", "method"])
+        self._tasks = paper_table("iou_per_task").set_index(["task", "method"])
+
+    def configuration(self, task: str, variant: str, name: str) -> Cell:
+        """Return the cell of a task, variant and method."""
+        key = (task, variant, name)
+        if self.source == "ours":
+            return Cell(summarise(self._scores.get(key, [])), len(self._runs.seeds))
+        return Cell(_printed(self._configurations, key, PAPER_SEED_COUNT), 0)
+
+    def task(self, task: str, name: str) -> Cell:
+        """Return the cell of a task and method, over all variants."""
+        if self.source == "ours":
+            scores = [self._scores.get((task, variant, name), []) for variant in self._runs.variants]
+            return Cell(summarise(np.concatenate(scores)), len(self._runs.variants) * len(self._runs.seeds))
+        return Cell(_printed(self._tasks, (task, name), 5 * PAPER_SEED_COUNT), 0)
+
+
+def _printed(table: pd.DataFrame, key: tuple[str, ...], count: int) -> Summary:
+    if key not in table.index:
+        return summarise([])
+    return Summary(float(table.loc[key, "iou_mean"]), float(table.loc[key, "iou_std"]), count)
+
+
+def ordered_tasks(tasks: Sequence[str]) -> list[str]:
+    """Return tasks in the paper's order, others after them."""
+    papers = list(dict.fromkeys(paper_table("iou_per_configuration")["task"]))
+    return sorted(tasks, key=lambda task: (papers.index(task) if task in papers else len(papers), task))
+
+
+# -------------------------------------------------------------------------------------------- incremental IoU
+
+
+def iou_per_task(runs: Runs) -> list[Table]:
+    """Return normalised incremental IoU per task and method: ours, the paper's, and the two compared."""
+    what = "over variants and seeds"
+    keys = [(task,) for task in ordered_tasks(runs.tasks)]
+    ours, theirs = Cells("ours", runs), Cells("paper", runs)
+
+    def difference(key: tuple[str, ...], name: str) -> Interval:
+        pairs = [
+            (ours.configuration(*key, variant, name), theirs.configuration(*key, variant, name))
+            for variant in runs.variants
+        ]
+        return stratified_difference([a.summary for a, _ in pairs], [b.summary for _, b in pairs])
+
+    title = "Normalised incremental IoU per task"
+    return _iou_tables(
+        runs, "iou_per_task", title, what, ("task",), keys, (ours.task, theirs.task), difference
+    )
+
+
+def iou_per_configuration(runs: Runs) -> list[Table]:
+    """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
+    keys = [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
+    ours, theirs = Cells("ours", runs).configuration, Cells("paper", runs).configuration
+
+    def difference(key: tuple[str, ...], name: str) -> Interval:
+        return stratified_difference([ours(*key, name).summary], [theirs(*key, name).summary])
+
+    title, names = "Normalised incremental IoU per configuration", ("task", "variant")
+    return _iou_tables(
+        runs, "iou_per_configuration", title, "over seeds", names, keys, (ours, theirs), difference
+    )
+
+
+Look = Callable[..., Cell]
+
+
+def _iou_tables(
+    runs: Runs,
+    name: str,
+    title: str,
+    what: str,
+    names: tuple[str, ...],
+    keys: list[tuple[str, ...]],
+    looks: tuple[Look, Look],
+    difference: Callable[[tuple[str, ...], str], Interval],
+) -> list[Table]:
+    """Return the three forms of a table of scores.
+
+    Args:
+        runs: Our runs.
+        name: Name of the files.
+        title: Heading.
+        what: What means and spreads are taken over.
+        names: Columns that say what a row is about.
+        keys: Their values, a tuple per row.
+        looks: Finds our cell, and the paper's, for a key and a method.
+        difference: Compares ours and the paper's, for a key and a method.
+    """
+    notes = [f"Mean ± standard deviation {what}.", _BOLD]
+    made = []
+    for form, look, more in (
+        ("ours", looks[0], [_INCOMPLETE, *settings_note(runs)]),
+        ("paper", looks[1], []),
+    ):
+        methods = runs.methods if form == "ours" else [m for m in runs.methods if _in_paper(m)]
+        grid = [[look(*key, m) for m in methods] for key in keys]
+        cells = pd.DataFrame(
+            [[cell.text for cell in line] for line in grid], columns=[method(m).label for m in methods]
+        )
+        if form == "paper":
+            cells = cells.replace("0/0", NOTHING)
+        for position, column in enumerate(names):
+            cells.insert(position, column, [key[position] for key in keys])
+        bold = np.array([[False] * len(names) + _best(line, methods) for line in grid])
+        data = [
+            dict(zip(names, key, strict=True)) | {"method": m} | _numbers(cell, form)
+            for key, line in zip(keys, grid, strict=True)
+            for m, cell in zip(methods, line, strict=True)
+        ]
+        made.append(
+            Table(
+                name,
+                form,
+                f"{title}, {_OWNER[form]}",
+                cells,
+                pd.DataFrame(data),
+                bold,
+                notes + more,
+                len(keys) > 40,
+            )
+        )
+    return [*made, _compared(runs, name, title, names, keys, looks, difference)]
+
+
+_OWNER = {"ours": "plab", "paper": "the paper"}
+
+
+def _compared(
+    runs: Runs,
+    name: str,
+    title: str,
+    names: tuple[str, ...],
+    keys: list[tuple[str, ...]],
+    looks: tuple[Look, Look],
+    difference: Callable[[tuple[str, ...], str], Interval],
+) -> Table:
+    """Return our scores beside the paper's; the arguments are those of :func:`_iou_tables`."""
+    cells, data = [], []
+    for key in keys:
+        for m in filter(_in_paper, runs.methods):
+            mine, theirs = looks[0](*key, m), looks[1](*key, m)
+            gap = difference(key, m)
+            where = dict(zip(names, key, strict=True))
+            shown = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
+            cells.append(where | {"method": method(m).label} | shown | {INTERVAL: ends(gap)})
+            printed = {f"paper_{k}": v for k, v in _numbers(theirs, "paper").items()}
+            gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
+            data.append(where | {"method": m} | _numbers(mine, "ours") | printed | gaps)
+    notes = [_DIFFERENCE, *settings_note(runs)]
+    return Table(
+        name, "comparison", f"{title}, compared", pd.DataFrame(cells), pd.DataFrame(data), None, notes, True
+    )
+
+
+INTERVAL = f"{CONFIDENCE:.0%} interval"
+"""Heading of intervals."""
+
+
+def ends(interval: Interval, decimals: int = 2) -> str:
+    """Write the ends of an interval, a dash if there are none."""
+    if np.isnan(interval.low):
+        return NOTHING
+    return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
+
+
+def _numbers(cell: Cell, form: str) -> dict[str, float]:
+    values = {"mean": cell.summary.mean, "std": cell.summary.std, "runs": cell.summary.count}
+    return values | ({"expected": cell.expected} if form == "ours" else {})
+
+
+def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
+    """Say which cells are the best of their kind of method, as printed; none where one is incomplete."""
+    best = [False] * len(line)
+    for kind in (RL, GRADIENT):
+        rivals = [
+            k
+            for k, m in enumerate(methods)
+            if method(m).kind == kind and (_in_paper(m) or line[k].summary.count)
+        ]
+        if not rivals or not all(line[k].complete and line[k].summary.count for k in rivals):
+            continue
+        highest = max(round(line[k].summary.mean, 2) for k in rivals)
+        for k in rivals:
+            best[k] = round(line[k].summary.mean, 2) == highest
+    return best
+
+
+def _in_paper(name: str) -> bool:
+    return name in set(paper_table("iou_per_task")["method"])
+
+
+def settings_note(runs: Runs) -> list[str]:
+    """Say how the runs were made where that is not plab's own way."""
+    if not runs.unusual:
+        return []
+    shown = [f"{key} = {', '.join(map(str, values))}" for key, values in list(runs.unusual.items())[:6]]
+    more = len(runs.unusual) - len(shown)
+    return [f"Settings other than plab's own: {'; '.join(shown)}{f'; and {more} more' if more else ''}."]
+
+
+# ------------------------------------------------------------------------------------------------ solvability
+
+
+def solvability(runs: Runs) -> list[Table]:
+    """Return what the reference demonstrations reach beside the best method of the paper."""
+    with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
+        known = pd.read_csv(file, dtype={"variant": str}).set_index(["task", "variant"])["score"]
+    paper = paper_table("iou_per_configuration")
+    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
+    keys = [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
+    rows = []
+    for key in keys:
+        score = float(known.get(key, np.nan))
+        theirs = summarise([])
+        if key in best.index:
+            theirs = Summary(
+                float(best.loc[key, "iou_mean"]), float(best.loc[key, "iou_std"]), PAPER_SEED_COUNT
+            )
+        # A replay has no spread: all of the interval is the paper's.
+        gap = stratified_difference([Summary(score, 0.0, 0 if np.isnan(score) else 2)], [theirs])
+        name = best.loc[key, "method"] if theirs.count else ""
+        rows.append(
+            {"task": key[0], "variant": key[1], "score": score, "paper_method": name}
+            | {"paper_mean": theirs.mean, "paper_std": theirs.std}
+            | {"difference": gap.value, "low": gap.low, "high": gap.high}
+        )
+    data = pd.DataFrame(rows)
+    return [
+        _solvability_grid(data, "ours", "score", "What the reference demonstrations reach", []),
+        _solvability_grid(
+            data, "paper", "paper_mean", "What the best method of the paper reaches", ["Mean over seeds."]
+        ),
+        _solvability_compared(data),
+    ]
+
+
+_DEMONSTRATIONS = "Normalised incremental IoU of the best actions known, replayed in the hard contact model."
+
+
+def _solvability_grid(data: pd.DataFrame, form: str, column: str, title: str, notes: list[str]) -> Table:
+    grid = data.pivot(index="task", columns="variant", values=column).loc[list(dict.fromkeys(data["task"]))]
+    cells = grid.map(number).rename(columns=lambda variant: f"variant {variant}").reset_index()
+    cells.columns.name = None
+    columns = ["task", "variant", column, *(["paper_method"] if form == "paper" else [])]
+    own = [_DEMONSTRATIONS] if form == "ours" else notes
+    return Table("solvability", form, title, cells, data[columns], notes=own)
+
+
+def _solvability_compared(data: pd.DataFrame) -> Table:
+    cells = [
+        {
+            "task": row.task,
+            "variant": row.variant,
+            "demonstration": number(row.score),
+            "paper, best method": _printed_best(row),
+            "difference": number(row.difference, sign=True),
+            INTERVAL: ends(Interval(row.difference, row.low, row.high)),
+        }
+        for row in data.itertuples()
+    ]
+    notes = [
+        _DEMONSTRATIONS,
+        "Our targets are made from their parameters or by scripts, the paper's are files, so the two columns "
+        "judge somewhat different goals. The interval is Student's t over the paper's seeds.",
+    ]
+    title = "Demonstrations beside the best method of the paper"
+    return Table("solvability", "comparison", title, pd.DataFrame(cells), data, None, notes, True)
+
+
+def _printed_best(row: Any) -> str:
+    if not row.paper_method:
+        return NOTHING
+    printed = Summary(row.paper_mean, row.paper_std, PAPER_SEED_COUNT)
+    return f"{spread(printed)} ({method(row.paper_method).label})"

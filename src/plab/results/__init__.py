@@ -1,0 +1,48 @@
+"""Result files: one HDF5 file per run, replaced atomically while it runs, loaded into pandas afterwards.
+
+The layout is described in docs/results.md. A run that is under way keeps its state in ``<name>.partial.h5``,
+rewritten as a whole now and then: a process killed at any moment leaves the previous, readable version
+behind, from which the same command resumes. Finished runs can be packed into archives, which load like
+folders; ``python -m plab.results`` packs and checks. This package imports neither torch nor taichi, so that
+reading results is quick.
+"""
+
+from plab.results.archive import pack, unpack
+from plab.results.checking import Problem, check
+from plab.results.files import read, write
+from plab.results.loading import Row, load, lookup, rows
+from plab.results.running import RunFile
+from plab.results.schema import (
+    SCHEMA_VERSION,
+    STATUSES,
+    NewerSchemaError,
+    ResultsError,
+    RunBusyError,
+    RunResult,
+    config_dict,
+    config_hash,
+    result_path,
+)
+
+__all__ = [
+    "SCHEMA_VERSION",
+    "STATUSES",
+    "NewerSchemaError",
+    "Problem",
+    "ResultsError",
+    "Row",
+    "RunBusyError",
+    "RunFile",
+    "RunResult",
+    "check",
+    "config_dict",
+    "config_hash",
+    "load",
+    "lookup",
+    "pack",
+    "read",
+    "result_path",
+    "rows",
+    "unpack",
+    "write",
+]

@@ -1,0 +1,137 @@
+"""Archives: many runs in one file, for publishing or keeping under version control.
+
+An archive is a zip file of result files, each with what tables, curves and pictures need; any zip program
+unpacks it. Its members are the same HDF5 files as those of a results folder, compressed once inside (arrays,
+with the bytes of equal significance together) and once outside (names, configurations).
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from plab.results.files import encode, read, replace_file
+from plab.results.loading import Row, rows
+from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, member_name
+
+__all__ = ["Packed", "pack", "unpack"]
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Time of every member, the earliest that zip knows: the same runs give the same bytes."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """What :func:`pack` did.
+
+    Attributes:
+        runs: Number of runs in the archive.
+        archive_bytes: Size of the archive.
+        file_bytes: Size of the runs' own files; of those that came out of an archive, 0.
+        unreadable: What could not be read, hence is not in the archive.
+    """
+
+    runs: int
+    archive_bytes: int
+    file_bytes: int
+    unreadable: list[ResultsError]
+
+
+def pack(
+    source: str | Path | Sequence[str | Path],
+    archive: str | Path,
+    *,
+    wanted: Callable[[Row], bool] | None = None,
+    keep_masses: bool = False,
+    keep_resume: bool = False,
+) -> Packed:
+    """Write runs into an archive, in one atomic step.
+
+    Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
+    where the archive itself lies there. Numbers keep all their digits.
+
+    Args:
+        source: Folder of results, archive, result file, or several of them.
+        archive: File to create or replace; its name ends in ``.plab.zip``.
+        wanted: Says which runs to take; all finished ones by default.
+        keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
+        keep_resume: Keep the state from which unfinished runs go on.
+
+    Raises:
+        ResultsError: If there is nothing to pack, two runs claim the same place, or the archive cannot be
+            written.
+    """
+    archive = Path(archive)
+    if not archive.name.endswith(ARCHIVE_SUFFIX):
+        raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
+    found, unreadable = rows(source)
+    chosen: dict[str, Row] = {}
+    for row in filter(wanted or _finished, found):
+        name = _member(row).as_posix()
+        if name in chosen:
+            raise ResultsError(
+                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
+            )
+        chosen[name] = row
+    if not chosen:
+        raise ResultsError("there is nothing to pack: no run fits")
+    content, size = io.BytesIO(), 0
+    with zipfile.ZipFile(content, "w") as members:
+        for name, row in sorted(chosen.items()):
+            run = read(row.path)
+            run = replace(
+                run, masses=run.masses if keep_masses else {}, resume=run.resume if keep_resume else None
+            )
+            member = zipfile.ZipInfo(name, _EPOCH)
+            member.external_attr = 0o644 << 16
+            members.writestr(member, encode(run, compress=True), zipfile.ZIP_DEFLATED, 9)
+            size += row.path.stat().st_size if row.path.is_file() else 0
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(archive, content.getvalue(), sync=True)
+    return Packed(len(chosen), archive.stat().st_size, size, unreadable)
+
+
+def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
+    """Write the runs of an archive to files of their own; files that are there already stay as they are.
+
+    Args:
+        archive: The archive.
+        folder: Results folder to put them into.
+
+    Returns:
+        Number of files written, and of files left as they were.
+
+    Raises:
+        ResultsError: If the archive cannot be read or a file cannot be written.
+    """
+    found, unreadable = rows(archive, index=False)
+    if unreadable:
+        raise unreadable[0]
+    written = 0
+    for row in found:
+        path = Path(folder) / _member(row)
+        if not path.resolve().is_relative_to(Path(folder).resolve()):
+            raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
+        if path.exists():
+            continue
+        run = read(row.path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+        replace_file(path, encode(run, compress=True), sync=False)
+        written += 1
+    return written, len(found) - written
+
+
+def _member(row: Row) -> Path:
+    """Return a run's place in an archive, or in a folder that it is unpacked to."""
+    name = member_name(row.config, row.values["config_hash"])
+    return name if _finished(row) else name.with_suffix(PARTIAL_SUFFIX)
+
+
+def _finished(row: Row) -> bool:
+    return row.values["status"] == "finished"

@@ -1,0 +1,207 @@
+"""Checking result files against the schema."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from plab.objective import scores_from_iou
+from plab.results.files import read
+from plab.results.loading import run_files
+from plab.results.schema import (
+    ARCHIVE_SUFFIX,
+    COLUMNS,
+    EVALUATION,
+    FAMILY_COLUMNS,
+    MAY_BE_NAN,
+    PARTIAL_SUFFIX,
+    STATUSES,
+    ResultsError,
+    RunResult,
+    config_hash,
+)
+
+__all__ = ["Problem", "check", "problems"]
+
+_IN_UNIT_INTERVAL = ("iou", "score", "iou_initial", "iou_target_self")
+
+_TOLERANCE = 1e-9
+"""Relative error allowed between a score and the IoUs that it is computed from."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is wrong with a file.
+
+    Attributes:
+        path: The file, or the place in an archive.
+        reason: What is wrong, one line.
+        advice: What to do, one line.
+    """
+
+    path: Path
+    reason: str
+    advice: str
+
+
+def check(source: str | Path) -> Iterator[tuple[Path, Problem | None]]:
+    """Check all result files of a folder, all runs of an archive, or one file, in full.
+
+    Args:
+        source: Folder of results, archive or result file.
+
+    Yields:
+        Each file, or place in an archive, with what is wrong with it, or None.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``.
+    """
+    for path, _ in run_files(Path(source)):
+        if path.name.endswith(ARCHIVE_SUFFIX):
+            yield from _check_archive(path)
+        else:
+            yield path, _check_file(path)
+
+
+def problems(run: RunResult) -> list[str]:
+    """Return what is wrong with the contents of a run that could be read, nothing if all is well."""
+    found = [*_status(run), *_iterations(run), *_best(run), *_times(run)]
+    if run.status == "finished":
+        found += [*_evaluation(run), *_masses(run), *_complete(run)]
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------- details
+
+
+def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, zipfile.BadZipFile) as error:
+        yield path, Problem(path, f"truncated or damaged ({error})", "get it again, or pack it again")
+        return
+    for name in names:
+        yield path / name, _check_file(path / name)
+
+
+def _check_file(path: Path) -> Problem | None:
+    try:
+        run = read(path)
+        found = problems(run)
+    except ResultsError as error:
+        reason = str(error).removeprefix(str(path)).strip()
+        return Problem(path, reason, _advice_unreadable(path, reason))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
+    if found:
+        return Problem(path, "; ".join(found), "run it again with force=true, or delete it")
+    return None
+
+
+def _advice_unreadable(path: Path, reason: str) -> str:
+    if "schema version" in reason:
+        return "read it with the plab that wrote it"
+    if "not a plab" in reason or not h5py.is_hdf5(path):
+        begun = path.name.endswith(PARTIAL_SUFFIX)
+        cut = "delete it; the run starts afresh" if begun else "delete it and run it again"
+        return "move it out of the results" if "not a plab" in reason else cut
+    return "delete it and run it again"
+
+
+def _status(run: RunResult) -> Iterator[str]:
+    if run.status not in STATUSES:
+        yield f"status '{run.status}' is none of {', '.join(STATUSES)}"
+    partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
+    if partial == (run.status == "finished"):
+        yield f"the name says that the run is {'not ' if partial else ''}finished, the status is {run.status}"
+    if run.status == "failed" and not run.message:
+        yield "it failed without a message"
+    if config_hash(run.config) != run.config_hash:
+        yield "config_hash is not that of config"
+
+
+def _times(run: RunResult) -> Iterator[str]:
+    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
+        yield "wall_time has seconds that are negative or not finite"
+
+
+def _iterations(run: RunResult) -> Iterator[str]:
+    table = run.iterations
+    if table.empty:
+        if run.status == "finished":
+            yield "it has no iterations"
+        return
+    wanted = (*COLUMNS, *FAMILY_COLUMNS.get(run.config["method"]["family"], ()))
+    if missing := [name for name in wanted if name not in table]:
+        yield f"iterations lack {', '.join(missing)}"
+        return
+    if strange := [name for name in table if table[name].dtype.kind not in "iuf"]:
+        yield f"iterations are not numbers: {', '.join(map(str, strange))}"
+        return
+    if endless := [n for n in table if n not in MAY_BE_NAN and not np.isfinite(table[n]).all()]:
+        yield f"iterations are not finite: {', '.join(map(str, endless))}"
+    if not np.array_equal(table["iteration"], np.arange(len(table))):
+        yield "iterations are not numbered 0, 1, 2, ..."
+    for name in ("episodes", "steps"):
+        if (np.diff(table[name]) < 0).any():
+            yield f"{name} decrease"
+    for name in ("iou", "score"):
+        if not table[name].between(0.0, 1.0).all():
+            yield f"{name} leaves [0, 1]"
+
+
+def _best(run: RunResult) -> Iterator[str]:
+    actions, table = run.best_actions, run.iterations
+    if actions is None:
+        if not table.empty:
+            yield "it has iterations, but no best actions"
+        return
+    if actions.ndim != 2 or len(actions) != run.config["sim"]["horizon"]:
+        yield f"best actions have shape {list(actions.shape)}, not [{run.config['sim']['horizon']}, A]"
+    if not (np.abs(actions) <= 1.0).all():
+        yield "best actions leave [-1, 1]"
+    if not 0 <= run.best_iteration < len(table):
+        yield f"there is no iteration {run.best_iteration}, which is to be the best"
+    elif "loss" in table and run.best_loss != table["loss"].min():
+        yield f"the best loss is {run.best_loss:g}, the lowest in the iterations {table['loss'].min():g}"
+
+
+def _evaluation(run: RunResult) -> Iterator[str]:
+    values = run.evaluation
+    if missing := [name for name in EVALUATION if name not in values]:
+        yield f"evaluation lacks {', '.join(missing)}"
+        return
+    if endless := [name for name, value in values.items() if not np.isfinite(value)]:
+        yield f"evaluation is not finite: {', '.join(endless)}"
+        return
+    if outside := [name for name in _IN_UNIT_INTERVAL if not 0.0 <= values[name] <= 1.0]:
+        yield f"evaluation leaves [0, 1]: {', '.join(outside)}"
+    again = scores_from_iou(values["iou_initial"], values["iou"], values["iou_target_self"])
+    for name in ("score", "score_printed"):
+        if not np.isclose(values[name], getattr(again, name), rtol=_TOLERANCE, atol=_TOLERANCE):
+            yield f"{name} is {values[name]:g}, by the IoUs it should be {getattr(again, name):g}"
+
+
+def _masses(run: RunResult) -> Iterator[str]:
+    size = run.config["sim"]["grid_size"]
+    for name, mass in run.masses.items():
+        if mass.shape != (size,) * 3:
+            yield f"mass {name} has shape {list(mass.shape)}, not {[size] * 3}"
+        elif not (np.isfinite(mass).all() and (mass >= 0.0).all()):
+            yield f"mass {name} is negative or not finite somewhere"
+
+
+def _complete(run: RunResult) -> Iterator[str]:
+    method, table = run.config["method"], run.iterations
+    if "iterations" in method and len(table) != method["iterations"]:
+        yield f"it is finished after {len(table)} of {method['iterations']} iterations"
+    if "episodes" in method and "episodes" in table and len(table):
+        done = int(table["episodes"].iloc[-1])
+        if done < method["episodes"]:
+            yield f"it is finished after {done} of {method['episodes']} episodes"

@@ -1,0 +1,233 @@
+"""Reading and writing one run's HDF5 file, on its own or inside an archive."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+
+from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, NewerSchemaError, ResultsError, RunResult
+
+__all__ = ["attributes", "encode", "opened", "opened_image", "read", "replace_file", "split_archive", "write"]
+
+_images = itertools.count()
+
+_COMPACT = ("v110", "v110")
+"""HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
+
+_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile)
+"""What h5py, zlib and zipfile raise on files that are cut short, damaged or something else."""
+
+
+def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
+    """Write a result file in one atomic step: readers see the previous file or the new one, never a part.
+
+    Args:
+        result: What to write.
+        path: File to create or replace.
+        compress: Compress the arrays (gzip) and wait until the disk has the data: for the final file.
+
+    Raises:
+        ResultsError: If the file cannot be written; ``path`` is then as it was.
+    """
+    replace_file(path, encode(result, compress=compress), sync=compress)
+
+
+def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
+    """Put a file in place in one atomic step.
+
+    Args:
+        path: File to create or replace.
+        content: What it is to hold.
+        sync: Wait until the disk has it.
+
+    Raises:
+        ResultsError: If the file cannot be written; ``path`` is then as it was.
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def read(path: str | Path) -> RunResult:
+    """Read one run: a result file, finished or partial, or a member of an archive.
+
+    Args:
+        path: The file; ``<archive>.plab.zip/<member>`` for a run in an archive, as in the column ``path`` of
+            :func:`plab.results.load`.
+
+    Raises:
+        ResultsError: If the file is missing, truncated, of another schema version or no result file at all.
+    """
+    path = Path(path)
+    with opened(path) as file:
+        masses = {name: _read_sparse(group) for name, group in file["mass"].items()}
+        best = file["best"]
+        table = file["iterations"]
+        return RunResult(
+            config=json.loads(file.attrs["config"]),
+            config_hash=file.attrs["config_hash"],
+            status=file.attrs["status"],
+            message=file.attrs["message"],
+            provenance=attributes(file["provenance"]),
+            wall_time=attributes(file["wall_time"]),
+            iterations=pd.DataFrame({str(name): table[name][()] for name in table.attrs["columns"]}),
+            best_actions=best["actions"][()] if "actions" in best else None,
+            best_iteration=int(best.attrs["iteration"]),
+            best_loss=float(best.attrs["loss"]),
+            evaluation=attributes(file["evaluation"]),
+            masses=masses,
+            resume=_read_tree(file["resume"]) if "resume" in file else None,
+            path=path,
+        )
+
+
+def encode(result: RunResult, *, compress: bool) -> bytes:
+    """Return the bytes of the HDF5 file, built in memory: then a full disk is a plain OSError, not HDF5's."""
+    options = {"compression": "gzip", "shuffle": True} if compress else {}
+    # A name of its own: Ctrl-C inside h5py can leave the previous image open, under its name.
+    name = f"image{next(_images)}"
+    with h5py.File(name, "w", driver="core", backing_store=False, libver=_COMPACT) as file:
+        file.attrs["format"] = "plab-run"
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        file.attrs["config"] = json.dumps(result.config)
+        file.attrs["config_hash"] = result.config_hash
+        file.attrs["status"] = result.status
+        file.attrs["message"] = result.message
+        for name in ("provenance", "wall_time", "evaluation"):
+            file.create_group(name).attrs.update(getattr(result, name))
+        table = file.create_group("iterations")
+        table.attrs["columns"] = list(result.iterations.columns)
+        for column in result.iterations.columns:
+            table.create_dataset(column, data=result.iterations[column].to_numpy(), **options)
+        best = file.create_group("best")
+        best.attrs["iteration"] = result.best_iteration
+        best.attrs["loss"] = result.best_loss
+        if result.best_actions is not None:
+            best.create_dataset("actions", data=result.best_actions, **options)
+        masses = file.create_group("mass")
+        for name, mass in result.masses.items():
+            _write_sparse(masses.create_group(name), mass, options)
+        if result.resume is not None:
+            _write_tree(file.create_group("resume"), result.resume)
+        file.flush()
+        return file.id.get_file_image()
+
+
+def split_archive(path: Path) -> tuple[Path, str] | None:
+    """Return archive and member of a path into an archive, None for any other path."""
+    for folder in path.parents:
+        if folder.name.endswith(ARCHIVE_SUFFIX) and folder.is_file():
+            return folder, path.relative_to(folder).as_posix()
+    return None
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """Open a run of this schema version, turning whatever is wrong with it into a ResultsError."""
+    inside = split_archive(path)
+    with _explained(path):
+        if inside is None:
+            with h5py.File(path, "r") as file:
+                yield _of_this_version(file, path)
+            return
+        archive, member = inside
+        try:
+            with zipfile.ZipFile(archive) as members:
+                image = members.read(member)
+        except KeyError:
+            raise ResultsError(f"{archive} holds no run {member}") from None
+    with opened_image(image, path) as file:
+        yield file
+
+
+@contextmanager
+def opened_image(image: bytes, path: Path) -> Iterator[h5py.File]:
+    """Open the bytes of a run, as :func:`opened` does a file; ``path`` is for messages."""
+    with _explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
+        yield _of_this_version(file, path)
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise ResultsError(f"{path} does not exist") from error
+    except ResultsError:
+        raise
+    except PermissionError as error:
+        raise ResultsError(f"{path} may not be read ({error.strerror or error})") from error
+    except _UNREADABLE as error:
+        raise ResultsError(f"{path} is truncated or damaged ({error})") from error
+
+
+def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
+    if file.attrs.get("format") != "plab-run":
+        raise ResultsError(f"{path} is not a plab result file")
+    version = file.attrs["schema_version"]
+    if version > SCHEMA_VERSION:
+        raise NewerSchemaError(
+            f"{path} was written by a newer plab (schema version {version}, this one knows "
+            f"{SCHEMA_VERSION}): install that, or choose another results_dir"
+        )
+    if version != SCHEMA_VERSION:
+        raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
+    return file
+
+
+def attributes(group: h5py.Group) -> dict[str, Any]:
+    """Return a group's attributes as plain Python scalars."""
+    items = group.attrs.items()
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in items}
+
+
+def _write_sparse(group: h5py.Group, mass: np.ndarray, options: dict[str, Any]) -> None:
+    flat = np.asarray(mass).ravel()
+    index = np.flatnonzero(flat).astype(np.int32)
+    group.attrs["shape"] = np.shape(mass)
+    group.create_dataset("index", data=index, **options)
+    group.create_dataset("value", data=flat[index], **options)
+
+
+def _read_sparse(group: h5py.Group) -> np.ndarray:
+    values = group["value"][()]
+    flat = np.zeros(int(np.prod(group.attrs["shape"])), dtype=values.dtype)
+    flat[group["index"][()]] = values
+    return flat.reshape(group.attrs["shape"])
+
+
+def _write_tree(group: h5py.Group, tree: Mapping[str, Any]) -> None:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            _write_tree(group.create_group(str(key)), value)
+        else:
+            group.create_dataset(str(key), data=value)
+
+
+def _read_tree(group: h5py.Group) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for key, item in group.items():
+        if isinstance(item, h5py.Group):
+            tree[key] = _read_tree(item)
+        else:
+            value = item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
+            tree[key] = value if isinstance(value, str) else np.asarray(value)
+    return tree

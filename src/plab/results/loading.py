@@ -1,0 +1,247 @@
+"""Folders and archives of results as one table, a row per run."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+import zipfile
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+
+from plab.results.files import attributes, opened, opened_image, split_archive
+from plab.results.index import Index
+from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
+
+__all__ = ["Row", "load", "lookup", "read_rows", "rows", "run_files"]
+
+_SUMMARY_COLUMNS = (
+    "task",
+    "variant",
+    "method",
+    "seed",
+    "status",
+    "message",
+    "score",
+    "iou",
+    "loss",
+    "iterations",
+    "best_iteration",
+    "best_loss",
+    "seconds",
+    "started",
+    "device",
+    "precision",
+    "plab",
+    "git_commit",
+    "config_hash",
+    "path",
+)
+
+_ORIGIN = {
+    "started": "start_time",
+    "device": "device",
+    "precision": "precision",
+    "plab": "plab",
+    "git_commit": "git_commit",
+}
+"""Column to attribute of the group ``provenance``."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a table of runs says about one of them.
+
+    Attributes:
+        values: Value of each column of :func:`load`.
+        config: The run's configuration.
+    """
+
+    values: dict[str, Any]
+    config: dict[str, Any]
+
+    @property
+    def path(self) -> Path:
+        """The run's file, or its place in an archive."""
+        return Path(self.values["path"])
+
+
+def load(
+    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
+) -> pd.DataFrame:
+    """Load results, a row per run.
+
+    Partial files are included (their status tells them apart) unless the same run has a finished file, and so
+    are the runs in archives unless the folder has the same run in a file. Files that cannot be read are named
+    in one warning.
+
+    Args:
+        source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
+        keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
+        index: Take rows of unchanged files from the index in the user's cache folder, and keep it up to date.
+
+    Returns:
+        Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
+        best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
+        of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
+        ``score``, ``iou`` and ``loss`` are the final evaluation's, NaN before it.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``.
+    """
+    found, unreadable = rows(source, index=index)
+    if unreadable:
+        listed = "; ".join(str(error) for error in unreadable)
+        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=2)
+    table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
+    return pd.DataFrame(table, columns=None if table else [*_SUMMARY_COLUMNS, *keys])
+
+
+def rows(
+    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
+) -> tuple[list[Row], list[ResultsError]]:
+    """Return the rows of :func:`load` with their configurations, and what could not be read.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``.
+    """
+    sources = [source] if isinstance(source, str | Path) else source
+    found: list[Row] = []
+    unreadable: list[ResultsError] = []
+    for root in map(Path, sources):
+        for entry in _all_rows(root, index):
+            (unreadable if isinstance(entry, ResultsError) else found).append(entry)
+    return _without_repetitions(found), unreadable
+
+
+def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
+
+    Raises:
+        ResultsError: If there is nothing at ``root``.
+    """
+    if root.is_file():
+        yield root, root.stat()
+        return
+    if not root.exists():
+        raise ResultsError(f"there are no results: {root} does not exist")
+    for folder, subfolders, names in os.walk(root):
+        subfolders.sort()
+        for name in sorted(names):
+            if name.endswith((SUFFIX, ARCHIVE_SUFFIX)):
+                path = Path(folder, name)
+                try:
+                    yield path, path.stat()
+                except FileNotFoundError:
+                    # A run that ends removes its partial file, any moment.
+                    continue
+
+
+def read_rows(path: Path) -> Iterator[Row | ResultsError]:
+    """Yield the rows of a result file or an archive, and what is wrong where there is none."""
+    if not path.name.endswith(ARCHIVE_SUFFIX):
+        try:
+            with opened(path) as file:
+                yield _row(file, path)
+        except ResultsError as error:
+            yield error
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                yield _member_row(archive, path, name)
+    except (OSError, zipfile.BadZipFile) as error:
+        yield ResultsError(f"{path} is truncated or damaged ({error})")
+
+
+def lookup(config: Mapping[str, Any], key: str) -> Any:
+    """Return a configuration's value of a dotted key, NaN where there is none."""
+    value: Any = config
+    for part in key.split("."):
+        value = value.get(part, np.nan) if isinstance(value, Mapping) else np.nan
+    return value
+
+
+# ---------------------------------------------------------------------------------------------------- details
+
+
+def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
+    """Yield the rows of all files below a folder, or of one file, from the index where it knows them."""
+    known = Index(root) if use_index else None
+    paths = list(run_files(root))
+    present = {path for path, _ in paths}
+    for path, stat in paths:
+        if path.name.endswith(PARTIAL_SUFFIX) and final_path(path) in present:
+            continue
+        entry = None if known is None else known.find(path, stat)
+        if entry is not None:
+            yield from (
+                Row(values | {"path": str(path / member)}, config) for member, values, config in entry
+            )
+            continue
+        fresh = list(read_rows(path))
+        if known is not None and not any(isinstance(row, ResultsError) for row in fresh):
+            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in fresh])
+        yield from fresh
+    if known is not None:
+        known.save()
+
+
+def _without_repetitions(found: list[Row]) -> list[Row]:
+    """Leave out what the same configuration's finished run makes superfluous.
+
+    Of loose files that are as good as each other all stay, of archived runs only the first, and none where
+    there is a loose one.
+    """
+    by_hash: dict[str, list[Row]] = defaultdict(list)
+    for row in found:
+        by_hash[row.values["config_hash"]].append(row)
+    kept = []
+    for same in by_hash.values():
+        best = [row for row in same if row.values["status"] == "finished"] or same
+        loose = [row for row in best if split_archive(row.path) is None]
+        kept += loose or best[:1]
+    return kept
+
+
+def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | ResultsError:
+    try:
+        with opened_image(archive.read(name), path / name) as file:
+            return _row(file, path / name)
+    except ResultsError as error:
+        return error
+    except (zipfile.BadZipFile, zlib.error) as error:
+        return ResultsError(f"{path / name} is truncated or damaged ({error})")
+
+
+def _row(file: h5py.File, path: Path) -> Row:
+    """Return the row of an open file, from its attributes alone."""
+    config = json.loads(file.attrs["config"])
+    evaluation, phases = attributes(file["evaluation"]), attributes(file["wall_time"])
+    table, best, origin = file["iterations"], file["best"].attrs, file["provenance"].attrs
+    columns = [str(name) for name in table.attrs["columns"]]
+    known = {
+        "task": config["task"]["name"],
+        "variant": str(config["variant"]),
+        "method": config["method"]["name"],
+        "seed": config["seed"],
+        "status": file.attrs["status"],
+        "message": file.attrs["message"],
+        "iterations": table[columns[0]].shape[0] if columns else 0,
+        "best_iteration": int(best["iteration"]),
+        "best_loss": float(best["loss"]),
+        "seconds": float(sum(phases.values())),
+        "config_hash": file.attrs["config_hash"],
+        "path": str(path),
+    } | {name: origin.get(attribute, np.nan) for name, attribute in _ORIGIN.items()}
+    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
+    values |= {name: value for name, value in evaluation.items() if name not in values}
+    return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -1,0 +1,257 @@
+"""The result file of a run under way: finds what an earlier process left, records, finishes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from plab.locks import Lock, acquire, lock_path
+from plab.provenance import provenance, version_changes
+from plab.results.files import opened, read, write
+from plab.results.schema import (
+    PARTIAL_SUFFIX,
+    NewerSchemaError,
+    ResultsError,
+    RunBusyError,
+    RunResult,
+    config_dict,
+    config_hash,
+    result_path,
+)
+
+__all__ = ["RunFile"]
+
+_PROBE_BYTES = 4 << 20
+"""Room demanded in the results folder before a run starts: a partial, its successor and the final file."""
+
+_log = logging.getLogger(__name__)
+
+
+class RunFile:
+    """The result file of one run while it runs: finds what an earlier process left, records, finishes.
+
+    Unless the run is complete already, it holds the run's lock until it is closed, finished or released.
+
+    Attributes:
+        path: Final file.
+        partial_path: File that carries the state of the run while it is under way.
+    """
+
+    def __init__(self, cfg: Any) -> None:
+        """Open the file of a configuration's run.
+
+        Raises:
+            RunBusyError: If somebody else computes the run.
+            NewerSchemaError: If a later plab has written a file of the run.
+            ResultsError: If the folder cannot be written or has no room, before anything is computed.
+        """
+        config = config_dict(cfg)
+        self.path = result_path(config)
+        self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
+        # Rows not yet in the table, the last one first: ``(row, (row before, ...))``. One object with
+        # the result: an interrupt may arrive between any two assignments.
+        self._state = RunResult(config, config_hash(config), provenance=provenance(config)), ()
+        self._every, self._written = config["checkpoint_seconds"], -math.inf
+        self._lock: Lock | None = None
+        _refuse_newer(self.path, self.partial_path)
+        if not config["force"] and self._is_finished():
+            if lock_path(self.path).exists() or self.partial_path.exists():
+                self._clear_up()
+            return
+        _probe(self.path.parent)
+        self._lock_and_look(config["force"])
+
+    def _lock_and_look(self, force: bool) -> None:
+        """Take the run's lock, then see what there is: whoever had it before may have changed everything."""
+        self._lock = acquire(self.path)
+        if self._lock is None:
+            raise RunBusyError(f"{self.path} is being computed by another process")
+        self._remove_temporary()
+        if not force and not self._is_finished():
+            self._take_up_earlier()
+        if self.finished:
+            self.release()
+
+    def _clear_up(self) -> None:
+        """Remove what a process left that was killed just after it had finished the run."""
+        lock = acquire(self.path)
+        # Otherwise somebody computes it again, by force.
+        if lock is not None:
+            self._remove_temporary()
+            self.partial_path.unlink(missing_ok=True)
+            lock.release(remove=True)
+
+    def _remove_temporary(self) -> None:
+        for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
+            leftover.unlink(missing_ok=True)
+
+    @property
+    def result(self) -> RunResult:
+        """What is known so far; from an earlier process where there was one."""
+        known, pending = self._state
+        rows = []
+        while pending:
+            row, pending = pending
+            rows.insert(0, row)
+        if rows:
+            table = pd.concat([known.iterations, pd.DataFrame(rows)], ignore_index=True)
+            self._state = dataclasses.replace(known, iterations=table), ()
+        return self._state[0]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run is complete, by this process or an earlier one."""
+        return self._state[0].status == "finished"
+
+    def release(self) -> None:
+        """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
+        if self._lock is not None:
+            self._lock.release(remove=self.finished)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Add the time spent inside the ``with`` block to the wall time of a phase."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spend(name, time.perf_counter() - start)
+
+    def spend(self, name: str, seconds: float) -> None:
+        """Add to the wall time of a phase."""
+        times = self._state[0].wall_time
+        times[name] = times.get(name, 0.0) + seconds
+
+    def record(
+        self, row: Mapping[str, float], resume: Mapping[str, Any], *, keep: bool = False, **changes: Any
+    ) -> None:
+        """Append a row to the iterations, and rewrite the partial file if ``checkpoint_seconds`` are over.
+
+        Args:
+            row: Column name to number; the same columns in every call.
+            resume: State from which the next iteration starts: nested dictionaries of arrays, numbers and
+                strings.
+            keep: Write the partial file in any case.
+            changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
+        """
+        known, pending = self._state
+        self._state = dataclasses.replace(known, resume=dict(resume), **changes), (dict(row), pending)
+        if keep or time.monotonic() - self._written >= self._every:
+            self._write()
+
+    def close(self, status: str, message: str) -> None:
+        """Mark an unfinished run ``failed`` or ``stopped``, keeping what it computed in the partial file."""
+        self._state = dataclasses.replace(self.result, status=status, message=message), ()
+        try:
+            self._write()
+        finally:
+            self.release()
+
+    def _write(self) -> None:
+        write(self.result, self.partial_path)
+        self._written = time.monotonic()
+
+    def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
+        """Write the final file and remove the partial one.
+
+        Args:
+            evaluation: Scalars of the final evaluation.
+            masses: Mass tensors to add, each of shape [n, n, n].
+        """
+        result = dataclasses.replace(
+            self.result,
+            status="finished",
+            message="",
+            evaluation={name: float(value) for name, value in evaluation.items()},
+            masses={**self.result.masses, **masses},
+            resume=None,
+            path=self.path,
+        )
+        write(result, self.path, compress=True)
+        self._state = result, ()
+        self.partial_path.unlink(missing_ok=True)
+        self.release()
+
+    def _is_finished(self) -> bool:
+        """Look whether there is a complete result, and take it."""
+        try:
+            earlier = read(self.path)
+        except ResultsError:
+            return False
+        if earlier.status != "finished" or earlier.config_hash != self.result.config_hash:
+            return False
+        self._state = earlier, ()
+        return True
+
+    def _take_up_earlier(self) -> None:
+        """Continue from what an earlier process left; files that cannot be used are moved aside."""
+        for path in (self.path, self.partial_path):
+            if not path.exists():
+                continue
+            try:
+                earlier = read(path)
+                if earlier.config_hash != self.result.config_hash:
+                    raise ResultsError(f"{path} belongs to another configuration")
+            except ResultsError as error:
+                _move_aside(path, error)
+                continue
+            if earlier.resume is not None:
+                self._resume(earlier)
+
+    def _resume(self, earlier: RunResult) -> None:
+        changes = version_changes(earlier.provenance, self.result.provenance)
+        if changes:
+            _log.warning("resuming %s, begun with other versions: %s", self.partial_path, ", ".join(changes))
+        first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
+        self._state = (
+            dataclasses.replace(earlier, status="running", message="", provenance=first, path=None),
+            (),
+        )
+
+
+def _move_aside(path: Path, reason: ResultsError) -> None:
+    names = (f"{path.name}.bad{number or ''}" for number in itertools.count())
+    aside = next(aside for name in names if not (aside := path.with_name(name)).exists())
+    try:
+        os.replace(path, aside)
+    except OSError as error:
+        raise ResultsError(f"{reason}, and cannot be moved: {error.strerror or error}") from error
+    _log.warning("%s; moved to %s, starting afresh", reason, aside.name)
+
+
+def _refuse_newer(*paths: Path) -> None:
+    """Raise NewerSchemaError if one of the files has been written by a later plab."""
+    for path in paths:
+        try:
+            with opened(path):
+                pass
+        except NewerSchemaError:
+            raise
+        except ResultsError:
+            # Missing or damaged: what is done about it depends on what it was.
+            pass
+
+
+def _probe(folder: Path) -> None:
+    """Check that a folder can be made and has room, by writing to it."""
+    probe = folder / f".probe-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(bytes(_PROBE_BYTES))
+    except OSError as error:
+        raise ResultsError(f"cannot write results to {folder}: {error.strerror or error}") from error
+    finally:
+        # Removing it may fail like writing it did, where the parent is a file for example.
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)

@@ -1,0 +1,161 @@
+"""What a result file holds: its parts, its columns, its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+__all__ = [
+    "ARCHIVE_SUFFIX",
+    "COLUMNS",
+    "EVALUATION",
+    "FAMILY_COLUMNS",
+    "MAY_BE_NAN",
+    "PARTIAL_SUFFIX",
+    "SCHEMA_VERSION",
+    "STATUSES",
+    "SUFFIX",
+    "NewerSchemaError",
+    "ResultsError",
+    "RunBusyError",
+    "RunResult",
+    "config_dict",
+    "config_hash",
+    "final_path",
+    "member_name",
+    "parse_member",
+    "result_path",
+]
+
+SCHEMA_VERSION = 1
+"""Version of the file layout; files of another version are not read."""
+
+STATUSES = ("running", "finished", "failed", "stopped")
+
+SUFFIX = ".h5"
+PARTIAL_SUFFIX = ".partial.h5"
+ARCHIVE_SUFFIX = ".plab.zip"
+"""Ends of the names of result files, of those of runs under way, and of archives."""
+
+_MEASURES = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
+
+COLUMNS = ("iteration", "episodes", "steps", *_MEASURES, "seconds")
+"""Columns that the iterations of every method have."""
+
+FAMILY_COLUMNS = {
+    "trajectory": ("gradient_norm",),
+    "apg": ("gradient_norm",),
+    "rl": ("train_reward", "train_score"),
+}
+"""Further columns by ``method.family``."""
+
+MAY_BE_NAN = ("train_reward", "train_score")
+"""Columns with entries for which there is no number: no episode of training had ended."""
+
+EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
+"""Scalars of the final evaluation."""
+
+_NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
+"""Configuration keys that cannot change a result, hence are left out of the hash."""
+
+
+class ResultsError(RuntimeError):
+    """A result file that cannot be read or written; the message names the file and the reason."""
+
+
+class NewerSchemaError(ResultsError):
+    """A result file of a later schema version than this plab knows: it is never moved or replaced."""
+
+
+class RunBusyError(ResultsError):
+    """A run that somebody else computes at this moment."""
+
+
+@dataclasses.dataclass
+class RunResult:
+    """Everything that a result file holds.
+
+    Attributes:
+        config: Resolved configuration, plain nested dictionaries.
+        config_hash: :func:`config_hash` of ``config``.
+        status: One of :data:`STATUSES`.
+        message: Why the run failed or stopped, one line; empty otherwise.
+        provenance: Versions, platform, commit, device, precision, seed, start time: flat scalars.
+        wall_time: Seconds spent in each phase, summed over resumptions.
+        iterations: One row per iteration, or per evaluation; the columns are listed in docs/results.md.
+        best_actions: Best actions found, in [-1, 1], shape [T, A]; None before the first iteration.
+        best_iteration: Iteration that ran them, -1 if none has.
+        best_loss: Their trajectory loss in the contact model of the rollouts.
+        evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
+        masses: Mass tensors by name (``initial``, ``final``, ``target``), each of shape [n, n, n].
+        resume: Nested state from which the run goes on: arrays, numbers, strings; None in finished files.
+        path: File this was read from.
+    """
+
+    config: dict[str, Any]
+    config_hash: str
+    status: str = "running"
+    message: str = ""
+    provenance: dict[str, Any] = dataclasses.field(default_factory=dict)
+    wall_time: dict[str, float] = dataclasses.field(default_factory=dict)
+    iterations: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    best_actions: np.ndarray | None = None
+    best_iteration: int = -1
+    best_loss: float = float("nan")
+    evaluation: dict[str, float] = dataclasses.field(default_factory=dict)
+    masses: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    resume: dict[str, Any] | None = None
+    path: Path | None = None
+
+
+def config_dict(cfg: Any) -> dict[str, Any]:
+    """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists."""
+    plain = dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)
+    return json.loads(json.dumps(plain))
+
+
+def config_hash(cfg: Any) -> str:
+    """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
+    plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
+    # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
+    plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
+    plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def result_path(cfg: Any) -> Path:
+    """Return where a run's file goes: ``results_dir/<task>-v<variant>/<method>/seed<k>-<hash8>.h5``."""
+    config = config_dict(cfg)
+    return Path(config["results_dir"]) / member_name(config, config_hash(config))
+
+
+def member_name(config: Mapping[str, Any], digest: str) -> Path:
+    """Return a run's place inside a results folder or an archive, by its configuration and its hash."""
+    folder = Path(f"{config['task']['name']}-v{config['variant']}") / config["method"]["name"]
+    return folder / f"seed{config['seed']}-{digest[:8]}{SUFFIX}"
+
+
+def final_path(partial: Path) -> Path:
+    """Return the file that takes the place of a partial one when its run ends."""
+    return partial.with_name(partial.name.removesuffix(PARTIAL_SUFFIX) + SUFFIX)
+
+
+def parse_member(path: Path) -> dict[str, str] | None:
+    """Return task, variant, method and seed that a path made by :func:`member_name` tells, None for others.
+
+    Args:
+        path: Path of a result file, or of a file beside it with the same stem.
+    """
+    found = re.fullmatch(
+        r"(?P<task>.+)-v(?P<variant>[^/]+)/(?P<method>[^/]+)/seed(?P<seed>\d+)-[0-9a-f]{8}\..+",
+        "/".join(path.parts[-3:]),
+    )
+    return None if found is None else found.groupdict()

@@ -1,0 +1,93 @@
+"""Runs that are carried out together: their configurations and files, and how each of them ended."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from plab.config_errors import ConfigError
+from plab.results import ResultsError, RunBusyError, RunFile, result_path
+from plab.scene import SceneError
+from plab.sweep.tally import Outcome
+from plab.targets import TargetError
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = [
+    "USER_ERRORS",
+    "Job",
+    "RunBusyError",
+    "RunError",
+    "TogetherError",
+    "batch_title",
+    "describe",
+    "outcome",
+    "title",
+]
+
+USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
+"""What a user has to put right: mistakes in the configuration, files that cannot be read or written."""
+
+
+class RunError(RuntimeError):
+    """A run that cannot go on; the message says in which iteration and why."""
+
+
+class TogetherError(RuntimeError):
+    """Runs that cannot be simulated together, for the reason that is the cause of this error."""
+
+
+@dataclass
+class Job:
+    """One run of a batch.
+
+    Attributes:
+        cfg: Its configuration.
+        run: Its file.
+        error: Why it broke off, if it did.
+    """
+
+    cfg: Config
+    run: RunFile
+    error: Exception | None = None
+
+    @property
+    def open(self) -> bool:
+        """Whether it has neither finished nor broken off."""
+        return self.error is None and not self.run.finished
+
+    def fail(self, error: Exception) -> None:
+        """Note why the run breaks off, also in its file, which keeps what it computed."""
+        self.error = error
+        if isinstance(error, ResultsError):
+            # The file itself is what failed: nothing more can be written to it.
+            return
+        try:
+            self.run.close("failed", str(error) if isinstance(error, RunError) else describe(error))
+        except ResultsError as another:
+            self.error = another
+
+
+def describe(error: Exception) -> str:
+    """Return an error that nobody foresaw in one line."""
+    return f"{type(error).__name__}: {error}"
+
+
+def title(cfg: Config) -> str:
+    """Return what tells a run from others, in a few words."""
+    return f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
+
+
+def batch_title(cfgs: Sequence[Config]) -> str:
+    """Return what the runs of a batch have in common, and how many they are; of one run its title."""
+    if len(cfgs) == 1:
+        return title(cfgs[0])
+    return f"{cfgs[0].task.name}, {len(cfgs)} runs"
+
+
+def outcome(cfg: Config, status: str, score: float = math.nan, message: str = "") -> Outcome:
+    """Return the outcome of a configuration's run."""
+    return Outcome(title(cfg), str(result_path(cfg)), status, score, " ".join(message.split()))

@@ -1,0 +1,83 @@
+"""Which runs are meant: the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+__all__ = ["Selection", "SelectionError", "select"]
+
+
+class SelectionError(ValueError):
+    """Words that select nothing meaningful; the message is one line that says what would do."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A choice of runs.
+
+    Attributes:
+        choices: Allowed values, as text, by name: ``task``, ``variant``, ``method``, ``seed`` and the like.
+        keys: Values that configuration keys must have, by dotted key: ``{"task.yield_stress": ["50.0"]}``.
+    """
+
+    choices: dict[str, list[str]] = field(default_factory=dict)
+    keys: dict[str, list[str]] = field(default_factory=dict)
+
+    def __call__(self, values: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+        """Return whether a run is among the chosen ones.
+
+        Args:
+            values: The run's values of the names.
+            config: Its configuration.
+        """
+        from plab.results import lookup
+
+        return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
+            any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
+        )
+
+
+def select(words: Sequence[str], names: Sequence[str]) -> Selection:
+    """Read the words of a command line.
+
+    Args:
+        words: ``name=value``, with several values as in a sweep: ``seed=0,1,2`` or ``seed=range(3)``.
+        names: Names without a dot that may be given; every dotted name is a key of the configuration.
+
+    Raises:
+        SelectionError: If a word cannot be read, or its name is none of ``names``.
+    """
+    if not words:
+        return Selection()
+    # Imported here: without words nobody should have to wait for Hydra.
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    choices: dict[str, list[str]] = {}
+    keys: dict[str, list[str]] = {}
+    for word in words:
+        try:
+            (override,) = OverridesParser.create().parse_overrides([word])
+        except HydraException:
+            raise SelectionError(f"cannot read '{word}': write name=value or name=value,value") from None
+        name = override.key_or_group
+        if "." not in name and name not in names:
+            raise SelectionError(
+                f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
+            )
+        sweep = override.is_sweep_override()
+        texts = list(override.sweep_string_iterator()) if sweep else [str(override.value())]
+        (keys if "." in name else choices)[name] = texts
+    return Selection(choices, keys)
+
+
+def _same(value: Any, text: str) -> bool:
+    """Return whether a configuration's value is what the text says: numbers by value, all else by letter."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value).lower() == text.lower()
+    try:
+        return float(text) == value
+    except ValueError:
+        return False

@@ -1,0 +1,82 @@
+"""What goes into the simulator and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["Measures", "Rollout", "State", "rest_state"]
+
+
+@dataclass(frozen=True)
+class State:
+    """Particles and manipulators of all environments, float64.
+
+    Attributes:
+        x: Particle positions [domain units], shape [batch, particle, 3].
+        v: Particle velocities, shape [batch, particle, 3].
+        C: APIC velocity gradients, shape [batch, particle, 3, 3].
+        F: Deformation gradients, shape [batch, particle, 3, 3].
+        poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, manipulator, 8].
+    """
+
+    x: np.ndarray
+    v: np.ndarray
+    C: np.ndarray
+    F: np.ndarray
+    poses: np.ndarray
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What a state is judged by.
+
+    Attributes:
+        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
+            their weight is.
+        iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
+            NaN before :meth:`Simulator.set_target`.
+    """
+
+    terms: np.ndarray | torch.Tensor
+    iou: np.ndarray | torch.Tensor
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What a rollout of T environment steps gives.
+
+    Attributes:
+        initial_terms: Unweighted loss terms (density, SDF, contact) of the initial state, shape [batch, 3].
+        step_terms: The same after each environment step, shape [batch, T, 3].
+        initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
+        step_iou: The same after each environment step, shape [batch, T].
+        gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape
+            [batch, T, action], or None if it was not asked for.
+        failures: Environments whose state, loss or gradient stopped being finite, and when and why; their
+            numbers mean nothing, those of the others are what they would be without them.
+    """
+
+    initial_terms: np.ndarray
+    step_terms: np.ndarray
+    initial_iou: np.ndarray
+    step_iou: np.ndarray
+    gradient: np.ndarray | torch.Tensor | None
+    failures: dict[int, str] = field(default_factory=dict)
+
+
+def rest_state(x: np.ndarray, poses: np.ndarray) -> State:
+    """Return particles at rest and without strain.
+
+    Args:
+        x: Positions [domain units], shape [batch, particle, 3].
+        poses: Poses as in :class:`State`.
+    """
+    shape = (*x.shape, 3)
+    identity = np.broadcast_to(np.eye(3), shape)
+    return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)

@@ -1,0 +1,200 @@
+"""The states that a gradient needs, kept or computed again, and the way back through them."""
+
+from __future__ import annotations
+
+import math
+
+import taichi as ti
+
+from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
+from plab.sim.particles import Particles
+from plab.sim.storage import MEASURES
+
+__all__ = ["Tape"]
+
+
+class Tape:
+    """Runs environment steps forward and back.
+
+    The steps are divided into segments. Of each but the last only the first state is kept on the way forward;
+    its other states are computed again on the way back, in the same order of the particles.
+
+    Attributes:
+        bar: Adjoint of the initial state after :meth:`backward`, in the initial order; None before the first.
+    """
+
+    def __init__(self, particles: Particles) -> None:
+        """Allocate nothing yet.
+
+        Args:
+            particles: The current state, from which :meth:`forward` starts.
+        """
+        self._particles = particles
+        self._engine = particles.engine
+        self._history: ti.Ndarray | None = None
+        self._checkpoints: ti.Ndarray | None = None
+        self._moves: ti.Ndarray | None = None
+        self._length = 0
+        self.bar: ti.Ndarray | None = None
+        self._spare_bar: ti.Ndarray | None = None
+        self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self._engine.batch)
+
+    # -- memory -------------------------------------------------------------------------------------
+
+    @property
+    def _slots_per_step(self) -> int:
+        """Time slots of an environment step in the history. Where particles are put into another order, a
+        step's start is kept in its own order and in that of the step before."""
+        return self._engine.substeps + (1 if self._engine.sorts else 0)
+
+    def _first_slot(self, t: int) -> int:
+        """Slot of the history from which step t starts."""
+        return t % self._length * self._slots_per_step + (1 if self._engine.sorts else 0)
+
+    def plan(self, steps: int, memory_mb: float) -> int:
+        """Environment steps per segment for a gradient over ``steps`` of them.
+
+        Args:
+            steps: Environment steps T.
+            memory_mb: Budget for everything that the simulator holds [MB].
+
+        Returns:
+            The most that fit into the budget, or fewer if as many segments do; all have about this length.
+
+        Raises:
+            MemoryError: If even one step per segment does not fit.
+        """
+        slot_bytes, slots_per_step = self._particles.slot_bytes, self._slots_per_step
+        self._engine.allocate_adjoint()
+        # The initial state is one more of the current one's size.
+        fixed = held_bytes(self._engine, self._particles, self._particles.order) + slot_bytes
+        if self._engine.sorts:
+            # The orders of all steps, and the adjoint's other half.
+            fixed += 4 * steps * self._particles.order.places + slot_bytes
+
+        def cost(length: int) -> int:
+            return kept_states(steps, slots_per_step, length) * slot_bytes + fixed
+
+        slots = ENTRIES_MAX // self._particles.slot_entries
+        fitting = [
+            length
+            for length in range(1, steps + 1)
+            if cost(length) <= memory_mb * 1e6
+            and max(length * slots_per_step + 1, -(-steps // length)) <= slots
+        ]
+        if not fitting:
+            need = math.ceil(min(cost(length) for length in range(1, steps + 1)) / 1e6)
+            raise MemoryError(
+                f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
+                f"set sim.memory_mb={need} or more"
+            )
+        # Fewest recomputed steps first: as few segments as possible, of even length.
+        segments = -(-steps // max(fitting))
+        return -(-steps // segments)
+
+    def _allocate(self, steps: int) -> None:
+        slots, segments = self._length * self._slots_per_step + 1, -(-steps // self._length)
+        per_slot = self._particles.current.shape[0]
+        if self._history is None or self._history.shape[0] < slots * per_slot:
+            self._history = None
+            self._history = self._particles.array(slots)
+        if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * per_slot):
+            self._checkpoints = None
+            self._checkpoints = self._particles.array(segments)
+        if self._engine.sorts:
+            self._moves = self._particles.order.allocate(steps)
+        if self.bar is None:
+            self.bar = self._particles.array(1)
+            self._spare_bar = self._particles.array(1) if self._engine.sorts else None
+
+    # -- forward and back ---------------------------------------------------------------------------
+
+    def forward(
+        self, actions: ti.Ndarray, poses: ti.Ndarray, terms: ti.Ndarray, steps: int, length: int | None
+    ) -> None:
+        """Run all steps from the current state and leave the last one there.
+
+        Args:
+            actions: Actions of all steps.
+            poses: History of the manipulators' poses; entry 0 is set.
+            terms: Measures after each step are written to it, from the second entry.
+            steps: Environment steps T.
+            length: What :meth:`plan` has returned, or None to keep nothing.
+        """
+        particles = self._particles
+        self._length = length or steps
+        if length is not None:
+            self._allocate(steps)
+        last = (steps - 1) // self._length if length is not None else -1
+        for t in range(steps):
+            k, begins = t // self._length, t % self._length == 0
+            if begins and length is not None and steps > length:
+                self._engine.copy_slot(particles.current, 0, self._checkpoints, k)
+            after = (t + 1) * self._engine.batch * MEASURES
+            if k == last:
+                if begins:
+                    self._engine.copy_slot(particles.current, 0, self._history, 0)
+                self._keep_step(t, actions, poses, known=False)
+                end = self._first_slot(t) + self._engine.substeps
+                particles.losses(terms, after, self._history, end)
+            else:
+                moves = self._moves if length is not None else None
+                particles.step(poses, actions, t, entries=(t, t + 1), moves=moves)
+                particles.losses(terms, after)
+        if length is not None:
+            end = self._first_slot(steps - 1) + self._engine.substeps
+            self._engine.copy_slot(self._history, end, particles.current, 0)
+
+    def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
+        """Run step t within the history; ``known`` tells that its order of the particles is."""
+        slot = self._first_slot(t)
+        if self._engine.sorts:
+            if not known:
+                stamp = self._particles.take_stamps(1)
+                self._particles.order.find(self._history, slot - 1, t, stamp, self._moves)
+            self._engine.move(self._history, slot - 1, self._history, slot, self._moves, t)
+        self._particles.advance(self._history, slot, 1, poses, actions, t, (t, t + 1))
+
+    def backward(self, actions: ti.Ndarray, poses: ti.Ndarray, steps: int, contact_free: int) -> ti.Ndarray:
+        """Go back through the steps that :meth:`forward` has run with a length.
+
+        Args:
+            actions: The same actions.
+            poses: The same history.
+            steps: Environment steps T.
+            contact_free: Steps at the start through which particles' adjoints need not be followed.
+
+        Returns:
+            Adjoint of the actions, laid out like these.
+        """
+        engine = self._engine
+        actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+        for array in (actions_bar, self.bar, engine.pose_bar, engine.frame_bar, engine.material_bar):
+            array.fill(0)
+        last = (steps - 1) // self._length
+        for t in reversed(range(steps)):
+            k = t // self._length
+            if k < last and (t + 1) % self._length == 0:
+                self._recompute(k, actions, poses)
+            engine.step_adjoint(
+                self._history,
+                self.bar,
+                poses,
+                actions,
+                actions_bar,
+                self._scratch_terms,
+                self._first_slot(t),
+                t,
+                self._particles.take_stamps(engine.substeps + 1),
+                int(t >= contact_free),
+            )
+            if engine.sorts:
+                engine.move_back(self.bar, self._spare_bar, self._moves, t)
+                self.bar, self._spare_bar = self._spare_bar, self.bar
+        return actions_bar
+
+    def _recompute(self, k: int, actions: ti.Ndarray, poses: ti.Ndarray) -> None:
+        """Fill the history with the states of segment k."""
+        self._engine.copy_slot(self._checkpoints, k, self._history, 0)
+        for t in range(k * self._length, (k + 1) * self._length):
+            self._keep_step(t, actions, poses, known=True)

@@ -1,0 +1,375 @@
+"""What is done, running, failed and missing: ``python -m plab.status [results] [task=... seed=...]``.
+
+The runs that are asked for are all combinations of task, variant, method and seed. The words choose them as
+those of a sweep do; what they leave open is the suite's tasks and variants, and the methods and seeds that
+the results have.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from plab.locks import held
+from plab.results import ResultsError, Row, lookup, rows
+from plab.results.files import attributes, opened, split_archive
+from plab.results.schema import parse_member
+from plab.selection import Selection, SelectionError, select
+from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
+
+__all__ = ["STATES", "Group", "Run", "Survey", "main", "survey"]
+
+STATES = ("done", "running", "interrupted", "failed", "missing")
+"""What a run can be, best first; ``interrupted`` goes on when its command is given again."""
+
+NAMES = ("task", "variant", "method", "seed")
+
+_RECENT_ROWS = 20
+"""Rows of a run under way that its speed is taken from."""
+
+
+@dataclass
+class Run:
+    """One of the runs that are asked for.
+
+    Attributes:
+        task: Name of the task.
+        variant: Name of the variant.
+        method: Name of the method.
+        seed: Seed of the method.
+        state: One of :data:`STATES`.
+        message: Why it failed; empty otherwise.
+        done: Iterations, or episodes, done.
+        total: Iterations, or episodes, in all; 0 where it is not known.
+        rate: Iterations, or episodes, per second [1/s], of a run under way; None if it is not known.
+        seconds: Wall time so far [s].
+        left: Time that it still needs [s]; None if it is not known.
+        path: Its file; empty for a missing run.
+    """
+
+    task: str
+    variant: str
+    method: str
+    seed: str
+    state: str = "missing"
+    message: str = ""
+    done: int = 0
+    total: int = 0
+    rate: float | None = None
+    seconds: float = 0.0
+    left: float | None = None
+    path: str = ""
+
+
+@dataclass
+class Group:
+    """The runs of a task and a method.
+
+    Attributes:
+        task: Name of the task, or of all.
+        method: Name of the method.
+        expected: Number of runs that are asked for.
+        counts: How many of them are in each of :data:`STATES`.
+        mean_seconds: Mean wall time of those that are done [s]; None if none is.
+        rate: Mean rate of those that are running [1/s]; None if none is.
+        left: Time that one worker needs for what is not done [s]; None if it is not known.
+    """
+
+    task: str
+    method: str
+    expected: int
+    counts: dict[str, int]
+    mean_seconds: float | None
+    rate: float | None
+    left: float | None
+
+
+@dataclass
+class Survey:
+    """All that is known about the runs that are asked for.
+
+    Attributes:
+        runs: Every one of them.
+        groups: The same by task and method.
+        others: Number of further runs in the results: not asked for, or of other settings.
+        unreadable: What could not be read.
+    """
+
+    runs: list[Run]
+    groups: list[Group]
+    others: int
+    unreadable: list[str]
+
+    @property
+    def workers(self) -> int:
+        """Number of runs under way."""
+        return sum(run.state == "running" for run in self.runs)
+
+    @property
+    def eta(self) -> float | None:
+        """Time until all is done [s], if as many runs stay under way as now; None if it is not known."""
+        left = [group.left for group in self.groups]
+        if not self.workers or None in left:
+            return None
+        # The longest of the running ones cannot be shared.
+        longest = max((run.left or 0.0 for run in self.runs if run.state == "running"), default=0.0)
+        return max(sum(left) / self.workers, longest)
+
+
+def survey(source: str | Path, chosen: Selection) -> Survey:
+    """Find out what has become of the runs that are asked for.
+
+    Args:
+        source: Folder of results, or archive.
+        chosen: Which runs; tasks and variants that it leaves open are the suite's, methods and seeds those of
+            the results, or the paper's if there are none.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``.
+    """
+    found, unreadable = rows(source)
+    fitting = [row for row in found if chosen(row.values, row.config)]
+    runs = {key: Run(*key) for key in _expected(fitting, chosen)}
+    others = 0
+    for row in fitting:
+        run = runs.get(_key(row))
+        # Of several settings of the same run the best one counts.
+        others += run is None or run.state != "missing"
+        if run is not None:
+            _take(run, row)
+    for run in _starting(Path(source), runs):
+        run.state = "running"
+    means = _mean_seconds(runs.values())
+    for run in runs.values():
+        _estimate(run, means.get((run.task, run.method)))
+    groups = [
+        _group(task, method, runs.values(), means) for task, method in dict.fromkeys(_pairs(runs.values()))
+    ]
+    return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable])
+
+
+# --------------------------------------------------------------------------------------------------- counting
+
+
+def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[tuple[str, ...]]:
+    present = {name: {str(row.values[name]) for row in found} for name in ("method", "seed")}
+    methods = [m for m in PAPER_METHODS if m in present["method"]] + sorted(
+        present["method"] - {*PAPER_METHODS}
+    )
+    open_choices = {
+        "task": suite_tasks(),
+        "variant": list(SUITE_VARIANTS),
+        "method": methods or list(PAPER_METHODS),
+        "seed": sorted(present["seed"], key=int) or list(PAPER_SEEDS),
+    }
+    return itertools.product(*(chosen.choices.get(name, open_choices[name]) for name in NAMES))
+
+
+def _key(row: Row) -> tuple[str, ...]:
+    return tuple(str(row.values[name]) for name in NAMES)
+
+
+def _state(row: Row) -> str:
+    if row.values["status"] == "finished":
+        return "done"
+    if split_archive(row.path) is None and held(row.path):
+        return "running"
+    return "failed" if row.values["status"] == "failed" else "interrupted"
+
+
+def _take(run: Run, row: Row) -> None:
+    """Describe a run by a row of the results, unless a better one of the same run has come before."""
+    state = _state(row)
+    if STATES.index(state) >= STATES.index(run.state):
+        return
+    run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
+    run.rate = run.left = None
+    run.message = row.values["message"] if state == "failed" else ""
+    total = lookup(row.config, "method.iterations")
+    run.total = int(total if total == total else lookup(row.config, "method.episodes"))
+    run.done = run.total if state == "done" else int(row.values["iterations"])
+    if state == "running":
+        _measure(run)
+
+
+def _starting(source: Path, runs: dict[tuple[str, ...], Run]) -> Iterable[Run]:
+    """Yield missing runs that somebody has begun: there is a lock, but no file yet."""
+    if not source.is_dir():
+        return
+    for lock in source.rglob("*.lock"):
+        names = parse_member(lock)
+        run = None if names is None else runs.get(tuple(names[name] for name in NAMES))
+        if run is not None and run.state not in ("done", "running") and held(lock.with_suffix(".h5")):
+            yield run
+
+
+# -------------------------------------------------------------------------------------------------- estimates
+
+
+def _measure(run: Run) -> None:
+    """Take speed and rest of a run under way from its latest rows."""
+    try:
+        with opened(Path(run.path)) as file:
+            table = file["iterations"]
+            seconds = table["seconds"][()]
+            in_episodes = "train_reward" in table
+            done = table["episodes"][()] if in_episodes else range(1, len(seconds) + 1)
+            written = Path(run.path).stat().st_mtime
+            run.seconds = float(sum(attributes(file["wall_time"]).values()))
+    except (ResultsError, OSError, KeyError):
+        # It may just have ended, and its partial file be gone.
+        return
+    if len(seconds) == 0:
+        return
+    run.done = int(done[-1])
+    # The first row of a process compiles the kernels.
+    count = min(_RECENT_ROWS, len(seconds) - 1)
+    if count == 0 or run.done <= int(done[-1 - count]):
+        return
+    run.rate = (run.done - int(done[-1 - count])) / max(float(seconds[-count:].sum()), 1e-9)
+    since = max(time.time() - written, 0.0)
+    run.left = max((run.total - run.done) / run.rate - since, 0.0)
+
+
+def _mean_seconds(runs: Iterable[Run]) -> dict[tuple[str, str], float]:
+    """Return the mean wall time [s] of the runs that are done, by task and method."""
+    times: dict[tuple[str, str], list[float]] = {}
+    for run in runs:
+        if run.state == "done":
+            times.setdefault((run.task, run.method), []).append(run.seconds)
+    return {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
+
+
+def _estimate(run: Run, mean: float | None) -> None:
+    """Say how long a run that is not done will take, if its own speed has not said so."""
+    if run.state == "done":
+        run.left = 0.0
+    elif run.left is None and mean is not None:
+        share = run.done / run.total if run.total else 0.0
+        run.left = mean * max(1.0 - share, 0.0)
+
+
+def _pairs(runs: Iterable[Run]) -> Iterable[tuple[str, str]]:
+    return ((run.task, run.method) for run in runs)
+
+
+def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:
+    own = [run for run in runs if (run.task, run.method) == (task, method)]
+    counts = Counter(run.state for run in own)
+    rates = [run.rate for run in own if run.rate is not None]
+    left = [run.left for run in own]
+    return Group(
+        task,
+        method,
+        len(own),
+        {state: counts[state] for state in STATES},
+        means.get((task, method)),
+        sum(rates) / len(rates) if rates else None,
+        None if None in left else sum(left),
+    )
+
+
+# ----------------------------------------------------------------------------------------------------- output
+
+
+def duration(seconds: float | None) -> str:
+    """Write a time for people: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
+    if seconds is None:
+        return "?"
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 100:
+        return f"{minutes} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d {hours % 24} h"
+
+
+def _show(found: Survey) -> None:
+    # Imported here: scripts that read --json need no tables.
+    from rich.console import Console
+    from rich.table import Table
+
+    # Not narrower than the table where the output is no terminal.
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    table = Table("task", "method")
+    for title in ("done", *STATES[1:], "mean time", "rate", "time left"):
+        table.add_column(title, justify="right")
+    for group in found.groups:
+        counts = [str(group.counts[state] or "") for state in STATES[1:]]
+        rate = "" if group.rate is None else f"{group.rate:.3g}/s"
+        mean = "" if group.mean_seconds is None else duration(group.mean_seconds)
+        left = "" if group.left == 0 else duration(group.left)
+        done = f"{group.counts['done']}/{group.expected}"
+        table.add_row(group.task, group.method, done, *counts, mean, rate, left)
+    console.print(table)
+    for run in found.runs:
+        name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
+        if run.state == "running":
+            progress = f"{run.done}/{run.total}, {duration(run.left)} left" if run.total else "starting"
+            console.print(f"running: {name}: {progress}", highlight=False)
+        if run.state == "failed":
+            console.print(f"[red]failed[/]: {name}: {run.message}", highlight=False)
+    totals = Counter(run.state for run in found.runs)
+    counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
+    console.print(f"{len(found.runs)} runs: {counts}", highlight=False)
+    if found.workers:
+        console.print(f"all done in {duration(found.eta)}, with {found.workers} at a time", highlight=False)
+    if found.others:
+        text = "further run(s) in the results, of other names or other settings"
+        console.print(f"{found.others} {text}", highlight=False)
+    for error in found.unreadable:
+        console.print(f"left out: {error}", highlight=False)
+
+
+def _json(found: Survey) -> dict[str, Any]:
+    return asdict(found) | {"workers": found.workers, "eta": found.eta}
+
+
+def _csv(found: Survey) -> None:
+    columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
+    writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
+    writer.writeheader()
+    for group in found.groups:
+        values = asdict(group)
+        writer.writerow(values.pop("counts") | values)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
+    what = "folder of results or archive (default: results), and runs: task=Rope,Move variant=1 seed=0,1,2"
+    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print everything, for scripts")
+    form.add_argument("--csv", action="store_true", help="print the table, for scripts")
+    options = parser.parse_intermixed_args(argv)
+    words = [argument for argument in options.arguments if "=" in argument]
+    sources = [argument for argument in options.arguments if "=" not in argument] or ["results"]
+    try:
+        if len(sources) > 1:
+            raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
+        found = survey(sources[0], select(words, NAMES))
+    except (ResultsError, SelectionError) as error:
+        print(f"plab: {error}", file=sys.stderr)
+        return 2
+    if options.json:
+        print(json.dumps(_json(found), indent=1))
+    elif options.csv:
+        _csv(found)
+    else:
+        _show(found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""Carrying out a sweep: what is left to do, who does it, and how each run ended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from hydra.core.hydra_config import HydraConfig
+
+from plab import runners
+from plab.locks import held, lock_path
+from plab.results import ResultsError, RunFile, read, result_path
+from plab.runners.jobs import outcome
+from plab.sweep.plan import plan
+from plab.sweep.tally import Outcome
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from plab.config import Config
+
+__all__ = ["BatchTask", "Carrier", "carry_here", "look_up", "run_sweep"]
+
+Carrier = Callable[[list[list["Config"]], Callable[[], str]], Iterator[Outcome]]
+"""Carries out batches: takes them and a function that says how far the sweep has come, yields outcomes."""
+
+
+def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -> Iterator[Outcome]:
+    """Carry out the runs of a sweep that are not finished, and yield how each ended.
+
+    Runs that another process computes are left to it. Should it end before they do, they are taken up here.
+
+    Args:
+        cfgs: The composed and checked configurations.
+        carry: Who computes.
+        size: Runs of a batch, at most; as many as fit the memory if None.
+    """
+    # The same run given twice is one run.
+    wanted = {result_path(cfg): cfg for cfg in cfgs}
+    ended: dict[str, Outcome] = {}
+    todo = []
+    for cfg in wanted.values():
+        done = None if cfg.force else _finished_before(cfg)
+        if done is None:
+            todo.append(cfg)
+        else:
+            ended[done.path] = done
+            yield done
+    if ended:
+        print(f"{len(ended)} of {len(wanted)} runs finished before", flush=True)
+
+    def progress() -> str:
+        return f"[{len(ended)}/{len(wanted)} runs] "
+
+    while todo:
+        away = []
+        for one in carry(plan(todo, size), progress):
+            if one.status == "elsewhere":
+                away.append(one)
+            else:
+                ended[one.path] = one
+                yield one
+        by_path = {str(result_path(cfg)): cfg for cfg in todo}
+        for one in away:
+            if held(one.path):
+                yield one
+        todo = [by_path[one.path] for one in away if not held(one.path)]
+
+
+def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
+    """Carry out batches in this process, one after the other."""
+    for batch in batches:
+        yield from runners.run_batch(batch, progress())
+
+
+class BatchTask:
+    """What a job of another launcher does: its number's batch, or, of a single run, the batch of that."""
+
+    def __init__(self, batches: Sequence[Sequence[Config]]) -> None:
+        self._batches = batches
+
+    def __call__(self, _composed: DictConfig) -> list[Outcome]:
+        """Carry out the batch of Hydra's job number; called in the job's process."""
+        number = HydraConfig.get().job.num
+        note = f"[batch {number + 1}/{len(self._batches)}] " if len(self._batches) > 1 else ""
+        return runners.run_batch(self._batches[number], note)
+
+
+def look_up(cfg: Config) -> Outcome:
+    """Say from its files how a run ended whose process cannot say it any more."""
+    path = result_path(cfg)
+    if (done := _finished_before(cfg)) is not None:
+        return outcome(cfg, "finished", done.score)
+    if held(path):
+        return outcome(cfg, "elsewhere", message=f"{path} is being computed by another process")
+    try:
+        left = read(path.with_suffix(".partial.h5"))
+    except ResultsError:
+        return outcome(cfg, "lost", message="its process ended before it had a result")
+    if left.status == "failed":
+        return outcome(cfg, "failed", message=left.message)
+    return outcome(cfg, "lost", message=f"its process ended after {len(left.iterations)} iterations")
+
+
+def _finished_before(cfg: Config) -> Outcome | None:
+    """Return the outcome of a run whose result is there."""
+    path = result_path(cfg)
+    try:
+        # Where there is something left of a process that was killed, RunFile clears it up.
+        result = RunFile(cfg).result if path.exists() and lock_path(path).exists() else read(path)
+    except ResultsError:
+        return None
+    if result.status != "finished":
+        return None
+    return outcome(cfg, "before", result.evaluation["score"])

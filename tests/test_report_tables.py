@@ -1,0 +1,375 @@
+"""The paper's tables from results: numbers, intervals, what is missing, files."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+import synthetic
+from plab.report.__main__ import main, write_tables
+from plab.report.collect import NAMES, MixedRunsError, collect
+from plab.report.hyperparameters import hyperparameters
+from plab.report.reference import paper_table
+from plab.report.statistics import Summary, stratified_difference, summarise
+from plab.report.table import Table, number, write_table
+from plab.report.tables import iou_per_configuration, iou_per_task, solvability
+from plab.report.times import timing
+from plab.results import pack
+from plab.selection import select
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def score(task: str, variant: str, method: str, seed: int) -> float:
+    """Return a score that can be computed by head: 0.1 per variant, 0.01 per seed, a little per method."""
+    lead = {"adam": 0.05, "gd": 0.0, "adam_h": 0.02, "ppo": 0.3}[method]
+    return 0.1 * int(variant) + 0.01 * seed + lead
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All gradient runs of Rope but one, two runs of PPO, one unfinished, one of another variant."""
+    results = tmp_path_factory.mktemp("results")
+    for method in ("adam", "gd", "adam_h"):
+        for variant in "12345":
+            for seed in range(3):
+                if (method, variant, seed) != ("gd", "5", 2):
+                    which = {"task": "Rope", "variant": variant, "method": method, "seed": seed}
+                    synthetic.save(synthetic.run(results, score=score(**which), **which))
+    for variant in "12":
+        which = {"task": "Move", "variant": variant, "method": "ppo", "seed": 0}
+        synthetic.save(synthetic.run(results, score=score(**which), **which))
+    begun = synthetic.run(results, variant="5", method="gd", seed=2)
+    begun.status, begun.evaluation = "stopped", {}
+    synthetic.save(begun)
+    synthetic.save(synthetic.run(results, variant="random3"))
+    return results
+
+
+def gather(folder: Path, *words: str):
+    return collect(folder, select(words, NAMES))
+
+
+def by_form(tables: list[Table]) -> dict[str, Table]:
+    return {table.form: table for table in tables}
+
+
+# ------------------------------------------------------------------------------------------------ the paper's
+
+
+def test_the_papers_two_tables_agree_with_population_standard_deviations() -> None:
+    tasks = paper_table("iou_per_task").set_index(["task", "method"])
+    groups = paper_table("iou_per_configuration").groupby(["task", "method"])
+    mean = groups["iou_mean"].mean()
+    std = np.sqrt(groups["iou_mean"].var(ddof=0) + groups["iou_std"].agg(lambda s: (s**2).mean()))
+    assert len(mean) == len(tasks) == 60
+    # Both are rounded to two decimals.
+    assert np.abs(mean - tasks["iou_mean"]).max() < 0.0101
+    assert np.abs(std - tasks["iou_std"]).max() < 0.0101
+
+
+def test_paper_form_has_the_papers_numbers_and_bold(folder: Path) -> None:
+    table = by_form(iou_per_task(gather(folder)))["paper"]
+    assert table.cells.shape == (10, 7)
+    rope = table.cells.set_index("task").loc["Rope"]
+    assert rope["Adam"] == "0.59 ± 0.13" and rope["PPO"] == "0.38 ± 0.19"
+    bold = pd.DataFrame(table.bold, index=table.cells["task"], columns=table.cells.columns)
+    assert bold.loc["Move"].to_list() == [False, False, False, True, True, False, False]
+    assert bold.loc["Torus", ["SAC", "GD"]].all() and bold.loc["Torus"].sum() == 2
+    # Nobody is best where all have nothing: then all are.
+    assert bold.loc["Assembly", "PPO"] and not bold.loc["Assembly", "SAC"]
+
+
+# ----------------------------------------------------------------------------------------------------- ours
+
+
+def test_means_and_spreads_over_variants_and_seeds(folder: Path) -> None:
+    table = by_form(iou_per_task(gather(folder)))["ours"]
+    expected = np.array([score("Rope", v, "adam", s) for v in "12345" for s in range(3)])
+    row = table.data.set_index(["task", "method"]).loc[("Rope", "adam")]
+    assert row["mean"] == pytest.approx(expected.mean()) and row["std"] == pytest.approx(expected.std())
+    assert (row["runs"], row["expected"]) == (15, 15)
+    cells = table.cells.set_index("task")
+    assert cells.loc["Rope", "Adam"] == f"{expected.mean():.2f} ± {expected.std():.2f}"
+
+
+def test_incomplete_cells_say_how_many_runs_they_hold_and_nobody_is_bold(folder: Path) -> None:
+    table = by_form(iou_per_task(gather(folder)))["ours"]
+    cells = table.cells.set_index("task")
+    assert cells.loc["Rope", "GD"].endswith("(14/15)")
+    assert cells.loc["Move", "PPO"] == "0.45 ± 0.05 (2/15)"
+    assert cells.loc["Move", "SAC"] == "0/15"
+    assert not table.bold.any()
+    complete = by_form(iou_per_task(gather(folder, "variant=1,2,3,4")))["ours"]
+    bold = pd.DataFrame(complete.bold, index=complete.cells["task"], columns=complete.cells.columns)
+    assert bold.loc["Rope"].to_list() == [False, False, False, False, True, False, False]
+
+
+def test_configurations_have_a_row_each(folder: Path) -> None:
+    tables = by_form(iou_per_configuration(gather(folder)))
+    assert tables["ours"].cells.shape == (50, 8) and len(tables["comparison"].cells) == 300
+    row = tables["ours"].data.set_index(["task", "variant", "method"]).loc[("Rope", "3", "adam_h")]
+    assert row["mean"] == pytest.approx(0.33) and row["runs"] == 3
+    single = tables["ours"].cells.set_index(["task", "variant"]).loc[("Move", "1"), "PPO"]
+    assert single == "0.40 (1/3)"
+
+
+def test_unfinished_and_other_runs_are_counted_not_used(folder: Path) -> None:
+    runs = gather(folder)
+    assert (runs.unfinished, runs.others) == (1, 1)
+    assert len(runs.table) == 3 * 15 - 1 + 2
+
+
+def test_archive_gives_the_same_digest_and_tables(folder: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "all.plab.zip"
+    pack(folder, archive)
+    loose, packed = gather(folder), gather(archive)
+    assert loose.digest == packed.digest
+    for one, other in zip(iou_per_task(loose), iou_per_task(packed), strict=True):
+        pd.testing.assert_frame_equal(one.data, other.data)
+    assert gather(folder, "task=Move").digest != loose.digest
+
+
+# ------------------------------------------------------------------------------------------------- comparison
+
+
+def test_difference_has_welchs_interval_in_a_single_stratum() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(0.5, 0.1, 7), rng.normal(0.2, 0.3, 4)
+    found = stratified_difference([summarise(a)], [summarise(b)])
+    expected = stats.ttest_ind(a, b, equal_var=False).confidence_interval(0.95)
+    assert found.value == pytest.approx(a.mean() - b.mean())
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+
+
+def test_strata_take_the_variance_between_variants_out() -> None:
+    ours = [Summary(mean, 0.01, 3) for mean in (0.1, 0.5, 0.9)]
+    theirs = [Summary(mean - 0.05, 0.01, 3) for mean in (0.1, 0.5, 0.9)]
+    found = stratified_difference(ours, theirs)
+    assert found.value == pytest.approx(0.05) and 0.02 < found.low < found.high < 0.08
+
+
+def test_interval_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(2000):
+        ours = [summarise(rng.normal(mean + 0.1, 0.1, 3)) for mean in (0.0, 0.5, 2.0, 3.0, 4.0)]
+        theirs = [summarise(rng.normal(mean, 0.2, 3)) for mean in (0.0, 0.5, 2.0, 3.0, 4.0)]
+        found = stratified_difference(ours, theirs)
+        hits += found.low <= 0.1 <= found.high
+    assert 0.93 < hits / 2000 < 0.975
+
+
+def test_too_few_runs_give_no_interval() -> None:
+    found = stratified_difference([Summary(0.5, 0.0, 1), Summary(0.2, 0.1, 3)], [Summary(0.4, 0.1, 3)] * 2)
+    assert found.value == pytest.approx(-0.05) and np.isnan(found.low)
+    nothing = stratified_difference([summarise([])], [Summary(0.4, 0.1, 3)])
+    assert np.isnan(nothing.value)
+
+
+def test_difference_is_over_the_variants_that_both_have(folder: Path) -> None:
+    data = by_form(iou_per_task(gather(folder)))["comparison"].data.set_index(["task", "method"])
+    # The paper's PPO on Move: 0.72 and 0.60 in variants 1 and 2.
+    row = data.loc[("Move", "ppo")]
+    assert row["difference"] == pytest.approx((0.4 - 0.72 + 0.5 - 0.60) / 2)
+    assert np.isnan(row["low"])
+    row = data.loc[("Rope", "adam")]
+    assert row["low"] < row["difference"] < row["high"]
+    assert row["difference"] == pytest.approx(row["mean"] - np.mean([0.66, 0.71, 0.52, 0.37, 0.70]))
+
+
+# --------------------------------------------------------------------------------------------------- settings
+
+
+def test_mixed_settings_are_refused_with_advice(folder: Path, tmp_path: Path) -> None:
+    for scale in (0.5, 1.0):
+        other = synthetic.config(tmp_path, seed=int(scale))
+        other["sim"]["particles_scale"] = scale
+        synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
+    with pytest.raises(MixedRunsError, match=r"Rope adam differ in sim\.particles_scale.*choose one"):
+        gather(tmp_path)
+    runs = gather(tmp_path, "sim.particles_scale=0.5")
+    assert len(runs.table) == 1
+    assert runs.unusual == {"method.iterations": [synthetic.ROWS], "sim.particles_scale": [0.5]}
+    note = by_form(iou_per_task(runs))["ours"].notes[-1]
+    assert "sim.particles_scale = 0.5" in note
+
+
+def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
+    for seed, stress in enumerate((50.0, 10.0)):
+        other = synthetic.config(tmp_path, seed=seed)
+        other["task"]["yield_stress"] = stress
+        synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
+    with pytest.raises(MixedRunsError, match=r"task\.yield_stress, which is .* and "):
+        gather(tmp_path)
+    assert gather(tmp_path, "task.yield_stress=10").unusual["task.yield_stress"] == [10.0]
+
+
+def test_two_runs_of_one_seed_are_refused(tmp_path: Path) -> None:
+    for device in ("cpu", "cuda"):
+        other = synthetic.config(tmp_path)
+        other["sim"]["device"] = device
+        synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
+    with pytest.raises(MixedRunsError, match=r"have the same seed: choose one by sim\.device="):
+        gather(tmp_path)
+    assert len(gather(tmp_path, "sim.device=cuda").table) == 1
+
+
+# ------------------------------------------------------------------------------------------------------ times
+
+
+def test_times_are_per_environment_step(tmp_path: Path) -> None:
+    for seed, seconds in enumerate((3.0, 4.5, 4.5)):
+        result = synthetic.run(tmp_path, seed=seed)
+        result.wall_time["optimise"] = seconds
+        synthetic.save(result)
+    tables = by_form(timing(gather(tmp_path)))
+    (row,) = tables["comparison"].data.to_dict("records")
+    # Three iterations of 50 steps after the first; equal times are one batch's.
+    assert row["ms"] == pytest.approx(25.0) and row["measurements"] == 2
+    assert row["paper_ms"] == 38.70 and row["ratio"] == pytest.approx(38.70 / 25.0)
+    expected = stats.t.interval(0.95, 1, 25.0 - 38.70, 5.0 / np.sqrt(1))
+    assert (row["low"], row["high"]) == pytest.approx(expected)
+    cells = tables["ours"].cells.set_index("task")
+    assert cells.loc["Rope", "gradient methods [ms]"] == "25.00 ± 5.00 (2)"
+
+
+def test_benchmark_stands_beside_the_runs(folder: Path, tmp_path: Path, capsys) -> None:
+    path = tmp_path / "speed.csv"
+    row = {"task": "Move", "device": "cuda", "batch": 64, "forward_ms": 0.14, "gradient_ms": 0.48}
+    pd.DataFrame([row]).to_csv(path, index=False)
+    out = tmp_path / "out"
+    assert main(["tables", "--results", str(folder), "--out", str(out), "--speed", str(path)]) == 0
+    data = pd.read_csv(out / "comparison" / "timing.csv", comment="#").set_index(["task", "what"])
+    assert data.loc[("Move", "forward"), "ratio"] == pytest.approx(14.26 / 0.14)
+    path.write_text("task\nMove\n")
+    assert main(["tables", "--results", str(folder), "--out", str(out), "--speed", str(path)]) == 2
+    assert "lacks batch" in capsys.readouterr().err
+
+
+# ----------------------------------------------------------------------------------------------- other tables
+
+
+def test_solvability_is_the_recorded_demonstrations(folder: Path) -> None:
+    tables = by_form(solvability(gather(folder)))
+    assert tables["ours"].cells.shape == (10, 6)
+    assert tables["ours"].cells.set_index("task").loc["Rope", "variant 1"] == "0.75"
+    row = tables["comparison"].data.set_index(["task", "variant"]).loc[("Rope", "1")]
+    assert (row["paper_method"], row["paper_mean"]) == ("adam", 0.66)
+    reach = stats.t.ppf(0.975, 2) * 0.01 / np.sqrt(2)
+    assert row["high"] - row["difference"] == pytest.approx(reach)
+
+
+def test_hyperparameters_are_read_from_the_files() -> None:
+    tables = by_form(hyperparameters())
+    both = tables["comparison"].cells.set_index(["method", "key"])
+    assert both.loc[("SAC", "tau")].to_list() == ["0.005", "0.0003"]
+    assert both.loc[("TD3", "hidden")].to_list() == ["[256, 256]", "-"]
+    assert both.loc[("GD", "momentum")].to_list() == ["0.9", "0.9"]
+    assert both.loc[("Adam-H", "eps")].to_list() == ["1e-8", "1e-8"]
+    remarks = tables["paper"].cells.set_index(["method", "key"])["remark"]
+    assert remarks[("SAC", "tau")].startswith("printed; perhaps a slip")
+    bold = pd.DataFrame(tables["comparison"].bold, index=both.index)
+    assert bold.loc[("SAC", "tau")].any() and not bold.loc[("SAC", "gamma")].any()
+
+
+# ------------------------------------------------------------------------------------------------------ files
+
+
+@pytest.fixture(scope="module")
+def written(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("tables")
+    write_tables(gather(folder, "method=adam,gd,adam_h"), out, "python -m plab.report tables")
+    return out
+
+
+FORMS = [
+    f"{form}/iou_per_task{suffix}"
+    for form in ("ours", "paper", "comparison")
+    for suffix in (".tex", ".md", ".csv")
+]
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_files_are_as_they_were(written: Path, name: str) -> None:
+    """Compare with the files in tests/golden; PLAB_UPDATE_GOLDEN=1 replaces them."""
+    text = re.sub(r"\b[0-9a-f]{64}\b", "0" * 64, (written / name).read_text(encoding="utf-8"))
+    golden = GOLDEN / name
+    if os.environ.get("PLAB_UPDATE_GOLDEN"):
+        golden.parent.mkdir(parents=True, exist_ok=True)
+        golden.write_text(text, encoding="utf-8", newline="\n")
+    assert text == golden.read_text(encoding="utf-8")
+
+
+def test_every_file_names_command_and_runs(written: Path, folder: Path) -> None:
+    digest = gather(folder, "method=adam,gd,adam_h").digest
+    for suffix in (".tex", ".md", ".csv", ".json"):
+        text = (
+            (written / "comparison" / "iou_per_configuration").with_suffix(suffix).read_text(encoding="utf-8")
+        )
+        assert "python -m plab.report tables" in text and digest in text
+    beside = json.loads((written / "ours" / "iou_per_task.json").read_text(encoding="utf-8"))
+    assert len(beside["runs"]) == 44 and all(Path(run["path"]).is_file() for run in beside["runs"])
+
+
+def test_csv_has_all_digits(written: Path) -> None:
+    data = pd.read_csv(written / "ours" / "iou_per_task.csv", comment="#").set_index(["task", "method"])
+    scores = [score("Rope", v, "adam", s) for v in "12345" for s in range(3)]
+    assert data.loc[("Rope", "adam"), "std"] == pytest.approx(np.std(scores), rel=1e-12)
+
+
+def test_nothing_finished_gives_tables_without_numbers(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    tables = write_tables(gather(tmp_path / "empty"), tmp_path / "out", "command")
+    assert len(tables) == 15
+    ours = by_form([table for table in tables if table.name == "iou_per_task"])["ours"]
+    assert set(ours.cells.drop(columns="task").to_numpy().ravel()) == {"0/15"}
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX installation: make tex-packages")
+def test_latex_compiles(written: Path, tmp_path: Path) -> None:
+    shutil.copytree(written, tmp_path / "tables")
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "tables.tex"]
+    done = subprocess.run(command, cwd=tmp_path / "tables", capture_output=True, text=True, errors="replace")
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "tables" / "tables.pdf").is_file()
+    assert "Overfull" not in done.stdout, re.findall("Overfull.*", done.stdout)
+
+
+def test_special_characters_survive_latex(tmp_path: Path) -> None:
+    cells = pd.DataFrame({"a_b": ["50% & more", "x ± y"], "remark": ["{c} # $d", "e"]})
+    table = Table("odd", "ours", "Odd_title", cells, cells, np.array([[True, False], [False, False]]))
+    write_table(table, tmp_path, {"footer": ["f"]})
+    text = (tmp_path / "ours" / "odd.tex").read_text(encoding="utf-8")
+    assert r"\bfseries 50\% \& more & \{c\} \# \$d \\" in text and r"x $\pm$ y" in text
+    assert "| **50% & more** | {c} # $d |" in (tmp_path / "ours" / "odd.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.126, "0.13"), (-0.001, "0.00"), (float("nan"), "-"), (1.0, "1.00")]
+)
+def test_numbers(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--results", "/nowhere"], "does not exist"),
+        (["tusk=Rope"], "choose from: task"),
+    ],
+)
+def test_mistakes_are_one_line(folder: Path, tmp_path: Path, capsys, arguments, message) -> None:
+    default = [] if "--results" in arguments else ["--results", str(folder)]
+    assert main(["tables", *arguments, *default, "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

@@ -1,0 +1,149 @@
+"""Sweeps of tiny simulated runs through Hydra's launchers, whose processes are killed on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+
+from plab.config import Config, load_config
+from plab.results import RunResult, read, result_path
+from plab.run import main
+from plab.runners import run_batch
+
+LAUNCHERS = {"batch_joblib": "loky", "batch_submitit_local": "submitit", "batch_ray": "ray::"}
+"""Launcher to a word in the command lines of its jobs' processes."""
+
+NEEDED = {"batch_joblib": "joblib", "batch_submitit_local": "submitit", "batch_ray": "ray"}
+"""Launcher to the package that it needs. Ray cannot be installed next to today's joblib."""
+
+COARSE = (
+    "sim.grid_size=16",
+    "sim.horizon=3",
+    "sim.substeps=5",
+    "sim.dt=4e-4",
+    "sim.particles_scale=0.03",
+    "progress=false",
+)
+
+
+def command(launcher: str, *overrides: str) -> list[str]:
+    chosen = (f"hydra/launcher={launcher}", "hydra.launcher.batch_size=2")
+    return [sys.executable, "-m", "plab.run", "-m", *COARSE, *chosen, *overrides]
+
+
+def files(folder: Path) -> set[Path]:
+    """All files of runs, whatever they are."""
+    return {path for path in folder.glob("results/*-v*/*/*") if path.is_file()}
+
+
+@pytest.fixture(params=LAUNCHERS)
+def launcher(request: pytest.FixtureRequest) -> str:
+    """A launcher that is installed."""
+    pytest.importorskip(NEEDED[request.param])
+    return request.param
+
+
+def test_a_sweep_through_another_launcher(tmp_path: Path, launcher: str) -> None:
+    sweep = command(launcher, "seed=0,1,2", "method.iterations=2")
+    done = subprocess.run(sweep, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert any(line.startswith("3 runs go to ") and line.endswith(" in 2 jobs") for line in lines)
+    assert lines[-1] == "3 runs: 3 finished, 0 finished before"
+    assert len(files(tmp_path)) == 3
+
+
+def test_what_is_missing_is_named(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    # As if the launcher were not installed.
+    Plugins.instance()
+    launchers = ConfigStore.instance().repo["hydra"]["launcher"]
+    monkeypatch.delitem(launchers, "joblib.yaml")
+    assert main(["-m", "hydra/launcher=batch_joblib", "seed=0,1"]) == 2
+    assert "pip install 'plab[joblib]'" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- kills
+
+
+def processes(parent: int) -> Iterator[tuple[int, str]]:
+    """Processes that descend from another one, with their command lines."""
+    parents, lines = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+            lines[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
+            parents[int(folder.name)] = int(fields[1])
+        except OSError:
+            continue
+    for pid in lines:
+        ancestor = pid
+        while ancestor in parents and ancestor != parent:
+            ancestor = parents[ancestor]
+        if ancestor == parent and pid != parent:
+            yield pid, lines[pid]
+
+
+def kill_a_job(sweep: subprocess.Popen, word: str, folder: Path, rng: np.random.Generator) -> bool:
+    """Wait until runs are under way, then kill a process that computes some; whether there was one."""
+    while not list(folder.glob("results/*-v*/*/*.lock")):
+        if sweep.poll() is not None:
+            return False
+        time.sleep(0.01)
+    time.sleep(rng.uniform(0.0, 8.0))
+    jobs = [pid for pid, line in processes(sweep.pid) if word in line and "resource_tracker" not in line]
+    # What computes has no such process below it; submitit's have one that looks after them.
+    computing = [pid for pid in jobs if not {child for child, _ in processes(pid)} & set(jobs)]
+    for pid in computing[:1]:
+        os.kill(pid, signal.SIGKILL)
+    return bool(computing)
+
+
+def assert_same_numbers(got: RunResult, want: RunResult) -> None:
+    rows = [result.iterations.drop(columns=["seconds"]) for result in (got, want)]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+    assert np.array_equal(got.best_actions, want.best_actions) and got.evaluation == want.evaluation
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the jobs' processes in /proc")
+def test_a_sweep_whose_jobs_are_killed_is_completed_by_the_same_command(
+    tmp_path: Path, launcher: str
+) -> None:
+    rng = np.random.default_rng()
+    overrides = ("method=adam,gd", "seed=0,1,2", "method.iterations=300", "checkpoint_seconds=0")
+    kills = 0
+    for _ in range(3):
+        sweep = subprocess.Popen(
+            command(launcher, *overrides), cwd=tmp_path, stdout=subprocess.PIPE, text=True
+        )
+        kills += kill_a_job(sweep, LAUNCHERS[launcher], tmp_path, rng)
+        out, _ = sweep.communicate()
+        print(out)
+        assert sweep.returncode in (0, 1)
+    assert kills > 0
+    last = subprocess.run(command(launcher, *overrides), cwd=tmp_path, capture_output=True, text=True)
+    assert last.returncode == 0, last.stderr
+    cfgs: list[Config] = [
+        load_config([*COARSE, f"method={method}", f"seed={seed}", "method.iterations=300"])
+        for method in ("adam", "gd")
+        for seed in range(3)
+    ]
+    paths = [tmp_path / result_path(cfg) for cfg in cfgs]
+    assert files(tmp_path) == set(paths)
+    undisturbed = [replace(cfg, results_dir=str(tmp_path / "undisturbed")) for cfg in cfgs]
+    run_batch(undisturbed)
+    for path, cfg in zip(paths, undisturbed, strict=True):
+        assert_same_numbers(read(path), read(result_path(cfg)))
