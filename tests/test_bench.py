@@ -13,13 +13,16 @@ import pytest
 
 from plab.bench import opcount, paper, skips, speed
 from plab.bench.table import report
+from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
 from plab.sim import linalg as linear_algebra
+from plab.sim.memory import array_bytes
 from plab.suite import suite_tasks
 
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
 STEPS = 6
+PARTICLES = 25_000
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -97,39 +100,43 @@ def test_operations_are_counted() -> None:
     assert single["gather"] == double["gather"] and single["scatter"] < double["scatter"]
 
 
-def scene(particles: int = 300) -> Scene:
+def scene() -> Scene:
     """A ball of plasticine that never yields, next to a pillar and with a sphere coming, without friction."""
     tools = (
         Manipulator("Sphere", (0.06,), (0.22, 0.15, 0.5), scale=(0.02,) * 3, friction=0.0),
         Manipulator("Cylinder", (0.05, 0.2), (0.62, 0.1, 0.5), scale=(), friction=0.0),
     )
-    ball = Body("sphere", (0.5, 0.12, 0.5), (0.1,), particles)
+    ball = Body("sphere", (0.5, 0.12, 0.5), (0.1,), PARTICLES)
     settings = {"grid_size": 16, "substeps": 5, "dt": 2e-4, "yield_stress": math.inf, "floor_friction": 0.0}
     return Scene("skips", (ball,), tools, **settings)
 
 
-def simulator(particles: int = 300, **settings: object) -> Simulator:
-    sim = Simulator([scene(particles)], **settings)
-    n = sim.grid_size
-    grid = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
-    distance = np.linalg.norm(grid - (0.55, 0.15, 0.5), axis=-1)
-    mass = np.where(distance < 0.12, 3.0 * scene(particles).particle_mass, 0.0)
-    sim.set_target(mass[None], np.maximum(distance - 0.12, 0.0)[None])
+def simulator(**settings: object) -> Simulator:
+    sim = Simulator([scene()], precision="float64", **settings)
+    # The target is the ball a node further, so that the slope of each term differs from place to place.
+    mass = np.roll(sim.mass_tensor(), 1, axis=1)
+    sim.set_target(mass, target_sdf(mass[0])[None])
     return sim
 
 
-def actions(steps: int = STEPS) -> np.ndarray:
+def actions() -> np.ndarray:
     """Actions that take the sphere to the ball, which it reaches in the second step."""
-    u = np.zeros((1, steps, 3))
+    u = np.zeros((1, STEPS, 3))
     u[:, :, 0] = 1.0
-    u[:, :, 1] = np.random.default_rng(0).uniform(-1, 1, size=steps)
+    u[:, :, 1] = np.random.default_rng(0).uniform(-1, 1, size=STEPS)
     return u
 
 
-def test_skips_change_nothing(device: str) -> None:
+@pytest.fixture(scope="module")
+def usual(device: str) -> Simulator:
+    """A simulator that skips what it can."""
+    return simulator(device=device)
+
+
+def test_skips_change_nothing(usual: Simulator, device: str) -> None:
     """In a scene that has something to skip for each of them."""
-    everything = Skips(**{field.name: False for field in fields(Skips)})
-    usual, thorough = (simulator(precision="float64", device=device, skips=s) for s in (Skips(), everything))
+    nothing = Skips(**{field.name: False for field in fields(Skips)})
+    thorough = simulator(device=device, skips=nothing)
     for weights in ((10.0, 10.0, 1.0), (10.0, 0.0, 0.0)):
         results = []
         for sim in (usual, thorough):
@@ -138,7 +145,7 @@ def test_skips_change_nothing(device: str) -> None:
         losses = [result.step_terms @ weights for result in results]
         np.testing.assert_allclose(losses[0], losses[1], rtol=1e-9)
         largest = np.abs(results[0].gradient).max()
-        np.testing.assert_allclose(results[0].gradient, results[1].gradient, rtol=0, atol=1e-9 * largest)
+        np.testing.assert_allclose(results[0].gradient, results[1].gradient, rtol=0, atol=1e-8 * largest)
         np.testing.assert_allclose(usual.state().x, thorough.state().x, rtol=0, atol=1e-12)
     # What the scene is for: the first step has no adjoints of particles, the last ones have.
     assert 0 < usual._steps_before_contact(STEPS) < STEPS
@@ -152,18 +159,18 @@ def resident_mb() -> float:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads the resident memory from /proc")
-def test_memory_is_what_it_is_said_to_be() -> None:
+def test_memory_is_what_it_is_said_to_be(device: str) -> None:
     """A gradient needs no more than its budget, and what it allocates is what appears in the process."""
-    sim = simulator(60_000)
-    u = actions(4)
-    sim.rollout(u)
-    whole = sim.memory_bytes() / 1e6
-    del sim
-    gc.collect()
-    sim = simulator(60_000, memory_mb=whole / 2)
-    before = sim.rollout(u), resident_mb(), sim.memory_bytes() / 1e6
-    assert before[2] <= whole / 2
-    sim.memory_mb = 2 * whole
-    after = sim.rollout(u), resident_mb(), sim.memory_bytes() / 1e6
-    assert after[1] - before[1] == pytest.approx(after[2] - before[2], rel=0.05)
-    np.testing.assert_array_equal(before[0].gradient, after[0].gradient)
+    if device != "cpu":
+        pytest.skip("the resident memory is the host's")
+    # With compiled kernels in place, states kept for the gradient are all that a larger budget adds.
+    sim = simulator(memory_mb=100.0)
+    fewer = sim.rollout(actions()), sim.memory_bytes() / 1e6, resident_mb()
+    assert fewer[1] <= 100.0
+    # Taichi keeps the memory of an array that a larger one replaces.
+    replaced = array_bytes(sim._history) / 1e6
+    sim.memory_mb = 400.0
+    more = sim.rollout(actions()), sim.memory_bytes() / 1e6, resident_mb()
+    assert 150.0 < more[1] <= 400.0
+    assert more[2] - fewer[2] == pytest.approx(more[1] - fewer[1] + replaced, rel=0.05)
+    np.testing.assert_array_equal(fewer[0].gradient, more[0].gradient)

@@ -21,6 +21,9 @@ __all__ = ["KINDS", "Timing", "Workload", "build", "peak_rss_mb", "restart_peak_
 NOISE = 0.02
 """Actions of the environments of a batch differ by this much, so that no two do the same."""
 
+SOLID = 0.1
+"""Share of the largest mass from which on a node belongs to the target."""
+
 WARM_UP = 2
 """Calls after the first, which compiles, that are not counted: the CPU's kernels try sizes of their teams."""
 
@@ -90,8 +93,10 @@ def build(
     weights = cfg.method.loss_weights
     simulator.set_loss_weights(weights.density, weights.sdf, weights.contact)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
+    # Relative to its largest: with few particles all masses are small.
+    distance = target_sdf(mass, threshold=SOLID * mass.max())
     shape = (batch, *mass.shape)
-    simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(target_sdf(mass), shape))
+    simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(distance, shape))
     actions = _actions(cfg, batch, scene.action_dim)
     first = 0
     begin = time.perf_counter()
