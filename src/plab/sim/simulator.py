@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -217,10 +216,7 @@ class Simulator:
         )
         for scene in scenes:
             scene.validate()
-            if math.isfinite(scene.yield_stress) and not self._engine.series.plastic:
-                raise SceneError(
-                    "this simulator was built for infinite yield stress only: build one with a finite one"
-                )
+        self._require_compiled(scenes)
         self.scenes = scenes
         self._engine.fill_material(scenes)
 
@@ -432,6 +428,13 @@ class Simulator:
         self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
 
     # -- internals ----------------------------------------------------------------------------------
+
+    def _require_compiled(self, scenes: Sequence[Scene]) -> None:
+        """Refuse scenes that need what was left out when the simulator was built."""
+        for name in self._engine.left_out(scenes):
+            raise SceneError(
+                f"this simulator was built for scenes without {name}: build it with skips=Skips({name}=False)"
+            )
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
         """Make the scenes' start the initial state."""
