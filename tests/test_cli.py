@@ -61,7 +61,7 @@ REFUSED = [
     (["Rope"], "cannot read 'Rope': write key=value"),
     (["~seed"], "keys cannot be removed"),
     (["method.lr=0"], "method.lr must be positive"),
-    (["sim.dt=1e-3"], "dt 0.001 is above the stability limit 0.00021"),
+    (["sim.dt=1e-3"], "dt 0.001 is above the stability limit 0.000171"),
     (["task.bodies.rope.center=[0.5,0.5,0.99]"], "outside the domain"),
     (["task.target.radius=0.6"], "the target reaches outside the domain"),
     (["--mutlirun"], "unknown flag --mutlirun; did you mean --multirun?"),

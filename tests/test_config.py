@@ -277,12 +277,17 @@ def test_particles_scale():
 
 def test_scalar_overrides_reach_the_scene():
     cfg = load_config(
-        ["task.yield_stress=inf", "task.gravity=[0,-5,0]", "sim.dt=2e-4", "task.manipulators.left.friction=0"]
+        [
+            "task.yield_stress=inf",
+            "task.gravity=[0,-5,0]",
+            "sim.dt=1.5e-4",
+            "task.manipulators.left.friction=0",
+        ]
     )
     scene = build_scene(cfg)
     assert scene.yield_stress == float("inf")
     assert scene.gravity == (0, -5, 0)
-    assert scene.dt == 2e-4
+    assert scene.dt == 1.5e-4
     assert scene.manipulators[0].friction == 0
     assert scene.manipulators[1].friction == 0.9
 
@@ -445,7 +450,7 @@ def test_refused_of_a_method(method, override, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sim.dt=1e-3", "dt 0.001 is above the stability limit 0.00021"),
+        ("sim.dt=1e-3", "dt 0.001 is above the stability limit 0.000171"),
         ("task.poisson_ratio=0.5", "poisson_ratio 0.5 is outside [0, 0.5)"),
         ("task.bodies.rope.shape=cone", "shape 'cone' is not one of sphere, box"),
         ("task.bodies.rope.size=[0.6]", "a box needs 3 size(s), not 1"),

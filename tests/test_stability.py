@@ -1,4 +1,4 @@
-"""The stability benchmark: what is refused, that all tasks are one kind of scene, that cases survive."""
+"""The stability benchmark: what is refused, the common kind of scene, and that cases survive."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_what_cannot_be_simulated_is_refused(name: str) -> None:
 
 def test_refusals_name_what_would_do() -> None:
     said = {row["case"]: row["where"] for row in run_refusals()}
-    assert "substeps >= 91" in said["E times 100 without more substeps"]
+    assert "substeps >= 112" in said["E times 100 without more substeps"]
     assert "scale it by 0.3 or less, or use substeps >= 64" in said["manipulator moves by cells per substep"]
     assert "lower_bound" in said["manipulator's bounds are the wrong way round"]
 

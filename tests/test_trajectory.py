@@ -88,6 +88,20 @@ def test_first_actions_are_uniform_and_follow_the_seed(method) -> None:
     assert not np.array_equal(first, ActionSequence(method, 50, 6, seed=8).numpy())
 
 
+def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
+    def moved(largest: float | None, gradient: np.ndarray) -> np.ndarray:
+        settings = replace(method, optimizer="gd", lr=0.1, momentum=0.0, max_gradient_norm=largest)
+        actions = ActionSequence(settings, 2, 2, seed=0)
+        before = actions.numpy()
+        actions.step(gradient)
+        return before - actions.numpy()
+
+    long = np.array([[3.0, 0.0], [0.0, 4.0]])
+    np.testing.assert_allclose(moved(None, long), 0.1 * long)
+    np.testing.assert_allclose(moved(10.0, long), 0.1 * long)
+    np.testing.assert_allclose(moved(2.0, long), 0.1 * 0.4 * long, rtol=1e-5)
+
+
 def test_gd_is_momentum_on_weighted_gradients(method) -> None:
     """v <- 0.9 v + 0.1 g from v = 0, the first step included; actions <- clip(actions - lr v)."""
     actions = ActionSequence(replace(method, optimizer="gd", lr=0.5, momentum=0.9), 2, 2, seed=0)

@@ -281,6 +281,7 @@ class TrajectoryConfig(MethodConfig):
         betas: Decay rates of adam's two moment estimates.
         eps: Added to adam's denominator.
         momentum: gd's momentum, on (1 - momentum)-weighted gradients.
+        max_gradient_norm: Longer gradients are scaled down to this norm; None sets no limit.
         iterations: Rollouts with gradient, hence updates.
         action_init: Initial actions are uniform in +- this.
     """
@@ -290,6 +291,7 @@ class TrajectoryConfig(MethodConfig):
     betas: list[float]
     eps: float
     momentum: float
+    max_gradient_norm: float | None
     iterations: int
     action_init: float
 
@@ -303,6 +305,8 @@ class TrajectoryConfig(MethodConfig):
             _fraction(f"{path}.betas", beta)
         _positive(f"{path}.eps", self.eps)
         _fraction(f"{path}.momentum", self.momentum)
+        if self.max_gradient_norm is not None:
+            _positive(f"{path}.max_gradient_norm", self.max_gradient_norm)
         _at_least(f"{path}.iterations", self.iterations, 1)
         if not 0 <= self.action_init <= 1:
             raise ConfigError(f"{path}.action_init must be in [0, 1], not {self.action_init:g}")

@@ -240,12 +240,12 @@ class Scene:
         _require(self.yield_stress >= 0, f"yield_stress {self.yield_stress:g} must not be negative")
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
-        steps = math.ceil(self.substeps * self.dt / self.stable_dt)
-        _require(
-            self.dt <= self.stable_dt,
-            f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of this material and grid: "
-            f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}",
-        )
+        if self.dt > self.stable_dt:
+            steps = math.ceil(self.substeps * self.dt / self.stable_dt)
+            raise SceneError(
+                f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of material and grid: "
+                f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
+            )
         _require(
             self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
         )
@@ -314,7 +314,7 @@ class Scene:
         )
         _require(
             0 <= manipulator.friction < math.inf,
-            f"{label}: friction {manipulator.friction:g} must be finite and not negative",
+            f"{label}: friction {manipulator.friction:g} must not be negative, infinite or NaN",
         )
         _require(
             all(math.isfinite(c) for c in manipulator.position),

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from plab.bench.common_scene import common_actions, common_scene, own_components
+from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
 from plab.bench.precision import angle
 from plab.bench.table import report
 from plab.config import build_scene, load_config
@@ -36,7 +36,6 @@ from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, Simulator
-from plab.sim.skips import Skips
 from plab.suite import task_list
 
 __all__ = ["Setting", "lattice", "main"]
@@ -252,7 +251,7 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int) -> Ite
     Yields:
         Task, contact model and :class:`Result`.
     """
-    skips = Skips(singular_values=setting.material == "series")
+    skips = replace(ANY_SCENE, singular_values=setting.material == "series")
     simulator = None
     for attempt in attempts:
         scene, x = attempt.start(setting)

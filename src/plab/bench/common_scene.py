@@ -14,8 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+from plab.sim.skips import Skips
 
-__all__ = ["PLACES", "common_actions", "common_scene", "own_components"]
+__all__ = ["ANY_SCENE", "PLACES", "common_actions", "common_scene", "own_components"]
+
+ANY_SCENE = Skips(plasticity=False, friction=False)
+"""For simulators that are given other scenes later, which may yield or rub where the first do not."""
 
 PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
 """Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""

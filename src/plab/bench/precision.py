@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from plab.bench.common_scene import common_actions, common_scene, own_components
+from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
 from plab.bench.table import report
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
@@ -113,7 +113,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
     Yields:
         For each configuration its target and an :class:`Outcome` per kind of actions.
     """
-    simulator = Simulator([configurations[0].scene], precision=precision)
+    simulator = Simulator([configurations[0].scene], precision=precision, skips=ANY_SCENE)
     simulator.set_loss_weights(10.0, 10.0, 0.0)
     for number, start in enumerate(configurations):
         simulator.set_scenes([start.scene])

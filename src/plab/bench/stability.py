@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
 from plab.scene import SceneError
@@ -54,7 +55,7 @@ def run_cases(cases: Sequence[Case], precision: str) -> Iterator[dict[str, objec
         substep], largest gradient component, and the environment step of that component.
     """
     for group in _groups(cases).values():
-        simulator = Simulator([group[0].scene] * min(BATCH, len(group)), precision=precision)
+        simulator = Simulator([group[0].scene] * min(BATCH, len(group)), precision=precision, skips=ANY_SCENE)
         simulator.set_target(*_target(simulator))
         for at in range(0, len(group), simulator.batch):
             part = group[at : at + simulator.batch]

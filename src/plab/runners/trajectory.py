@@ -160,14 +160,18 @@ class ActionSequence:
         unit = torch.rand((horizon, action_dim), generator=self._generator, dtype=torch.float64)
         self.parameter = ((2.0 * unit - 1.0) * method.action_init).requires_grad_()
         self._optimizer = OPTIMIZERS[method.optimizer](self.parameter, method)
+        self._largest = method.max_gradient_norm
 
     def numpy(self) -> np.ndarray:
         """Return a copy of the actions, shape [T, A]."""
         return self.parameter.detach().numpy().copy()
 
     def step(self, gradient: np.ndarray) -> None:
-        """Update the actions by a gradient of shape [T, A] and clip them to [-1, 1]."""
+        """Update the actions by a gradient of shape [T, A], no longer than ``method.max_gradient_norm``, and
+        clip them to [-1, 1]."""
         self.parameter.grad = torch.from_numpy(np.array(gradient, dtype=np.float64))
+        if self._largest is not None:
+            torch.nn.utils.clip_grad_norm_(self.parameter, self._largest)
         self._optimizer.step()
         with torch.no_grad():
             self.parameter.clamp_(-1.0, 1.0)

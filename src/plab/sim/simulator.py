@@ -184,7 +184,7 @@ class Simulator:
         for scene in scenes:
             scene.validate()
         _require_alike([self.scenes[0], *scenes])
-        self._engine.require_kept(scenes)
+        self._require_compiled(scenes)
         self.scenes = tuple(scenes)
         self._engine.fill_parameters(scenes)
         self._start_from(particles)
@@ -222,7 +222,7 @@ class Simulator:
         )
         for scene in scenes:
             scene.validate()
-        self._engine.require_kept(scenes)
+        self._require_compiled(scenes)
         self.scenes = scenes
         self._engine.fill_material(scenes)
 
@@ -440,6 +440,13 @@ class Simulator:
         if on_device(like):
             return tensor_from(array, shape, like)
         return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
+
+    def _require_compiled(self, scenes: Sequence[Scene]) -> None:
+        """Refuse scenes that need what was left out when the simulator was built."""
+        for name in self._engine.left_out(scenes):
+            raise SceneError(
+                f"this simulator was built for scenes without {name}: build it with skips=Skips({name}=False)"
+            )
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
         """Make the scenes' start the initial state."""

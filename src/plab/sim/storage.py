@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 import taichi as ti
 
-from plab.scene import MANIPULATOR_SHAPES, Scene, SceneError
+from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.material import Series
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
@@ -220,23 +220,6 @@ class Storage:
         self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
         # Adjoints of mu, lambda and yield strain.
         self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
-
-    def require_kept(self, scenes: Sequence[Scene]) -> None:
-        """Check that the kernels compute what other scenes need.
-
-        Raises:
-            SceneError: If they leave it out, because the scenes that they were made for did not need it.
-        """
-        lacking = {
-            "a finite yield stress": not self.series.plastic
-            and any(math.isfinite(s.yield_stress) for s in scenes),
-            "floor friction": not self.floor_rubs and any(s.floor_friction > 0 for s in scenes),
-            "friction of a manipulator": not self.manipulators_rub
-            and any(m.friction > 0 for s in scenes for m in s.manipulators),
-        }
-        for what, lacks in lacking.items():
-            if lacks:
-                raise SceneError(f"this simulator was built without {what}: build one that has it")
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""
