@@ -97,7 +97,8 @@ def write_index(tables: list[Table], folder: Path) -> None:
     (folder / "tables.md").write_text(text, encoding="utf-8", newline="\n")
 
 
-_DOCUMENT = r"""\documentclass{article}
+_DOCUMENT = r"""% pdflatex tables.tex, twice: long tables align their columns the second time.
+\documentclass{article}
 \usepackage[utf8]{inputenc}
 \usepackage[a4paper, margin=1.5cm]{geometry}
 \usepackage{booktabs}
