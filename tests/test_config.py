@@ -386,7 +386,7 @@ REFUSED = [
     ("experiment=yield_ablation", "write +experiment=yield_ablation"),
     (
         "+experiment=yield_ablatoin",
-        "experiment 'yield_ablatoin' does not exist; did you mean yield_ablation? choose from: yield_",
+        "experiment 'yield_ablatoin' does not exist; did you mean yield_ablation? choose from: paper_",
     ),
     ("method.name=", "method.name '' must be"),
     ("sim.precision=float16", "sim.precision 'float16' does not exist; did you mean float64?"),

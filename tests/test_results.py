@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -310,7 +311,7 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
     run.record(make_row(0), make_state(rng))
     before = run.partial_path.read_bytes()
 
-    def full(*_):
+    def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
@@ -318,7 +319,7 @@ def test_full_disk_is_one_error_and_keeps_the_previous_file(tmp_path: Path, rng,
         run.record(make_row(1), make_state(rng))
     assert run.partial_path.read_bytes() == before
     assert not list(run.path.parent.glob("*.tmp"))
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
     with pytest.raises(ResultsError, match=r"cannot write results to .*No space left"):
         RunFile(make_config(tmp_path))
 

@@ -21,13 +21,15 @@ EXAMPLES
   python -m plab.run task=Move variant=3 method=gd method.lr=0.05
   python -m plab.run sim=reference sim.device=cuda             float64 on the GPU
   python -m plab.run sim.particles_scale=0.2 method.iterations=20         a quick try
-  python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs, one after the other
+  python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs that share a simulator
 
   python -m plab.run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
   python -m plab.run -m variant=random 'seed_scene=range(10)'  ten drawn configurations
   python -m plab.run task=Torus method=ppo method.profile=paper            reinforcement learning
   python -m plab.run +experiment=yield_ablation                a sweep that a file describes
   python -m plab.run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
+
+  python -m plab.run +experiment=smoke hydra/launcher=batch_joblib         in several processes
 
 FLAGS
   -m, --multirun    run every combination of the values given with commas

@@ -37,6 +37,7 @@ def pick(name: str, names: Sequence[str]) -> str:
 
 LAUNCHER_EXTRAS = {
     "joblib": "joblib",
+    "ray": "ray",
     "submitit_local": "submitit",
     "submitit_slurm": "submitit",
 }

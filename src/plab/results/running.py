@@ -7,9 +7,10 @@ import itertools
 import logging
 import math
 import os
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -245,13 +246,10 @@ def _refuse_newer(*paths: Path) -> None:
 
 def _probe(folder: Path) -> None:
     """Check that a folder can be made and has room, by writing to it."""
-    probe = folder / f".probe-{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe.write_bytes(bytes(_PROBE_BYTES))
+        # A file without a name, of which a process that is killed leaves nothing.
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(_PROBE_BYTES))
     except OSError as error:
         raise ResultsError(f"cannot write results to {folder}: {error.strerror or error}") from error
-    finally:
-        # Removing it may fail like writing it did, where the parent is a file for example.
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)

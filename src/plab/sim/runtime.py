@@ -65,10 +65,10 @@ _process: int | None = None
 
 
 def available_threads() -> int:
-    """CPUs that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """CPUs that this process may use; ``OMP_NUM_THREADS``, as launchers set it, can make it fewer."""
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    wish = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cpus, int(wish)) if wish.isdigit() and int(wish) > 0 else cpus
 
 
 def start_runtime(device: str, precision: str, threads: int | None = None) -> Runtime:

@@ -96,10 +96,10 @@ def look_up(cfg: Config) -> Outcome:
     try:
         left = read(path.with_suffix(".partial.h5"))
     except ResultsError:
-        return outcome(cfg, "lost", message="its process ended before it had a result")
+        return outcome(cfg, "lost", message="no result, and no process computes it now")
     if left.status == "failed":
         return outcome(cfg, "failed", message=left.message)
-    return outcome(cfg, "lost", message=f"its process ended after {len(left.iterations)} iterations")
+    return outcome(cfg, "lost", message=f"{len(left.iterations)} iterations, and no process computes it now")
 
 
 def _finished_before(cfg: Config) -> Outcome | None:

@@ -13,7 +13,7 @@ _UNFINISHED = {
     "failed": "failed",
     "refused": "refused",
     "elsewhere": "under way in another process",
-    "lost": "lost with their process",
+    "lost": "not under way",
 }
 
 
@@ -41,7 +41,7 @@ class Outcome:
         title: Task, variant, method and seed.
         path: The run's final file.
         status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (a mistake
-            of the user's), ``elsewhere`` (another process computes it) or ``lost`` (its process ended).
+            of the user's), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
         score: Score of the final evaluation, NaN if there is none.
         message: Why it has not finished, one line.
     """
