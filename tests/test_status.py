@@ -8,6 +8,7 @@ import io
 import json
 import os
 import time
+from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,28 @@ def test_running_is_a_held_lock(folder: Path) -> None:
     assert run.left <= 1.15
     lock.release()
     assert counts(find(folder))["running"] == 0
+
+
+def test_runs_of_a_batch_share_a_process(folder: Path) -> None:
+    locks = []
+    for seed in range(3):
+        result = synthetic.run(folder, task="Move", seed=seed)
+        # Begun together a minute ago, 20 s each; 10 s for each of two iterations after the first.
+        result.provenance["start_time"] = datetime.fromtimestamp(time.time() - 60, timezone.utc).isoformat()
+        result.wall_time = {"optimise": 20.0}
+        result.iterations = result.iterations.iloc[:3].assign(seconds=10.0)
+        result.status, result.evaluation = "running", {}
+        locks.append(acquire(synthetic.save(result)))
+    found = find(folder, "task=Move", "variant=1")
+    assert found.workers == 1
+    for run in found.running:
+        assert run.together == pytest.approx(3.0, rel=0.3)
+        assert run.rate == pytest.approx(0.1 / run.together)
+    # Three times ten seconds, less what has gone by since.
+    assert 0.0 < found.eta <= 32.0
+    assert sum(run.left for run in found.running) <= 30.0
+    for lock in locks:
+        lock.release()
 
 
 def test_waiting_counts_for_the_rest(folder: Path) -> None:

@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +51,11 @@ class Run:
         message: Why it failed; empty otherwise.
         done: Iterations, or episodes, done.
         total: Iterations, or episodes, in all; 0 where it is not known.
-        rate: Iterations, or episodes, per second [1/s], of a run under way; None if it is not known.
+        rate: Iterations, or episodes, per second of wall time [1/s], of a run under way; None if it is not
+            known.
         seconds: Wall time so far [s].
-        left: Time that it still needs [s]; None if it is not known.
+        left: Time that it still needs [s], its share of a batch; None if it is not known.
+        together: Number of runs that share its process's time, if it is under way.
         path: Its file; empty for a missing run.
     """
 
@@ -67,6 +70,7 @@ class Run:
     rate: float | None = None
     seconds: float = 0.0
     left: float | None = None
+    together: float = 1.0
     path: str = ""
 
 
@@ -110,18 +114,23 @@ class Survey:
     unreadable: list[str]
 
     @property
+    def running(self) -> list[Run]:
+        """Runs under way."""
+        return [run for run in self.runs if run.state == "running"]
+
+    @property
     def workers(self) -> int:
-        """Number of runs under way."""
-        return sum(run.state == "running" for run in self.runs)
+        """About how many processes are at work: runs of a batch share one."""
+        return max(round(sum(1.0 / run.together for run in self.running)), 1) if self.running else 0
 
     @property
     def eta(self) -> float | None:
-        """Time until all is done [s], if as many runs stay under way as now; None if it is not known."""
+        """Time until all is done [s], if as many processes stay at work; None if it is not known."""
         left = [group.left for group in self.groups]
         if not self.workers or None in left:
             return None
-        # The longest of the running ones cannot be shared.
-        longest = max((run.left or 0.0 for run in self.runs if run.state == "running"), default=0.0)
+        # No process can help another one.
+        longest = max((run.left or 0.0) * run.together for run in self.running)
         return max(sum(left) / self.workers, longest)
 
 
@@ -225,6 +234,7 @@ def _measure(run: Run) -> None:
             done = table["episodes"][()] if in_episodes else range(1, len(seconds) + 1)
             written = Path(run.path).stat().st_mtime
             run.seconds = float(sum(attributes(file["wall_time"]).values()))
+            run.together = _together(attributes(file["provenance"]), written, run.seconds)
     except (ResultsError, OSError, KeyError):
         # It may just have ended, and its partial file be gone.
         return
@@ -235,9 +245,19 @@ def _measure(run: Run) -> None:
     count = min(_RECENT_ROWS, len(seconds) - 1)
     if count == 0 or run.done <= int(done[-1 - count]):
         return
-    run.rate = (run.done - int(done[-1 - count])) / max(float(seconds[-count:].sum()), 1e-9)
+    rate = (run.done - int(done[-1 - count])) / max(float(seconds[-count:].sum()), 1e-9)
     since = max(time.time() - written, 0.0)
-    run.left = max((run.total - run.done) / run.rate - since, 0.0)
+    run.left = max((run.total - run.done) / rate - since / run.together, 0.0)
+    run.rate = rate / run.together
+
+
+def _together(origin: dict[str, Any], written: float, spent: float) -> float:
+    """Return how many runs share a process: wall time since the start over the run's own time, at least 1."""
+    if origin.get("resumed") or spent <= 0.0:
+        # What went by between two processes is not known.
+        return 1.0
+    started = datetime.fromisoformat(origin["start_time"]).timestamp()
+    return max((written - started) / spent, 1.0)
 
 
 def _mean_seconds(runs: Iterable[Run]) -> dict[tuple[str, str], float]:
@@ -315,7 +335,8 @@ def _show(found: Survey) -> None:
     for run in found.runs:
         name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
         if run.state == "running":
-            progress = f"{run.done}/{run.total}, {duration(run.left)} left" if run.total else "starting"
+            left = None if run.left is None else run.left * run.together
+            progress = f"{run.done}/{run.total}, {duration(left)} left" if run.total else "starting"
             console.print(f"running: {name}: {progress}", highlight=False)
         if run.state == "failed":
             console.print(f"[red]failed[/]: {name}: {run.message}", highlight=False)
@@ -323,7 +344,7 @@ def _show(found: Survey) -> None:
     counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
     console.print(f"{len(found.runs)} runs: {counts}", highlight=False)
     if found.workers:
-        console.print(f"all done in {duration(found.eta)}, with {found.workers} at a time", highlight=False)
+        console.print(f"all done in {duration(found.eta)}, with {found.workers} at work", highlight=False)
     if found.others:
         text = "further run(s) in the results, of other names or other settings"
         console.print(f"{found.others} {text}", highlight=False)
