@@ -174,5 +174,5 @@ def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.
     tiles = engine.affine.to_numpy().reshape(b, engine.tiles, 9, engine.lanes)
     flat = tiles.transpose(0, 1, 3, 2).reshape(b, -1, 9)[:, :n] / engine.stress_scale
     tau = np.empty((b, n, 9))
-    np.put_along_axis(tau, sim._order.current()[:, :, None], flat, axis=1)
+    np.put_along_axis(tau, sim._particles.order.current()[:, :, None], flat, axis=1)
     return state.F, tau.reshape(b, n, 3, 3)
