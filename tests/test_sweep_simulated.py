@@ -12,7 +12,7 @@ import pytest
 
 from plab.config import Config, load_config
 from plab.problem import Problem
-from plab.results import RunFile, RunResult, read, result_path
+from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import run_batch, run_config
 from plab.sim import Simulator
 
@@ -162,18 +162,16 @@ def test_runs_that_stand_at_different_iterations_go_on_together(tmp_path: Path, 
 
 
 def test_a_file_that_cannot_be_written_ends_its_run_only(tmp_path: Path, alone, monkeypatch) -> None:
-    from plab import results
-
     cfgs = configs(tmp_path)
-    bad, intact = result_path(cfgs[2]).with_suffix(".partial.h5"), results.write
+    bad, intact = result_path(cfgs[2]).with_suffix(".partial.h5"), RunFile._write
 
-    def write(result, path, **options):
-        if path == bad:
-            raise results.ResultsError(f"cannot write {path}: No space left on device")
-        intact(result, path, **options)
+    def write(self):
+        if self.partial_path == bad:
+            raise ResultsError(f"cannot write {bad}: No space left on device")
+        intact(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(results, "write", write)
+        patch.setattr(RunFile, "_write", write)
         ended = run_batch(cfgs)
     assert [one.status for one in ended] == ["finished", "finished", "refused", "finished"]
     assert ended[2].message == f"cannot write {bad}: No space left on device"
