@@ -13,6 +13,7 @@ import pytest
 
 from plab.bench import opcount, paper, skips, speed
 from plab.bench.table import report
+from plab.config import build_scene, load_config
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
@@ -62,6 +63,8 @@ def test_a_skip_has_a_row_and_a_changed_result_is_told(
 
 def test_every_skip_is_measured_on_some_device() -> None:
     assert {case.skip for case in skips.CASES} == {field.name for field in fields(Skips)}
+    for case in skips.CASES:
+        build_scene(load_config(case.overrides)).validate()
 
 
 def test_mistakes_are_answered_in_one_line(capsys: pytest.CaptureFixture) -> None:

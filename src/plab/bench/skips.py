@@ -56,7 +56,7 @@ CASES = (
     Case("far_manipulators", ("task=TripleMove",), (GRADIENT, FORWARD)),
     Case("rotations", ("task=TripleMove",), (GRADIENT, FORWARD)),
     Case("singular_values", ("task=Move",)),
-    Case("plasticity", ("task=Move", "task.yield_stress=.inf")),
+    Case("plasticity", ("task=Move", "task.yield_stress=inf")),
     Case("flow", ("task=Move",)),
     Case("friction", ("task=Writer", "task.floor_friction=0")),
     Case("history", ("task=Move",), (REWARD,)),
