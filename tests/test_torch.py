@@ -98,7 +98,7 @@ def test_type_is_kept_and_no_gradient_is_computed_in_vain(problem: Problem, monk
     monkeypatch.setattr(
         Problem,
         "rollout",
-        lambda self, a, *, gradient: (wanted.append(gradient), intact(self, a, gradient=gradient))[1],
+        lambda self, a, **options: (wanted.append(options["gradient"]), intact(self, a, **options))[1],
     )
     assert not rollout(problem, actions.detach()).requires_grad
     with torch.no_grad():
