@@ -343,7 +343,7 @@ def _show(found: Survey) -> None:
     totals = Counter(run.state for run in found.runs)
     counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
     console.print(f"{len(found.runs)} runs: {counts}", highlight=False)
-    if found.workers:
+    if found.eta is not None:
         console.print(f"all done in {duration(found.eta)}, with {found.workers} at work", highlight=False)
     if found.others:
         text = "further run(s) in the results, of other names or other settings"
