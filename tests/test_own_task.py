@@ -228,7 +228,7 @@ REFUSED = [
     ),
     ([('variant: "1"', 'variant: "7"')], ["variant=random"], "variant 7 of task Dumbbell does not exist"),
     ([("  shift:", "  shfit:")], ["variant=random"], "task.random: unknown key 'shfit'; did you mean shift?"),
-    ([("size: [0.03]", "size: [0.03, 0.1]")], [], "a Sphere needs positive, finite sizes (radius), not (0.03, 0.1)"),
+    ([("size: [0.03]", "size: [0.03, 0.1]")], [], "positive, finite sizes (radius), not (0.03, 0.1)"),
     ([("size: [0.03]", "size: 0.03")], [], "task.manipulators.left.size: Invalid value assigned"),
 ]
 
