@@ -408,7 +408,7 @@ def parameter_adjoint(
     """
     # The stress is linear in mu and lambda.
     mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
-    _q, _det, norm, k = yield_factor(d, yield_strain)
+    _q, _det, norm, k = yield_factor(d, yield_strain, series)
     yield_bar = ti.select(k < 1.0, k_bar / norm, 0.0 * k)
     return mu_bar, (tau_bar[0] + tau_bar[1] + tau_bar[2]) * j * (j - 1.0), yield_bar
 
