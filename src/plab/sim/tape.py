@@ -101,7 +101,9 @@ class Tape:
         if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * per_slot):
             self._checkpoints = None
             self._checkpoints = self._particles.array(segments)
-        if self._engine.sorts:
+        if self._engine.sorts and (
+            self._moves is None or self._moves.shape[0] < steps * self._particles.order.places
+        ):
             self._moves = self._particles.order.allocate(steps)
         if self.bar is None:
             self.bar = self._particles.array(1)
