@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-__all__ = ["provenance", "version_changes"]
+__all__ = ["now", "provenance", "version_changes"]
 
 _PACKAGES = {
     "plab": "plab",
@@ -48,9 +48,14 @@ def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
         "device": config["sim"]["device"],
         "precision": config["sim"]["precision"],
         "seed": config["seed"],
-        "start_time": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "start_time": now(),
         "resumed": 0,
     }
+
+
+def now() -> str:
+    """Return the time as results state it: UTC, ISO 8601, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def version_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

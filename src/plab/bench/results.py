@@ -25,7 +25,7 @@ import pandas as pd
 from plab.bench.table import report
 from plab.config import load_config
 from plab.objective import scores_from_iou
-from plab.provenance import provenance
+from plab.provenance import now, provenance
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
 from plab.results.schema import COLUMNS, FAMILY_COLUMNS
 from plab.selection import Selection
@@ -99,7 +99,7 @@ def _provenance(config: dict[str, Any]) -> dict[str, Any]:
     # Asking git for every one of thousands of files would take minutes.
     if not _origin:
         _origin.update(provenance(config))
-    return _origin | {"seed": config["seed"]}
+    return _origin | {"seed": config["seed"], "start_time": now()}
 
 
 def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
