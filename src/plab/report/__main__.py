@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 
 import plab
+from plab.examples import resolve
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
@@ -67,7 +68,9 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("what", choices=["tables", "curves"], help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
-    what = "folder of results, archive, or several of them (default: results)"
+    what = (
+        "folder of results, archive, or several; 'example': real runs that come with plab (default: results)"
+    )
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
@@ -75,7 +78,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
     options.words += [item for item in options.results if "=" in item]
-    options.results = [item for item in options.results if "=" not in item]
+    options.results = [resolve(item) for item in options.results if "=" not in item]
     return options
 
 

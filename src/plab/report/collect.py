@@ -266,8 +266,14 @@ def _unusual_of(row: Row) -> dict[str, Any]:
     expected = _usual(row.values["method"])
     by_variant = _changed_by_variant(row.config)
     task = {f"task.{k}": v for k, v in _usual_task(row.values["task"]).items() if k not in by_variant}
-    own = {key: (value, lookup(row.config, key)) for key, value in (expected | task).items()}
+    own = {key: (value, _present(row.config, key)) for key, value in (expected | task).items()}
     return {key: mine for key, (value, mine) in own.items() if key not in _HARMLESS and mine != value}
+
+
+def _present(config: Mapping[str, Any], key: str) -> Any:
+    """Return a setting, None where the run is older than it: that it did without, as null says."""
+    value = lookup(config, key)
+    return None if value != value else value
 
 
 @functools.cache

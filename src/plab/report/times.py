@@ -37,7 +37,8 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
                     _time_row(task, f"runs, {device}", "forward + backward", mine["gradient"], theirs)
                 )
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
-            where = f"benchmark, {row['device']}, batch {row['batch']}"
+            kind = [row["device"], *([row["precision"]] if "precision" in row else [])]
+            where = f"benchmark, {', '.join(kind)}, batch {row['batch']}"
             for column, kind, printed in _BENCHMARK:
                 theirs = float(paper.loc[task, printed])
                 compared.append(_time_row(task, where, kind, np.array([row[column]]), theirs))
@@ -74,8 +75,14 @@ def _step_times(runs: Runs) -> pd.DataFrame:
     steps = np.where(kind == "gradient", table["iterations"] - 1, table["method.episodes"]) * horizon
     optimise = table.get("seconds_optimise", pd.Series(np.nan, table.index))
     ms = 1e3 * optimise / np.where(steps > 0, steps, np.nan)
-    found = pd.DataFrame({"task": table["task"], "device": table["device"], "kind": kind, "ms": ms})
+    device = [_where(*each) for each in zip(table["device"], table["batch"], strict=True)]
+    found = pd.DataFrame({"task": table["task"], "device": device, "kind": kind, "ms": ms})
     return found.dropna()
+
+
+def _where(device: str, batch: float) -> str:
+    """Say where a run was computed, and with how many others."""
+    return f"{device}, {batch:.0f} runs at once" if batch > 1 else device
 
 
 def _devices(steps: pd.DataFrame, task: str) -> list[str]:
