@@ -24,4 +24,8 @@ def resolve(source: str | Path) -> Path:
     Args:
         source: Folder, archive or file; a folder of that name is meant by ``./example``.
     """
-    return example_archive() if str(source) == EXAMPLE else Path(source)
+    if str(source) != EXAMPLE:
+        return Path(source)
+    archive, here = example_archive(), Path.cwd()
+    # Reports name the files that they are made of: no more of the computer's folders than must be.
+    return archive.relative_to(here) if archive.is_relative_to(here) else archive

@@ -1,7 +1,8 @@
-"""The paper's tables and curves from result files alone.
+"""The paper's tables and curves, and a page of all results, from result files alone.
 
 python -m plab.report tables --results results --out reports/tables
 python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
+python -m plab.report html --results example           real runs that come with plab
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, 
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
+from plab.report.page import write_page
 from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
@@ -45,18 +47,33 @@ def main(argv: Sequence[str] | None = None) -> int:
         runs = collect(options.results, chosen)
         if options.what == "tables":
             benchmark = None if options.speed is None else _benchmark(options.speed)
-            count = len(write_tables(runs, out, command, benchmark))
-        else:
+            made = f"{len(write_tables(runs, out, command, benchmark))} tables"
+        elif options.what == "curves":
             ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
-            count = len(write_curves(runs, ablation, out, command))
+            made = f"{len(write_curves(runs, ablation, out, command))} figures"
+        else:
+            _require_runs(runs, options.results)
+            trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
+            if trouble:
+                print(f"plab: without pictures: {trouble}", file=sys.stderr)
+            made = "index.html"
     except (ResultsError, SelectionError, MixedRunsError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
-    _tell(runs, f"{count} {'tables' if options.what == 'tables' else 'figures'}", out)
+    _tell(runs, made, out)
     return 0
+
+
+def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
+    if runs.table.empty:
+        where = ", ".join(map(str, sources))
+        raise ResultsError(
+            f"there are no finished runs to show in {where}: python -m plab.run task=Move makes one, "
+            "and --results example shows those that come with plab"
+        )
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -66,7 +83,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=["tables", "curves"], help="what to make")
+    parser.add_argument("what", choices=["tables", "curves", "html"], help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
     what = (
         "folder of results, archive, or several; 'example': real runs that come with plab (default: results)"
@@ -75,6 +92,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
+    what = "html: draw no pictures, which takes minutes; those that are there stay"
+    parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
     options.words += [item for item in options.results if "=" in item]
@@ -180,14 +199,8 @@ def _benchmark(path: Path) -> pd.DataFrame:
 def _tell(runs: Runs, what: str, out: Path) -> None:
     expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
     print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
-    for count, what in (
-        (runs.unfinished, "are not finished, hence not in them"),
-        (runs.others, "are of other tasks, variants, methods or seeds, hence not in them"),
-        (runs.set_aside, "try other settings than conf/ has, hence are not in them"),
-        (len(runs.unreadable), "cannot be read: python -m plab.results check"),
-    ):
-        if count:
-            print(f"{count} run(s) {what}")
+    for line in runs.left_out():
+        print(line)
 
 
 if __name__ == "__main__":
