@@ -2,6 +2,7 @@
 
 python -m plab.report tables --results results --out reports/tables
 python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
+python -m plab.report notebooks --results example
 python -m plab.report html --results example           real runs that come with plab
 """
 
@@ -23,6 +24,7 @@ from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, 
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
+from plab.report.notebooks import NOTEBOOKS, execute
 from plab.report.page import write_page
 from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
@@ -51,6 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif options.what == "curves":
             ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
             made = f"{len(write_curves(runs, ablation, out, command))} figures"
+        elif options.what == "notebooks":
+            _require_runs(runs, options.results)
+            given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
+            given |= {"BENCH": str(options.bench), "COMMAND": command}
+            made = f"{len(execute(NOTEBOOKS, given, out))} notebooks"
         else:
             _require_runs(runs, options.results)
             trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
@@ -83,7 +90,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=["tables", "curves", "html"], help="what to make")
+    parser.add_argument("what", choices=["tables", "curves", "notebooks", "html"], help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
     what = (
         "folder of results, archive, or several; 'example': real runs that come with plab (default: results)"
@@ -92,6 +99,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
+    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
+    parser.add_argument("--bench", type=Path, default=Path("reports/bench"), help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     options = parser.parse_intermixed_args(argv)
