@@ -6,6 +6,7 @@
 # make tables   the paper's tables beside ours, from results alone: reports/tables; RESULTS=folder or archive, or
 #               RESULTS=example: real runs that come with plab
 # make curves   the paper's curves and more, from results alone: reports/curves
+# make report   notebooks on reproduction, speed, accuracy and a single run: reports/notebooks/*.html
 # make html     a page of all results, with curves, pictures and films: reports/html/index.html
 # make browser-packages   on Debian or Ubuntu, as root: Chromium, with which the page is tested
 # make tex-packages   on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
@@ -19,7 +20,7 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint clean system-packages tex-packages browser-packages tables curves html
+.PHONY: run test test-slow lint clean system-packages tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
@@ -49,7 +50,10 @@ tables: $(VENV)/.run.stamp
 curves: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.report curves --results $(RESULTS) --out $(REPORTS)/curves
 
-html: $(VENV)/.run.stamp
+report: $(VENV)/.report.stamp
+	$(BIN)/python -m plab.report notebooks --results $(RESULTS) --out $(REPORTS)/notebooks
+
+html: $(VENV)/.report.stamp
 	$(BIN)/python -m plab.report html --results $(RESULTS) --out $(REPORTS)/html
 
 clean:
@@ -61,9 +65,13 @@ $(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e .
 	touch $@
 
+$(VENV)/.report.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e ".[report]"
+	touch $@ $(VENV)/.run.stamp
+
 $(VENV)/.dev.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
-	touch $@ $(VENV)/.run.stamp
+	touch $@ $(VENV)/.run.stamp $(VENV)/.report.stamp
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -25,16 +25,11 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 # %%
 import pandas as pd
 
-from plab.report.costs import (
-    ACCURACY_COLUMNS,
-    PRECISION_COLUMNS,
-    contact_models,
-    precision_summary,
-    work_precision,
-)
+from plab.report.costs import contact_models, precision_summary, work_precision
 from plab.report.figures import style
+from plab.report.measurements import ACCURACY, PRECISION, origin
 from plab.report.methods import method
-from plab.report.notebook import gather, read_csv, show_figure, show_origin, show_table
+from plab.report.notebook import benchmark, gather, show_figure, show_origin, show_table
 from plab.report.series import load_series
 
 runs = gather(RESULTS, WORDS)
@@ -44,7 +39,7 @@ show_origin(runs, COMMAND)
 # ## Run time against error
 
 # %%
-table = read_csv(f"{BENCH}/accuracy.csv", ACCURACY_COLUMNS, f"python -m plab.bench.accuracy --output {BENCH}")
+table = benchmark(BENCH, ACCURACY)
 if table is not None:
     with style():
         drawing = work_precision(table)
@@ -54,11 +49,9 @@ if table is not None:
 # ## float32 against float64
 
 # %%
-table = read_csv(
-    f"{BENCH}/precision.csv", PRECISION_COLUMNS, f"python -m plab.bench.precision --csv {BENCH}/precision.csv"
-)
+table = benchmark(BENCH, PRECISION)
 if table is not None:
-    show_table(precision_summary(table))
+    show_table(precision_summary(table), origin(table))
 
 # %% [markdown]
 # ## Soft and hard contact

@@ -23,22 +23,21 @@ BENCH = "reports/bench"  # folder of the benchmarks' CSV files
 COMMAND = "Jupyter"  # what is given as the command that made this
 
 # %%
-from plab.report.costs import SPEED_COLUMNS, phases, step_times
+from plab.report.costs import phases, step_times
 from plab.report.figures import style
-from plab.report.notebook import gather, read_csv, say, show_figure, show_origin, show_table
+from plab.report.measurements import SPEED
+from plab.report.notebook import benchmark, gather, say, show_figure, show_origin, show_table
 from plab.report.times import timing
 
 runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
-benchmark = read_csv(
-    f"{BENCH}/speed.csv", SPEED_COLUMNS, f"python -m plab.bench.speed --paper --csv {BENCH}/speed.csv"
-)
+speed = benchmark(BENCH, SPEED)
 
 # %% [markdown]
 # ## Time per environment step
 
 # %%
-ours, paper, compared = timing(runs, benchmark)
+ours, paper, compared = timing(runs, speed)
 show_table(compared)
 
 # %%

@@ -21,9 +21,11 @@ import pandas as pd
 import plab
 from plab.examples import resolve
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
+from plab.report.costs import work_precision
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
+from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.notebooks import NOTEBOOKS, execute
 from plab.report.page import write_page
 from plab.report.series import load_rows, load_series
@@ -48,11 +50,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         chosen = select(options.words, NAMES)
         runs = collect(options.results, chosen)
         if options.what == "tables":
-            benchmark = None if options.speed is None else _benchmark(options.speed)
+            benchmark = None if options.speed is None else measured(options.speed, SPEED)
             made = f"{len(write_tables(runs, out, command, benchmark))} tables"
         elif options.what == "curves":
             ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
-            made = f"{len(write_curves(runs, ablation, out, command))} figures"
+            errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
+            made = f"{len(write_curves(runs, ablation, out, command, errors))} figures"
         elif options.what == "notebooks":
             _require_runs(runs, options.results)
             given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
@@ -99,6 +102,8 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
+    what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
+    parser.add_argument("--accuracy", type=Path, help=what)
     what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
     parser.add_argument("--bench", type=Path, default=Path("reports/bench"), help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
@@ -140,7 +145,9 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     return tables
 
 
-def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str) -> list[Drawing]:
+def write_curves(
+    runs: Runs, ablation: Ablation | None, out: Path, command: str, errors: pd.DataFrame | None = None
+) -> list[Drawing]:
     """Draw all figures that there are runs for.
 
     Args:
@@ -148,6 +155,7 @@ def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str)
         ablation: Runs that differ in the yield stress, or None.
         out: Folder to write to.
         command: What is given as the command that makes them.
+        errors: What ``python -m plab.bench.accuracy`` measured, or None.
 
     Returns:
         The figures.
@@ -165,6 +173,8 @@ def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str)
         if ablation is not None:
             groups = {value: [load_rows(path) for path in paths] for value, paths in ablation.paths.items()}
             drawings += yield_ablation(groups, f"{ablation.task}-v{ablation.variant}", ablation.method)
+        if errors is not None:
+            drawings += [drawing for drawing in [work_precision(errors)] if drawing is not None]
         _write_runs(runs, out)
         save(drawings, out, _origin(runs, command, deep=False))
     return drawings
@@ -192,17 +202,6 @@ def _write_runs(runs: Runs, out: Path) -> None:
     known = runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else []
     out.mkdir(parents=True, exist_ok=True)
     (out / "runs.json").write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
-
-
-def _benchmark(path: Path) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path, comment="#")
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"cannot read {path}: {error}") from error
-    wanted = {"task", "device", "batch", "forward_ms", "gradient_ms"}
-    if missing := sorted(wanted - set(table)):
-        raise ResultsError(f"{path} lacks {', '.join(missing)}: make it with plab.bench.speed --paper --csv")
-    return table
 
 
 def _tell(runs: Runs, what: str, out: Path) -> None:

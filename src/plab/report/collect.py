@@ -137,7 +137,9 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     finished = _prefer_usual(complete)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
-    table = pd.DataFrame(values, columns=None if finished else [*NAMES, "score", "path", *KEYS])
+    table = pd.DataFrame(
+        values, columns=None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
+    )
     return Runs(
         table=table.astype({"seed": str}),
         tasks=asked["task"],

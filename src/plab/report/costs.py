@@ -10,14 +10,12 @@ import pandas as pd
 from plab.report.collect import Runs
 from plab.report.curves import Series
 from plab.report.figures import Drawing, grid, legend, legend_of_methods, log_axis
+from plab.report.measurements import origin
 from plab.report.methods import method
 from plab.report.tables import ordered_tasks
 
 __all__ = [
-    "ACCURACY_COLUMNS",
     "PHASES",
-    "PRECISION_COLUMNS",
-    "SPEED_COLUMNS",
     "contact_models",
     "phases",
     "precision_summary",
@@ -27,26 +25,6 @@ __all__ = [
 
 PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
 """Phases of a run, with their colours."""
-
-SPEED_COLUMNS = ("task", "device", "batch", "forward_ms", "gradient_ms")
-"""Columns that are needed of what ``python -m plab.bench.speed --paper`` writes."""
-
-ACCURACY_COLUMNS = (
-    "axis",
-    "task",
-    "contact",
-    "precision",
-    "material",
-    "substeps",
-    "ms_per_step",
-    "positions",
-    "gradient",
-    "outcome",
-)
-"""Columns that are needed of what ``python -m plab.bench.accuracy`` writes."""
-
-PRECISION_COLUMNS = ("task", "actions", "difference", "angle_deg", "failures")
-"""Columns that are needed of what ``python -m plab.bench.precision`` writes."""
 
 _FLOOR = 1e-16
 """Errors are drawn no smaller than this."""
@@ -106,19 +84,21 @@ def phases(runs: Runs) -> Drawing | None:
 # ----------------------------------------------------------------------------------------- run time and error
 
 
-def work_precision(table: pd.DataFrame) -> Drawing:
-    """Draw run time against error, per task and contact model.
+def work_precision(table: pd.DataFrame) -> Drawing | None:
+    """Draw run time against error, per task and contact model; None where nothing was varied.
 
     Args:
-        table: What ``python -m plab.bench.accuracy`` writes: :data:`ACCURACY_COLUMNS`.
+        table: What ``python -m plab.bench.accuracy`` wrote, see :func:`plab.report.measurements.measured`.
     """
     table = table[(table["axis"] == "substeps") & (table["material"] == "series")]
+    if table.empty:
+        return None
     tasks, contacts = list(dict.fromkeys(table["task"])), list(dict.fromkeys(table["contact"]))
     shown = {"positions": "final positions, RMS", "gradient": "norm of the gradient, relative"}
-    figure, axes = grid(len(shown) * len(contacts), max(len(tasks), 1), width=2.3, height=1.9)
+    figure, axes = grid(len(shown) * len(contacts), len(tasks), width=2.3, height=1.9)
     lines = [(column, text, contact) for column, text in shown.items() for contact in contacts]
     for line, (column, text, contact) in zip(axes, lines, strict=True):
-        for panel, task in zip(line, tasks, strict=False):
+        for panel, task in zip(line, tasks, strict=True):
             own = table[(table["task"] == task) & (table["contact"] == contact)]
             for precision, rows in own.groupby("precision", sort=False):
                 stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
@@ -143,7 +123,8 @@ def work_precision(table: pd.DataFrame) -> Drawing:
     legend(figure)
     notes = [
         "Error against a reference in float64 with many more substeps; numbers: substeps per environment "
-        "step. Settings that diverge are left out."
+        "step. Settings that diverge are left out.",
+        *origin(table),
     ]
     return Drawing("run_time_against_error", figure, notes)
 
@@ -155,7 +136,7 @@ def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
     """Return the worst and the median difference of float32 from float64, per task and kind of actions.
 
     Args:
-        table: What ``python -m plab.bench.precision`` writes: :data:`PRECISION_COLUMNS`.
+        table: What ``python -m plab.bench.precision`` wrote, read by the same.
     """
     rows = []
     for (task, kind), own in table.groupby(["task", "actions"], sort=False):

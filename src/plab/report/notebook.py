@@ -14,10 +14,12 @@ from IPython.display import HTML, Image, Markdown, display
 from plab.examples import resolve
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
+from plab.report.measurements import Benchmark, measured
 from plab.report.table import Table
+from plab.results import ResultsError
 from plab.selection import select
 
-__all__ = ["gather", "read_csv", "say", "show_figure", "show_origin", "show_table"]
+__all__ = ["benchmark", "gather", "say", "show_figure", "show_origin", "show_table"]
 
 _DPI = 180
 _COLOURS = {
@@ -98,28 +100,19 @@ def show_figure(drawing: Drawing | None) -> None:
     display(HTML(f'<p class="note">{escape(" ".join(drawing.notes))}</p>'))
 
 
-def read_csv(path: str | Path, columns: Sequence[str], command: str) -> pd.DataFrame | None:
-    """Return a benchmark's file, or say what makes it.
+def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
+    """Return what a benchmark measured, or say what makes its file.
 
     Args:
-        path: The file.
-        columns: Columns that are needed.
-        command: The command that writes it.
+        folder: Folder of the benchmarks' files.
+        which: The benchmark.
 
     Returns:
-        Its rows; None where it is missing or not what it should be.
+        Its rows; None where the file is missing or not what it should be.
     """
-    advice = f"`{command}` makes it."
-    if not Path(path).is_file():
-        say(f"There is no `{path}`: {advice}")
-        return None
     try:
-        table = pd.read_csv(path, comment="#")
-    except ValueError as error:
-        say(f"`{path}` cannot be read ({error}): {advice}")
+        return measured(Path(folder) / which.file, which)
+    except ResultsError as error:
+        text = str(error)
+        say(f"{text[0].upper()}{text[1:]}.")
         return None
-    if lacking := [name for name in columns if name not in table]:
-        say(f"`{path}` lacks {', '.join(lacking)}: {advice}")
-        return None
-    say(f"From `{path}`, {len(table)} rows; {advice}")
-    return table

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs
+from plab.report.measurements import origin
 from plab.report.reference import paper_table
 from plab.report.statistics import Interval, Summary, stratified_difference, summarise
 from plab.report.table import NOTHING, Table, number, spread
@@ -45,7 +46,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
     return [
         _our_times(rows, runs),
         _papers_times(tasks, paper),
-        _compared_times(compared, runs),
+        _compared_times(compared, runs, origin(benchmark)),
     ]
 
 
@@ -158,7 +159,7 @@ def _papers_times(tasks: Sequence[str], paper: pd.DataFrame) -> Table:
     return Table("timing", "paper", "Time per environment step, the paper", cells, data, notes=notes)
 
 
-def _compared_times(rows: list[dict[str, object]], runs: Runs) -> Table:
+def _compared_times(rows: list[dict[str, object]], runs: Runs, more: list[str]) -> Table:
     cells = [
         {
             "task": row["task"],
@@ -186,6 +187,7 @@ def _compared_times(rows: list[dict[str, object]], runs: Runs) -> Table:
         _TIMES,
         "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
         "measurements, for the paper gives no spread.",
+        *more,
         *settings_note(runs),
     ]
     data = pd.DataFrame(rows, columns=None if rows else ["task", "measured", "what", "measurements", "ms"])
