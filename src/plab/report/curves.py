@@ -182,6 +182,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     panel.set_ylim(0.0, 1.08)
     panel.set_ylabel("normalised incremental IoU")
     panel.grid(axis="x", visible=False)
+    panel.set_axisbelow(True)
     legend(figure)
     notes = [
         "Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs.",

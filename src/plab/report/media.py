@@ -125,7 +125,14 @@ def draw_missing(wanted: Sequence[Shown], out: Path) -> None:
         for task, group in by_task.items():
             try:
                 made = _replayed(group)
-            except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
+            except (
+                RenderError,
+                ConfigError,
+                SceneError,
+                TargetError,
+                DeviceError,
+                SimulationError,
+            ) as error:
                 troubles.append(f"{task} cannot be replayed: {error}")
                 continue
             for shown in group:

@@ -157,7 +157,7 @@ const plab = (() => {
   function pictures(one) {
     const made = ["start", "target"].filter((what) => one.pictures[what]);
     if (!made.length) {
-      return make("p", { class: "missing" }, "No pictures: they need OpenGL and ", make("code", {}, "pip install 'plab[render]'"), "; the same command then adds them.");
+      return make("p", { class: "missing" }, "No pictures yet: ", make("code", {}, "python -m plab.report html"), " draws them where there is OpenGL, with ", make("code", {}, "pip install 'plab[render]'"), ".");
     }
     return make("div", { class: "pictures" }, ...made.map((what) => make("figure", {},
       make("img", { src: one.pictures[what], alt: `${one.name}: ${what}`, width: 480, height: 360 }),
