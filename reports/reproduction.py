@@ -14,8 +14,8 @@
 # # Reproduction
 #
 # plab's scores beside those that Huang et al. print (PlasticineLab, ICLR 2021): normalised incremental IoU
-# of the final evaluation, in the hard contact model. Every number comes from result files; nothing is
-# typed in.
+# of the final evaluation, in the hard contact model. Ours come from result files alone, the paper's
+# from `src/plab/report/paper/`.
 
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab

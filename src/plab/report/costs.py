@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 
 from plab.report.collect import Runs
 from plab.report.curves import Series
@@ -95,31 +96,15 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
         return None
     tasks, contacts = list(dict.fromkeys(table["task"])), list(dict.fromkeys(table["contact"]))
     shown = {"positions": "final positions, RMS", "gradient": "norm of the gradient, relative"}
-    figure, axes = grid(len(shown) * len(contacts), len(tasks), width=2.3, height=1.9)
-    lines = [(column, text, contact) for column, text in shown.items() for contact in contacts]
-    for line, (column, text, contact) in zip(axes, lines, strict=True):
-        for panel, task in zip(line, tasks, strict=True):
+    columns = [(column, text, contact) for column, text in shown.items() for contact in contacts]
+    figure, axes = grid(len(tasks), len(columns), width=2.2, height=1.9)
+    for line, task in zip(axes, tasks, strict=True):
+        for panel, (column, text, contact) in zip(line, columns, strict=True):
             own = table[(table["task"] == task) & (table["contact"] == contact)]
-            for precision, rows in own.groupby("precision", sort=False):
-                stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
-                colour, mark = _PRECISIONS.get(precision, ("#777777", "x"))
-                error = stable[column].astype(float).clip(lower=_FLOOR)
-                panel.plot(
-                    stable["ms_per_step"],
-                    error,
-                    mark,
-                    color=colour,
-                    linestyle="-",
-                    markersize=3.5,
-                    label=precision,
-                )
-                for x, y, steps in zip(stable["ms_per_step"], error, stable["substeps"], strict=True):
-                    panel.annotate(str(steps), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
-            panel.set_xscale("log")
-            panel.set_yscale("log")
+            _errors(panel, own, column)
             panel.set_title(f"{task}, {contact} contact")
-            panel.set_xlabel("ms per step with gradient")
-        line[0].set_ylabel(text)
+            log_axis(panel, "ms per step with gradient")
+            log_axis(panel, text, vertical=True)
     legend(figure)
     notes = [
         "Error against a reference in float64 with many more substeps; numbers: substeps per environment "
@@ -127,6 +112,17 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
         *origin(table),
     ]
     return Drawing("run_time_against_error", figure, notes)
+
+
+def _errors(panel: Axes, own: pd.DataFrame, column: str) -> None:
+    """Draw a line per precision, each point with its number of substeps."""
+    for precision, rows in own.groupby("precision", sort=False):
+        stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
+        colour, mark = _PRECISIONS.get(precision, ("#777777", "x"))
+        times, error = stable["ms_per_step"], stable[column].astype(float).clip(lower=_FLOOR)
+        panel.plot(times, error, f"{mark}-", color=colour, markersize=3.5, label=precision)
+        for x, y, steps in zip(times, error, stable["substeps"], strict=True):
+            panel.annotate(str(steps), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
 
 
 _PRECISIONS = {"float32": ("#D55E00", "o"), "float64": ("#0072B2", "s")}

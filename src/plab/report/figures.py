@@ -107,15 +107,15 @@ def draw_band(
     axes.fill_between(drawn.x, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
-def log_axis(axes: Axes, label: str) -> None:
-    """Make the horizontal axis logarithmic, with numbers that have room; to be called after drawing."""
-    axes.set_xscale("log")
-    axes.set_xlabel(label)
-    low, high = axes.get_xlim()
+def log_axis(axes: Axes, label: str, *, vertical: bool = False) -> None:
+    """Make an axis logarithmic, with numbers that have room; to be called after drawing."""
+    axis = axes.yaxis if vertical else axes.xaxis
+    axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}label": label})
+    low, high = axis.get_view_interval()
     # A decade or less would have one number, or all of them on top of each other.
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(_tick))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(_tick))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _tick(value: float, _position: int) -> str:
