@@ -1,9 +1,9 @@
-"""The paper's tables and curves, and a page of all results, from result files alone.
+"""The paper's tables and curves, notebooks and a page of all results, from result files alone.
 
 python -m plab.report tables --results results --out reports/tables
 python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
 python -m plab.report notebooks --results example
-python -m plab.report html --results example           real runs that come with plab
+python -m plab.report html --results example         real runs that come with plab
 """
 
 from __future__ import annotations
@@ -47,26 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = shlex.join(["python", "-m", "plab.report", *arguments])
     out = options.out or Path("reports") / options.what
     try:
-        chosen = select(options.words, NAMES)
-        runs = collect(options.results, chosen)
-        if options.what == "tables":
-            benchmark = None if options.speed is None else measured(options.speed, SPEED)
-            made = f"{len(write_tables(runs, out, command, benchmark))} tables"
-        elif options.what == "curves":
-            ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
-            errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
-            made = f"{len(write_curves(runs, ablation, out, command, errors))} figures"
-        elif options.what == "notebooks":
-            _require_runs(runs, options.results)
-            given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
-            given |= {"BENCH": str(options.bench), "COMMAND": command}
-            made = f"{len(execute(NOTEBOOKS, given, out))} notebooks"
-        else:
-            _require_runs(runs, options.results)
-            trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
-            if trouble:
-                print(f"plab: without pictures: {trouble}", file=sys.stderr)
-            made = "index.html"
+        runs = collect(options.results, select(options.words, NAMES))
+        made = _MAKERS[options.what](runs, options, out, command)
     except (ResultsError, SelectionError, MixedRunsError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2
@@ -75,6 +57,36 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     _tell(runs, made, out)
     return 0
+
+
+def _make_tables(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    benchmark = None if options.speed is None else measured(options.speed, SPEED)
+    return f"{len(write_tables(runs, out, command, benchmark))} tables"
+
+
+def _make_curves(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    ablation = collect_ablation(options.results, select(options.words, NAMES), YIELD_STRESS)
+    errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
+    return f"{len(write_curves(runs, ablation, out, command, errors))} figures"
+
+
+def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    _require_runs(runs, options.results)
+    given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
+    given |= {"BENCH": str(options.bench), "COMMAND": command}
+    return f"{len(execute(NOTEBOOKS, given, out))} notebooks"
+
+
+def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    _require_runs(runs, options.results)
+    trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
+    if trouble:
+        print(f"plab: without pictures: {trouble}", file=sys.stderr)
+    return "index.html"
+
+
+_MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
+"""What can be made; each returns what it was in a word or two."""
 
 
 def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
@@ -93,11 +105,9 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=["tables", "curves", "notebooks", "html"], help="what to make")
+    parser.add_argument("what", choices=list(_MAKERS), help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
-    what = (
-        "folder of results, archive, or several; 'example': real runs that come with plab (default: results)"
-    )
+    what = "folder of results, archive, or several; 'example' is one of real runs (default: results)"
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
