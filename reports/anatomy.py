@@ -31,7 +31,7 @@ import pandas as pd
 import yaml
 from IPython.display import HTML, Image, display
 
-from plab.render import RenderError
+from plab.render import RenderError, require_graphics
 from plab.report import anatomy
 from plab.report.collect import changed_settings
 from plab.report.figures import style
@@ -100,7 +100,10 @@ if run is not None and run.best_actions is not None:
     with tempfile.TemporaryDirectory() as folder:
         picture = Path(folder) / "strip.png"
         try:
-            anatomy.strip(run.path, picture)
+            require_graphics()
+            from plab.render.replays import draw_strip
+
+            draw_strip(run.path, picture)
             display(Image(picture.read_bytes(), width=1000, alt="start, target and end"))
         except RenderError as error:
             say(f"No pictures: {error}")

@@ -12,7 +12,7 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +20,22 @@ import pandas as pd
 
 import plab
 from plab.examples import resolve
+from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
 from plab.report.costs import work_precision
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
-from plab.report.notebooks import NOTEBOOKS, execute
-from plab.report.page import write_page
+from plab.report.media import lacking, remove_earlier
+from plab.report.notebooks import NOTEBOOKS, execute, require_packages
+from plab.report.page import write_overview, write_page
 from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
+from plab.runners.progress import show_progress
 from plab.selection import SelectionError, select
 
 __all__ = ["main", "write_curves", "write_tables"]
@@ -74,15 +77,32 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
     _require_runs(runs, options.results)
     given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
     given |= {"BENCH": str(options.bench), "COMMAND": command}
-    return f"{len(execute(NOTEBOOKS, given, out))} notebooks"
+    require_packages()
+    with show_progress("notebooks", 0, len(NOTEBOOKS), plain_every=1) as report:
+        return f"{len(execute(NOTEBOOKS, given, out, report))} notebooks"
 
 
 def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
     _require_runs(runs, options.results)
-    trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
-    if trouble:
-        print(f"plab: without pictures: {trouble}", file=sys.stderr)
+    origin = _origin(runs, command, deep=False)
+    # It is complete but for pictures before the first of them is drawn.
+    write_page(runs, out, origin)
+    if options.pictures and (wanted := lacking(runs, out)):
+        try:
+            _draw(wanted)
+        except RenderError as error:
+            print(f"plab: without pictures: {error}", file=sys.stderr)
+        remove_earlier(runs, out)
+        write_overview(runs, out, origin)
     return "index.html"
+
+
+def _draw(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
+    require_graphics()
+    # Imported here: all else needs neither PyVista nor Taichi.
+    from plab.render.replays import draw_runs
+
+    draw_runs(wanted)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 
@@ -12,7 +10,7 @@ from plab.report.figures import Drawing, grid, legend
 from plab.report.methods import method
 from plab.results import RunResult
 
-__all__ = ["actions", "facts", "loss_terms", "measures", "strip", "times"]
+__all__ = ["actions", "facts", "loss_terms", "measures", "times"]
 
 _TERMS = {"density": "#0072B2", "sdf": "#D55E00", "contact": "#009E73"}
 
@@ -115,32 +113,6 @@ def times(run: RunResult) -> Drawing:
         figure,
         [f"Wall time by phase and by row{share}. The first row, which compiles, is left out on the right."],
     )
-
-
-def strip(path: str | Path, picture: Path) -> None:
-    """Replay a run and draw start, target and end side by side.
-
-    Args:
-        path: The result file.
-        picture: PNG file to write.
-
-    Raises:
-        plab.render.RenderError: If this computer cannot draw, or the run cannot be replayed.
-    """
-    from plab.render import RenderError, require_graphics
-
-    require_graphics()
-    # Imported here: they load the simulator.
-    from plab.render import recording
-    from plab.render.pictures import save
-    from plab.scene import SceneError
-    from plab.sim import DeviceError, SimulationError
-    from plab.targets import TargetError
-
-    try:
-        save(recording.record(*recording.result(Path(path))), picture, (480, 360))
-    except (SceneError, DeviceError, SimulationError, TargetError) as error:
-        raise RenderError(str(error)) from error
 
 
 def facts(run: RunResult) -> pd.DataFrame:

@@ -1,34 +1,25 @@
-"""Pictures and films for the page of results: the best run of each method, replayed and drawn."""
+"""Which runs the page of results shows in pictures and films, and where these are.
+
+Drawing is :mod:`plab.render`'s.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import hashlib
 import json
 import shutil
-import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from plab.report.collect import Runs
-from plab.runners.progress import show_progress
 
-if TYPE_CHECKING:
-    from plab.config_types import Config
-    from plab.render.recording import Recording
-
-__all__ = ["FOLDER", "Shown", "best_runs", "draw_missing", "present"]
+__all__ = ["FOLDER", "Shown", "best_runs", "lacking", "present", "remove_earlier"]
 
 FOLDER = "media"
 """Folder of pictures, below that of the page."""
-
-_SIZE = (480, 360)
 
 
 @dataclass(frozen=True)
@@ -92,84 +83,34 @@ def present(shown: Shown, out: Path) -> dict[str, str]:
     return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
 
 
-def draw_missing(wanted: Sequence[Shown], out: Path) -> None:
-    """Draw the pictures that are not there yet; those of runs that are no longer the best are removed.
+def lacking(runs: Runs, out: Path) -> dict[Path, dict[str, Path]]:
+    """Return what is to be drawn: the folder of each configuration's pictures, and the runs that they show.
 
     Args:
-        wanted: Configurations.
+        runs: Our runs.
         out: Folder of the page.
 
-    Raises:
-        plab.render.RenderError: If this computer cannot draw, a file cannot be written, or runs of a task
-            cannot be replayed; the pictures of the others are there.
+    Returns:
+        Result files by method, by folder; those whose folder is not there.
     """
-    lacking = [shown for shown in wanted if not present(shown, out)]
-    if not lacking:
-        return
-    from plab.render import RenderError, require_graphics
-
-    require_graphics()
-    # Imported here: a page without pictures needs neither PyVista nor Taichi.
-    from plab.config import ConfigError
-    from plab.render.pictures import save_set
-    from plab.scene import SceneError
-    from plab.sim import DeviceError, SimulationError
-    from plab.targets import TargetError
-
-    by_task: dict[str, list[Shown]] = defaultdict(list)
-    for shown in lacking:
-        by_task[shown.task].append(shown)
-    troubles = []
-    with show_progress("pictures", 0, len(lacking), plain_every=1) as report:
-        done = 0
-        for task, group in by_task.items():
-            try:
-                made = _replayed(group)
-            except (
-                RenderError,
-                ConfigError,
-                SceneError,
-                TargetError,
-                DeviceError,
-                SimulationError,
-            ) as error:
-                troubles.append(f"{task} cannot be replayed: {error}")
-                continue
-            for shown in group:
-                files = {method: made[shown.name, method] for method in shown.runs}
-                _fill(out / FOLDER, shown, functools.partial(save_set, files, size=_SIZE))
-                done += 1
-                report(done, shown.name)
-    if troubles:
-        raise RenderError("; ".join(troubles))
+    folders = {out / FOLDER / shown.folder: shown for shown in best_runs(runs)}
+    return {
+        folder: {method: Path(run["path"]) for method, run in shown.runs.items()}
+        for folder, shown in folders.items()
+        if not folder.is_dir()
+    }
 
 
-def _replayed(group: Sequence[Shown]) -> dict[tuple[str, str], Recording]:
-    """Replay all runs of one task; those of the same settings share a simulator."""
-    from plab.render import recording
+def remove_earlier(runs: Runs, out: Path) -> None:
+    """Remove pictures of runs that are no longer the best, where there are those of the best.
 
-    alike: dict[str, list[tuple[tuple[str, str], Config, np.ndarray]]] = defaultdict(list)
-    for shown in group:
-        for method, run in shown.runs.items():
-            cfg, actions = recording.result(Path(run["path"]))
-            kind = json.dumps([dataclasses.asdict(cfg.sim), actions.shape])
-            alike[kind].append(((shown.name, method), cfg, actions))
-    made = {}
-    for cases in alike.values():
-        names, cfgs, actions = zip(*cases, strict=True)
-        made |= dict(zip(names, recording.record_all(cfgs, np.stack(actions)), strict=True))
-    return made
-
-
-def _fill(folder: Path, shown: Shown, write: Callable[[Path], None]) -> None:
-    """Write a configuration's pictures, all or none, and remove those of earlier runs."""
-    folder.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=".", dir=folder))
-    try:
-        write(fresh)
-        fresh.chmod(0o755)
-        for old in folder.glob(f"{shown.name}-{'[0-9a-f]' * 8}"):
-            shutil.rmtree(old)
-        fresh.rename(folder / shown.folder)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+    Args:
+        runs: Our runs.
+        out: Folder of the page.
+    """
+    for shown in best_runs(runs):
+        current = out / FOLDER / shown.folder
+        if current.is_dir():
+            for folder in (out / FOLDER).glob(f"{shown.name}-{'[0-9a-f]' * 8}"):
+                if folder != current:
+                    shutil.rmtree(folder)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from plab.results import ResultsError
-from plab.runners.progress import show_progress
 
 __all__ = ["NOTEBOOKS", "execute", "notebook_folder", "require_packages"]
 
@@ -46,13 +44,16 @@ def require_packages() -> None:
         )
 
 
-def execute(names: Sequence[str], parameters: Mapping[str, Any], out: Path) -> list[Path]:
+def execute(
+    names: Sequence[str], parameters: Mapping[str, Any], out: Path, report: Callable[[int, str], None]
+) -> list[Path]:
     """Execute notebooks and write each as a page, and as a notebook with its outputs.
 
     Args:
         names: Names among :data:`NOTEBOOKS`.
         parameters: Values for the names in the notebooks' cell ``parameters``.
         out: Folder to write to.
+        report: Is told how many are done, and the last one's name.
 
     Returns:
         The pages.
@@ -63,14 +64,13 @@ def execute(names: Sequence[str], parameters: Mapping[str, Any], out: Path) -> l
     require_packages()
     out.mkdir(parents=True, exist_ok=True)
     pages = []
-    with show_progress("notebooks", 0, len(names), plain_every=1) as report:
-        for number, name in enumerate(names, start=1):
-            notebook = _executed(name, parameters)
-            (out / f"{name}.ipynb").write_text(_text(notebook), encoding="utf-8", newline="\n")
-            page = out / f"{name}.html"
-            page.write_text(_page(notebook, name, names), encoding="utf-8", newline="\n")
-            pages.append(page)
-            report(number, name)
+    for number, name in enumerate(names, start=1):
+        notebook = _executed(name, parameters)
+        (out / f"{name}.ipynb").write_text(_text(notebook), encoding="utf-8", newline="\n")
+        page = out / f"{name}.html"
+        page.write_text(_page(notebook, name, names), encoding="utf-8", newline="\n")
+        pages.append(page)
+        report(number, name)
     return pages
 
 
@@ -121,6 +121,4 @@ def _page(notebook: Any, name: str, names: Sequence[str]) -> str:
         for file in ("notebook.html", "page.css", "notebook.css")
     }
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["notebook.html"])
-    return template.render(
-        style=Markup(text["page.css"] + text["notebook.css"]), body=Markup(body), name=name, names=names
-    )
+    return template.render(style=text["page.css"] + text["notebook.css"], body=body, name=name, names=names)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from plab.report.collect import Runs, changed_settings
-from plab.report.media import Shown, best_runs, draw_missing, present
+from plab.report.media import Shown, best_runs, present
 from plab.report.methods import Method, method
 from plab.report.series import AXES, Band, band, rows_on_axes
 from plab.report.statistics import stratified_difference
 from plab.report.tables import Cell, Cells, ordered_tasks, settings_note
 from plab.results import RunResult, read
 
-__all__ = ["write_page"]
+__all__ = ["write_overview", "write_page"]
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
 """What curves show, and below what values count as this, as in the paper's figures."""
@@ -40,41 +39,24 @@ _DIGITS = 4
 """Significant digits of the curves' numbers."""
 
 
-def write_page(runs: Runs, out: Path, origin: Mapping[str, Any], *, pictures: bool = True) -> str | None:
-    """Write the page, and draw the pictures that it lacks.
-
-    The page is complete but for them before the first is drawn, and is written again after the last.
+def write_page(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
+    """Write the page, with the pictures that are there.
 
     Args:
         runs: Our runs.
-        out: Folder to write to; its pictures are kept.
-        origin: What is said about where the page comes from: ``command``, ``digest``.
-        pictures: Whether to draw pictures that are not there yet.
-
-    Returns:
-        Why pictures are missing, or None.
+        out: Folder to write to.
+        origin: What is said about where the page comes from: ``command``, ``digest``, ``plab``.
     """
-    wanted = best_runs(runs)
     (out / "data").mkdir(parents=True, exist_ok=True)
-    for shown in wanted:
+    for shown in best_runs(runs):
         text = json.dumps(_details(shown, runs), separators=(",", ":"), allow_nan=False)
         script = f"plab.receive({json.dumps(shown.name)},{text});\n"
         (out / "data" / f"{shown.name}.js").write_text(script, encoding="utf-8", newline="\n")
-    _write_index(runs, wanted, out, origin)
-    if not pictures:
-        return None
-    from plab.render import RenderError
-
-    trouble = None
-    try:
-        draw_missing(wanted, out)
-    except RenderError as error:
-        trouble = str(error)
-    _write_index(runs, wanted, out, origin)
-    return trouble
+    write_overview(runs, out, origin)
 
 
-def _write_index(runs: Runs, wanted: Sequence[Shown], out: Path, origin: Mapping[str, Any]) -> None:
+def write_overview(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
+    """Write ``index.html`` alone, as :func:`write_page` does: when there are more pictures than before."""
     folder = files("plab.report") / "web"
     text = {
         name: (folder / name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "page.js")
@@ -82,16 +64,16 @@ def _write_index(runs: Runs, wanted: Sequence[Shown], out: Path, origin: Mapping
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["page.html"])
     content = {
         "methods": [_look(method(name)) for name in runs.methods],
-        "configurations": _overview(runs, {shown.name: present(shown, out) for shown in wanted}),
+        "configurations": _overview(runs, {shown.name: present(shown, out) for shown in best_runs(runs)}),
         "axes": list(AXES),
         "columns": list(_COLUMNS),
     }
     known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
     html = template.render(
-        style=Markup(text["page.css"]),
-        script=Markup(text["page.js"]),
-        # The only signs with which text could leave the script that it is in.
-        content=Markup(json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")),
+        style=text["page.css"],
+        script=text["page.js"],
+        # The only sign with which text could leave the script that it is in.
+        content=json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         methods=[method(name) for name in runs.methods],
         origin=origin,
         runs=sorted(known, key=lambda row: [str(value) for value in row.values()]),

@@ -1,0 +1,117 @@
+"""Runs replayed and drawn: for the page of results, and for a look at a single one."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from plab.config import ConfigError
+from plab.config_types import Config
+from plab.render import recording
+from plab.render.graphics import RenderError, require_graphics
+from plab.render.pictures import save, save_set
+from plab.runners.progress import show_progress
+from plab.scene import SceneError
+from plab.sim import DeviceError, SimulationError
+from plab.targets import TargetError
+
+__all__ = ["draw_runs", "draw_strip"]
+
+_SIZE = (480, 360)
+_TROUBLE = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
+
+
+def draw_runs(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
+    """Draw runs of many configurations, see :func:`plab.render.pictures.save_set`.
+
+    Args:
+        wanted: For each configuration the folder of its pictures, which must not be there yet and appears
+            when it is complete; and the result files of its runs, by the name that their pictures are to
+            have.
+
+    Raises:
+        RenderError: If this computer cannot draw, a file cannot be written, or runs cannot be replayed; the
+            pictures of the others are there.
+    """
+    require_graphics()
+    troubles: list[str] = []
+    with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
+        done = 0
+        for folders in _by_task(wanted).values():
+            try:
+                made = _replayed({folder: wanted[folder] for folder in folders})
+            except _TROUBLE as error:
+                troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
+                continue
+            for folder in folders:
+                with _complete_or_not(folder) as fresh:
+                    save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _SIZE)
+                done += 1
+                report(done, folder.name)
+    if troubles:
+        raise RenderError("; ".join(troubles))
+
+
+def draw_strip(path: Path, picture: Path) -> None:
+    """Replay a run and draw start, target and end side by side.
+
+    Args:
+        path: The result file.
+        picture: PNG file to write.
+
+    Raises:
+        RenderError: If this computer cannot draw, or the run cannot be replayed.
+    """
+    require_graphics()
+    try:
+        save(recording.record(*recording.result(path)), picture, _SIZE)
+    except _TROUBLE as error:
+        raise RenderError(str(error)) from error
+
+
+def _by_task(wanted: Mapping[Path, Mapping[str, Path]]) -> dict[str, list[Path]]:
+    """Return the folders by task: configurations of one task share a simulator, and its compilation."""
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for folder in wanted:
+        groups[folder.name.rpartition("-v")[0]].append(folder)
+    return groups
+
+
+def _replayed(group: Mapping[Path, Mapping[str, Path]]) -> dict[tuple[Path, str], recording.Recording]:
+    """Replay all runs of one task; those of the same settings share a simulator."""
+    alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
+    for folder, files in group.items():
+        for name, path in files.items():
+            cfg, actions = recording.result(path)
+            kind = json.dumps([dataclasses.asdict(cfg.sim), actions.shape])
+            alike[kind].append(((folder, name), cfg, actions))
+    made: dict[tuple[Path, str], recording.Recording] = {}
+    for cases in alike.values():
+        names = [name for name, _, _ in cases]
+        actions = np.stack([actions for _, _, actions in cases])
+        made |= dict(zip(names, recording.record_all([cfg for _, cfg, _ in cases], actions), strict=True))
+    return made
+
+
+@contextmanager
+def _complete_or_not(folder: Path) -> Iterator[Path]:
+    """Give a folder to write to, which takes its place only if nothing goes wrong."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=".", dir=folder.parent))
+    except OSError as error:
+        raise RenderError(f"cannot write {folder}: {error.strerror or error}") from error
+    try:
+        yield fresh
+        fresh.chmod(0o755)
+        fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
