@@ -141,9 +141,9 @@ class CpuEngine(Phases):
         grid_index = e * self.chunks + c
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
             self.material_tile(
-                state, source, self.tile_entry(after, e, tile), entry9, e, grid_index * STAGE, True
+                state, source, self.tile_entry(after, e, tile), entry9, e, self.bounded(grid_index * STAGE), True
             )
             for lane in range(self.lanes_of(tile)):
                 base, fx = self.stencil(self.vector(state, source, lane))
@@ -186,7 +186,7 @@ class CpuEngine(Phases):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             for lane in range(self.lanes_of(tile)):
-                self.gather_particle(state, source, target, lane, e, time, (e * self.chunks + c) * WORK)
+                self.gather_particle(state, source, target, lane, e, time, self.bounded((e * self.chunks + c) * WORK))
 
     @ti.func
     def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
@@ -196,8 +196,8 @@ class CpuEngine(Phases):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
-            self.material_tile(state, source, target, entry9, e, grid_index * STAGE, False)
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STAGE), False)
             for lane in range(self.lanes_of(tile)):
                 x = self.vector(state, source, lane)
                 base, fx = self.stencil(x)
@@ -205,7 +205,10 @@ class CpuEngine(Phases):
                 self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
                 h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
                 self.scatter(
-                    self.velocity_bar, grid_index * self.nodes + self.node_index(base), spline(fx), h
+                    self.velocity_bar,
+                    self.bounded(grid_index * self.nodes + self.node_index(base)),
+                    spline(fx),
+                    h,
                 )
 
     @ti.func
@@ -233,12 +236,12 @@ class CpuEngine(Phases):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
             for lane in range(self.lanes_of(tile)):
                 self.gather_particle_adjoint(
-                    state, source, target, bar, entry, entry9, lane, e, (e * self.chunks + c) * WORK
+                    state, source, target, bar, entry, entry9, lane, e, self.bounded((e * self.chunks + c) * WORK)
                 )
-            self.material_tile_adjoint(state, source, bar, entry, entry9, e, (e * self.chunks + c) * STAGE)
+            self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded((e * self.chunks + c) * STAGE))
 
     # -- losses of one chunk ------------------------------------------------------------------------
 

@@ -55,7 +55,12 @@ class ParticlePhases(Storage):
     @ti.func
     def tile_entry(self, slot, e, tile):
         """Index of the first entry of a tile."""
-        return ((slot * self.batch + e) * self.tiles + tile) * STATE
+        return self.bounded(((slot * self.batch + e) * self.tiles + tile) * STATE)
+
+    @ti.func
+    def bounded(self, index):
+        """An index, the same, of which LLVM can tell on the CPU that sums with it do not overflow."""
+        return index if ti.static(self.cuda) else index & 0x7FFFFFF
 
     @ti.func
     def load(self, state: ti.template(), entry, lane, count: ti.template()):
@@ -427,7 +432,7 @@ class ParticlePhases(Storage):
         a = self.load(self.affine, entry9, lane, 9)
         v = self.vector(state, source + 3, lane)
         q = self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
-        self.scatter(self.momentum, grid_index * self.nodes + self.node_index(base), spline(fx), q)
+        self.scatter(self.momentum, self.bounded(grid_index * self.nodes + self.node_index(base)), spline(fx), q)
 
     @ti.func
     def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
@@ -452,7 +457,7 @@ class ParticlePhases(Storage):
         """
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        node = e * self.nodes + self.node_index(base)
+        node = self.bounded(e * self.nodes + self.node_index(base))
         gather(self.velocity, node, self.axis * self.axis, self.axis, spline(fx), self.work, at)
         scale = 4.0 * self.inv_dx
         speed = 0.0 * fx[0]
@@ -488,7 +493,7 @@ class ParticlePhases(Storage):
             self.work[at + 15][i] = w[i][0]
             self.work[at + 16][i] = dw[i][0]
             self.work[at + 17][i] = float(i)
-        node = e * self.nodes + self.node_index(base)
+        node = self.bounded(e * self.nodes + self.node_index(base))
         gather_adjoint(
             self.velocity,
             self.momentum_bar,
