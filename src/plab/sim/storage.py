@@ -46,10 +46,16 @@ FRAME_ADJOINT = 25
 """Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap
 (1)."""
 
-WORK = 20
+WORK = 32
 """4-vectors per thread of work for the transfers of one particle."""
 
-STAGE = 49
+SPREAD = 40
+"""Lane vectors per thread for weights and affine fields of one tile."""
+
+PLACES = 16
+"""Lane vectors of integers per thread for where one tile's particles are."""
+
+STAGE = 56
 """Lane vectors per thread for the intermediate results of one tile's material update."""
 
 LANES = {"cpu": 8, "cuda": 32}
@@ -169,6 +175,8 @@ class Storage:
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         self.work = ti.Vector.field(4, real, shape=1 if self.cuda else grids * WORK)
+        self.spread = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * SPREAD)
+        self.places = ti.Vector.field(self.lanes, ti.i32, shape=1 if self.cuda else grids * PLACES)
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
@@ -199,6 +207,7 @@ class Storage:
         self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
         self.block_list = ti.field(ti.i32, shape=b * self.blocks)
         self.block_count = ti.field(ti.i32, shape=b)
+        self.block_first = ti.field(ti.i32, shape=(1, 1) if self.cuda else (b, self.chunks + 1))
         self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
         # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
         # block.
