@@ -10,7 +10,7 @@ import taichi as ti
 
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import BLOCK, BLOCK_BITS
-from plab.sim.transfer import column, gather, gather_adjoint, scatter, spline, spline_slope, widen
+from plab.sim.transfer import column, gather, gather_adjoint, scatter, spline, spline_slope
 
 __all__ = ["TransferTiles"]
 
@@ -104,7 +104,11 @@ class TransferTiles(ParticlePhases):
         """A particle's weights (or, from their first entry, slopes) as 3-vectors by offset."""
         return [
             ti.Vector(
-                [self.spread[at + 3 * k][lane], self.spread[at + 3 * k + 1][lane], self.spread[at + 3 * k + 2][lane]]
+                [
+                    self.spread[at + 3 * k][lane],
+                    self.spread[at + 3 * k + 1][lane],
+                    self.spread[at + 3 * k + 2][lane],
+                ]
             )
             for k in range(3)
         ]
@@ -118,9 +122,7 @@ class TransferTiles(ParticlePhases):
     @ti.func
     def base_value(self, at, lane, last):
         """Value of an affine field at a particle's base node, as a 4-vector."""
-        return ti.Vector(
-            [self.spread[at][lane], self.spread[at + 1][lane], self.spread[at + 2][lane], last]
-        )
+        return ti.Vector([self.spread[at][lane], self.spread[at + 1][lane], self.spread[at + 2][lane], last])
 
     @ti.func
     def scatter_momentum(self, entry9, lane, grid_node, at, work_at):
@@ -136,7 +138,16 @@ class TransferTiles(ParticlePhases):
         a = self.load(self.affine, entry9, lane, 9)
         q0 = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
         q = [q0, column(a, 0, self.dx), column(a, 1, self.dx), column(a, 2, self.dx)]
-        scatter(self.momentum, grid_node, self.axis * self.axis, self.axis, self.weights(at, lane), q, self.work, work_at)
+        scatter(
+            self.momentum,
+            grid_node,
+            self.axis * self.axis,
+            self.axis,
+            self.weights(at, lane),
+            q,
+            self.work,
+            work_at,
+        )
 
     @ti.func
     def scatter_adjoint(self, bar: ti.template(), target, lane, grid_node, at, work_at):
@@ -145,7 +156,16 @@ class TransferTiles(ParticlePhases):
         scale = 4.0 * self.inv_dx
         h0 = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
         h = [h0, column(c_bar, 0, scale), column(c_bar, 1, scale), column(c_bar, 2, scale)]
-        scatter(self.velocity_bar, grid_node, self.axis * self.axis, self.axis, self.weights(at, lane), h, self.work, work_at)
+        scatter(
+            self.velocity_bar,
+            grid_node,
+            self.axis * self.axis,
+            self.axis,
+            self.weights(at, lane),
+            h,
+            self.work,
+            work_at,
+        )
 
     @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, work_at):
@@ -162,25 +182,41 @@ class TransferTiles(ParticlePhases):
             at: First entry of the thread's share of ``spread``.
             work_at: First entry of the thread's share of ``work``.
         """
-        gather(self.velocity, node, self.axis * self.axis, self.axis, self.weights(at, lane), self.work, work_at)
+        gather(
+            self.velocity, node, self.axis * self.axis, self.axis, self.weights(at, lane), self.work, work_at
+        )
         scale = 4.0 * self.inv_dx
+        f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+        x = self.vector(state, source, lane)
         v = self.work[work_at]
-        for j in ti.static(range(3)):
-            self.work[work_at + 1 + j] = scale * (self.work[work_at + 1 + j] - self.spread[at + OFFSETS + j][lane] * v)
+        # Everything is read before the first store, after which LLVM has to look up where arrays are again.
+        c0 = scale * (self.work[work_at + 1] - f[0] * v)
+        c1 = scale * (self.work[work_at + 2] - f[1] * v)
+        c2 = scale * (self.work[work_at + 3] - f[2] * v)
         speed = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         for i in ti.static(range(3)):
-            state[target + 3 + i][lane] = self.work[work_at][i]
-            for j in ti.static(range(3)):
-                state[target + 6 + 3 * i + j][lane] = self.work[work_at + 1 + j][i]
-            x = state[source + i][lane]
-            state[target + i][lane] = ti.min(ti.max(x + self.dt * self.work[work_at][i], 0.0), self.x_max)
+            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v[i], 0.0), self.x_max)
+            state[target + 3 + i][lane] = v[i]
+            state[target + 6 + 3 * i][lane] = c0[i]
+            state[target + 7 + 3 * i][lane] = c1[i]
+            state[target + 8 + 3 * i][lane] = c2[i]
         # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
         if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
             self.fault[e] = time + 1
 
     @ti.func
     def gather_particle_adjoint(
-        self, state: ti.template(), source, after, bar: ti.template(), target, entry9_tile, lane, node, at_tile, work_at
+        self,
+        state: ti.template(),
+        source,
+        after,
+        bar: ti.template(),
+        target,
+        entry9_tile,
+        lane,
+        node,
+        at_tile,
+        work_at,
     ):
         """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
         at = self.own(at_tile, node)
@@ -224,7 +260,9 @@ class TransferTiles(ParticlePhases):
             bar[target + 3 + i][lane] = self.mass * m0[i]
             f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
             for j in ti.static(range(3)):
-                self.affine[entry9 + 3 * i + j][lane] = self.dx * (self.work[work_at + 1 + j][i] - f[j] * m0[i])
+                self.affine[entry9 + 3 * i + j][lane] = self.dx * (
+                    self.work[work_at + 1 + j][i] - f[j] * m0[i]
+                )
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 

@@ -6,9 +6,6 @@ with more environments than threads every thread has environments of its own. On
 is one launch over all environments.
 """
 
-import time
-from collections.abc import Callable, Sequence
-
 import taichi as ti
 
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
@@ -16,6 +13,7 @@ from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
 from plab.sim.pose_phases import PosePhases
 from plab.sim.storage import BLOCK, MEASURES, PLACES, SPREAD, STAGE, STATE, WORK
+from plab.sim.teams import TeamChoice
 
 __all__ = ["CpuEngine"]
 
@@ -27,48 +25,6 @@ thread's work."""
 
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
-
-PROBE = 50
-"""Every so many launches the team that is not the best so far is tried again."""
-
-
-class TeamChoice:
-    """Chooses between teams of threads for a kernel's launches, by what they take.
-
-    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
-    Results do not depend on the choice.
-    """
-
-    def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first team.
-
-        Args:
-            sizes: Threads that work on one environment, in the order in which they are tried.
-        """
-        self._sizes = tuple(dict.fromkeys(sizes))
-        self._seconds: dict[int, float] = {}
-        self._launches = 0
-
-    def run(self, kernel: Callable, args: tuple) -> None:
-        """Launch a kernel with a team's size before its other arguments."""
-        self._launches += 1
-        size = self._next()
-        start = time.perf_counter()
-        kernel(size, *args)
-        seconds = time.perf_counter() - start
-        # The first launch compiles.
-        if self._launches > 1:
-            old = self._seconds.get(size, seconds)
-            self._seconds[size] = 0.7 * old + 0.3 * seconds
-
-    def _next(self) -> int:
-        untried = [size for size in self._sizes if size not in self._seconds]
-        if untried:
-            return untried[0]
-        best = min(self._sizes, key=self._seconds.__getitem__)
-        if self._launches % PROBE == 0:
-            return next((size for size in self._sizes if size != best), best)
-        return best
 
 
 class Phases(TransferTiles, GridPhases, PosePhases, LossPhases):
@@ -152,7 +108,13 @@ class CpuEngine(Phases):
             source = self.tile_entry(before, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
             self.material_tile(
-                state, source, self.tile_entry(after, e, tile), entry9, e, self.bounded(grid_index * STAGE), True
+                state,
+                source,
+                self.tile_entry(after, e, tile),
+                entry9,
+                e,
+                self.bounded(grid_index * STAGE),
+                True,
             )
             self.stencil_tile(state, source, at, places_at, False)
             self.momentum_tile(state, source, entry9, at)
@@ -428,9 +390,7 @@ class CpuEngine(Phases):
                             self.grid_chunk(e, c, s)
                         self.barrier(team, size)
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                            self.gather_chunk(
-                                state, before, before + stride, e, c, t * self.substeps + s
-                            )
+                            self.gather_chunk(state, before, before + stride, e, c, t * self.substeps + s)
 
     @ti.kernel
     def losses_kernel(
@@ -502,9 +462,7 @@ class CpuEngine(Phases):
                         now = stamp + 1 + back
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.scatter_chunk_adjoint(
-                                    state, slot + s, slot + s + 1, bar, e, c, now
-                                )
+                                self.scatter_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c, now)
                             self.barrier(team, size)
                             if rank == 0:
                                 self.collect_blocks(e, now)
@@ -516,9 +474,7 @@ class CpuEngine(Phases):
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.gather_chunk_adjoint(
-                                    state, slot + s, slot + s + 1, bar, e, c
-                                )
+                                self.gather_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c)
                             self.barrier(team, size)
 
     @ti.kernel

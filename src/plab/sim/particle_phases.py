@@ -21,8 +21,8 @@ from plab.sim.spectral import (
     spectral_return_map,
     spectral_return_map_adjoint,
 )
-from plab.sim.storage import BLOCK, BLOCK_BITS, STAGE, STATE, Storage
-from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
+from plab.sim.storage import BLOCK, BLOCK_BITS, INDEX_MASK, STAGE, STATE, STATE_MASK, Storage
+from plab.sim.transfer import column, widen
 
 __all__ = ["ParticlePhases"]
 
@@ -55,12 +55,20 @@ class ParticlePhases(Storage):
     @ti.func
     def tile_entry(self, slot, e, tile):
         """Index of the first entry of a tile."""
-        return self.bounded(((slot * self.batch + e) * self.tiles + tile) * STATE)
+        entry = ((slot * self.batch + e) * self.tiles + tile) * STATE
+        if ti.static(not self.cuda):
+            # As in :meth:`bounded`.
+            entry = entry & STATE_MASK
+        return entry
 
     @ti.func
     def bounded(self, index):
-        """An index, the same, of which LLVM can tell on the CPU that sums with it do not overflow."""
-        return index if ti.static(self.cuda) else index & 0x7FFFFFF
+        """An index on the CPU, the same: one of which LLVM can tell that sums with it do not overflow.
+
+        So it computes one address for all that lies at fixed distances, and finds neighbours to be
+        neighbours. Without, each of a stencil's nodes takes four instructions for its address.
+        """
+        return index & INDEX_MASK
 
     @ti.func
     def load(self, state: ti.template(), entry, lane, count: ti.template()):
