@@ -15,6 +15,8 @@ import synthetic
 from plab.report.__main__ import main
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
 from plab.report.collect import NAMES, collect, collect_ablation
+from plab.report.curves import rewards, rl_scores, score_curves
+from plab.report.figures import grid, log_axis, style
 from plab.report.methods import method, ordered
 from plab.report.series import band, load_series
 from plab.selection import select
@@ -191,6 +193,35 @@ def test_same_runs_give_the_same_files(folder: Path, tmp_path: Path, monkeypatch
         (tmp_path / "out").rename(out)
         images.append({path.name: path.read_bytes() for path in out.iterdir()})
     assert images[0] == images[1]
+
+
+def test_tasks_without_runs_have_no_panel_but_a_mention(folder: Path) -> None:
+    runs = collect(folder, select(["task=Rope,Torus", "method=adam"], NAMES))
+    with style():
+        per_task, per_configuration = rewards(runs, load_series(runs))
+        scores = score_curves(runs, load_series(runs))
+    for drawing in (per_task, per_configuration, *scores):
+        titles = [axes.get_title() for axes in drawing.figure.axes]
+        assert titles and all(title.startswith("Rope") for title in titles)
+        assert drawing.figure.get_supxlabel() == "no runs: Torus"
+    assert rl_scores(runs) == []
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [(0.2, 4.0, ["0.2", "0.5", "1", "2"]), (1.0, 200.0, ["1", "10", "100"]), (1e4, 9e4, ["$10^{4}$"])],
+)
+def test_logarithmic_axes_have_numbers_with_room(low: float, high: float, labels: list[str]) -> None:
+    figure, ((axes,),) = grid(1, 1)
+    axes.plot([low, high], [0.0, 1.0])
+    log_axis(axes, "x")
+    figure.draw_without_rendering()
+    shown = [label.get_text() for label in axes.get_xticklabels()]
+    left, right = axes.get_xlim()
+    inside = [text for text, x in zip(shown, axes.get_xticks(), strict=True) if left <= x <= right]
+    assert inside[: len(labels)] == labels and not any(
+        text.get_text() for text in axes.get_xticklabels(minor=True)
+    )
 
 
 def test_nothing_finished_draws_nothing(tmp_path: Path, capsys) -> None:

@@ -15,6 +15,7 @@ import pytest
 from scipy import stats
 
 import synthetic
+from plab.examples import example_archive, resolve
 from plab.report.__main__ import main, write_tables
 from plab.report.collect import NAMES, MixedRunsError, collect
 from plab.report.hyperparameters import hyperparameters
@@ -23,7 +24,7 @@ from plab.report.statistics import Summary, stratified_difference, summarise
 from plab.report.table import Table, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
-from plab.results import pack
+from plab.results import check, load, pack
 from plab.selection import select
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -224,6 +225,17 @@ def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
     assert gather(tmp_path, "task.yield_stress=10").unusual["task.yield_stress"] == [10.0]
 
 
+def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
+    for seed in range(2):
+        older = synthetic.config(tmp_path, seed=seed)
+        assert older["method"]["max_gradient_norm"] is None
+        if seed:
+            del older["method"]["max_gradient_norm"]
+        synthetic.save(synthetic.synthetic_run(older, rows=synthetic.ROWS))
+    runs = gather(tmp_path)
+    assert len(runs.table) == 2 and "method.max_gradient_norm" not in runs.unusual and not runs.set_aside
+
+
 def test_two_runs_of_one_seed_are_refused(tmp_path: Path) -> None:
     for device in ("cpu", "cuda"):
         other = synthetic.config(tmp_path)
@@ -253,6 +265,23 @@ def test_times_are_per_environment_step(tmp_path: Path) -> None:
     assert cells.loc["Rope", "gradient methods [ms]"] == "25.00 ± 5.00 (2)"
 
 
+def test_times_say_how_many_runs_shared_a_simulator(tmp_path: Path) -> None:
+    result = synthetic.run(tmp_path)
+    result.provenance["batch"] = 45
+    synthetic.save(result)
+    cells = by_form(timing(gather(tmp_path)))["comparison"].cells
+    assert cells["measured by"].to_list() == ["runs, cpu, 45 runs at once"]
+
+
+def test_example_stands_for_the_archive_that_comes_with_plab(tmp_path: Path, capsys) -> None:
+    assert main(["tables", "--results", "example", "--out", str(tmp_path)]) == 0
+    count = len(load(example_archive()))
+    assert f"15 tables of {count} out of" in capsys.readouterr().out
+    assert "--results example" in (tmp_path / "ours" / "iou_per_task.md").read_text(encoding="utf-8")
+    assert resolve("./example") == Path("example")
+    assert all(problem is None for _, problem in check(example_archive()))
+
+
 def test_benchmark_stands_beside_the_runs(folder: Path, tmp_path: Path, capsys) -> None:
     path = tmp_path / "speed.csv"
     row = {"task": "Move", "device": "cuda", "batch": 64, "forward_ms": 0.14, "gradient_ms": 0.48}
@@ -263,7 +292,7 @@ def test_benchmark_stands_beside_the_runs(folder: Path, tmp_path: Path, capsys) 
     assert data.loc[("Move", "forward"), "ratio"] == pytest.approx(14.26 / 0.14)
     path.write_text("task\nMove\n")
     assert main(["tables", "--results", str(folder), "--out", str(out), "--speed", str(path)]) == 2
-    assert "lacks batch" in capsys.readouterr().err
+    assert "lacks device, batch" in capsys.readouterr().err
 
 
 # ----------------------------------------------------------------------------------------------- other tables

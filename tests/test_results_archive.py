@@ -46,7 +46,7 @@ def test_archive_loads_like_the_folder(folder: Path, tmp_path: Path) -> None:
         assert np.array_equal(one.best_actions, other.best_actions)
         assert one.best_actions.dtype == other.best_actions.dtype
         assert (one.config, one.provenance, one.evaluation) == (
-            other.config,
+            other.config | {"results_dir": one.config["results_dir"]},
             other.provenance,
             other.evaluation,
         )

@@ -15,7 +15,7 @@ from plab.render.graphics import RenderError
 from plab.render.recording import Recording
 from plab.render.renderer import INK, PAPER, Renderer
 
-__all__ = ["STEPS_PER_SECOND", "SUFFIXES", "check_output", "save", "save_contact_sheet"]
+__all__ = ["STEPS_PER_SECOND", "SUFFIXES", "check_output", "save", "save_contact_sheet", "save_set"]
 
 STEPS_PER_SECOND = 20
 """Environment steps that a film shows in a second, whatever the number of its frames."""
@@ -57,6 +57,40 @@ def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1
     camera = scene_camera(scene, target_mass, size, recording.x[[0, -1]], recording.poses[::5])
     with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path):
         _WRITERS[path.suffix.lower()](recording, renderer, every, path)
+
+
+def save_set(recordings: Mapping[str, Recording], folder: Path, size: tuple[int, int]) -> None:
+    """Write what several rollouts of one configuration look like, all seen by the same camera.
+
+    Writes ``start.webp`` and ``target.webp``, and for each rollout its last state as ``<name>.webp`` and,
+    where imageio-ffmpeg is installed, a film ``<name>.mp4``.
+
+    Args:
+        recordings: The rollouts by name.
+        folder: Folder to write to.
+        size: Width and height of a frame [pixels]; even numbers.
+
+    Raises:
+        RenderError: If a file cannot be written.
+    """
+    first = next(iter(recordings.values()))
+    x = np.concatenate([recording.x[[0, -1]] for recording in recordings.values()])
+    poses = np.concatenate([recording.poses[::5] for recording in recordings.values()])
+    camera = scene_camera(first.scene, first.target_mass, size, x, poses)
+    films = find_spec("imageio_ffmpeg") is not None
+    for name, recording in recordings.items():
+        scene, mass = recording.scene, recording.target_mass
+        with closing(Renderer(scene, mass, size, camera)) as renderer, _writing(folder / name):
+            if recording is first:
+                _save_webp(renderer.frame(first.x[0], first.poses[0]), folder / "start.webp")
+                _save_webp(renderer.target(first.poses[0]), folder / "target.webp")
+            _save_webp(renderer.frame(recording.x[-1], recording.poses[-1]), folder / f"{name}.webp")
+            if films:
+                _save_mp4(recording, renderer, 1, folder / f"{name}.mp4")
+
+
+def _save_webp(picture: np.ndarray, path: Path) -> None:
+    Image.fromarray(picture).save(path, quality=86, method=6)
 
 
 def save_contact_sheet(rows: Mapping[str, Sequence[Recording]], path: Path, size: tuple[int, int]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from plab.results import read
 from plab.run import cuda_is_usable
 from plab.scene import Scene
 
-__all__ = ["Recording", "demonstration", "record", "result", "starts"]
+__all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts"]
 
 
 @dataclass(frozen=True)
@@ -91,23 +92,32 @@ def demonstration(cfg: Config) -> np.ndarray:
 
 def record(cfg: Config, actions: np.ndarray) -> Recording:
     """Run actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
-    problem = Problem([cfg])
+    return record_all([cfg], actions[None])[0]
+
+
+def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
+    """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene."""
+    problem = Problem(cfgs)
     simulator = problem.simulator
     simulator.set_contact("hard")
     simulator.reset()
     states = [simulator.state()]
-    for action in actions:
-        simulator.step(action[None])
+    for step in range(actions.shape[1]):
+        simulator.step(actions[:, step])
         states.append(simulator.state())
-    return Recording(
-        task=cfg.task.name,
-        variant=cfg.variant,
-        scene=problem.scenes[0],
-        target_mass=problem.target_mass[0],
-        x=np.stack([state.x[0] for state in states]),
-        poses=np.stack([state.poses[0] for state in states]),
-        score=problem.scores(simulator.mass_tensor())[0].score,
-    )
+    scores = problem.scores(simulator.mass_tensor())
+    return [
+        Recording(
+            task=cfg.task.name,
+            variant=cfg.variant,
+            scene=problem.scenes[number],
+            target_mass=problem.target_mass[number],
+            x=np.stack([state.x[number] for state in states]),
+            poses=np.stack([state.poses[number] for state in states]),
+            score=scores[number].score,
+        )
+        for number, cfg in enumerate(cfgs)
+    ]
 
 
 def starts(cfgs: Sequence[Config]) -> list[Recording]:
@@ -129,5 +139,7 @@ def starts(cfgs: Sequence[Config]) -> list[Recording]:
     ]
 
 
+@functools.cache
 def _say(message: str) -> None:
+    """Print a message, once however many runs it is true of."""
     print(f"plab: {message}", file=sys.stderr)

@@ -1,7 +1,9 @@
-"""The paper's tables and curves from result files alone.
+"""The paper's tables and curves, and a page of all results, from result files alone.
 
 python -m plab.report tables --results results --out reports/tables
 python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
+python -m plab.report notebooks --results example
+python -m plab.report html --results example           real runs that come with plab
 """
 
 from __future__ import annotations
@@ -17,10 +19,15 @@ from typing import Any
 import pandas as pd
 
 import plab
+from plab.examples import resolve
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
+from plab.report.costs import work_precision
 from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
 from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
+from plab.report.measurements import ACCURACY, SPEED, measured
+from plab.report.notebooks import NOTEBOOKS, execute
+from plab.report.page import write_page
 from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
@@ -43,19 +50,40 @@ def main(argv: Sequence[str] | None = None) -> int:
         chosen = select(options.words, NAMES)
         runs = collect(options.results, chosen)
         if options.what == "tables":
-            benchmark = None if options.speed is None else _benchmark(options.speed)
-            count = len(write_tables(runs, out, command, benchmark))
-        else:
+            benchmark = None if options.speed is None else measured(options.speed, SPEED)
+            made = f"{len(write_tables(runs, out, command, benchmark))} tables"
+        elif options.what == "curves":
             ablation = collect_ablation(options.results, chosen, YIELD_STRESS)
-            count = len(write_curves(runs, ablation, out, command))
+            errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
+            made = f"{len(write_curves(runs, ablation, out, command, errors))} figures"
+        elif options.what == "notebooks":
+            _require_runs(runs, options.results)
+            given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
+            given |= {"BENCH": str(options.bench), "COMMAND": command}
+            made = f"{len(execute(NOTEBOOKS, given, out))} notebooks"
+        else:
+            _require_runs(runs, options.results)
+            trouble = write_page(runs, out, _origin(runs, command, deep=False), pictures=options.pictures)
+            if trouble:
+                print(f"plab: without pictures: {trouble}", file=sys.stderr)
+            made = "index.html"
     except (ResultsError, SelectionError, MixedRunsError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
-    _tell(runs, f"{count} {'tables' if options.what == 'tables' else 'figures'}", out)
+    _tell(runs, made, out)
     return 0
+
+
+def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
+    if runs.table.empty:
+        where = ", ".join(map(str, sources))
+        raise ResultsError(
+            f"there are no finished runs to show in {where}: python -m plab.run task=Move makes one, "
+            "and --results example shows those that come with plab"
+        )
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -65,17 +93,25 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog=__doc__.partition("\n\n")[2],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", choices=["tables", "curves"], help="what to make")
+    parser.add_argument("what", choices=["tables", "curves", "notebooks", "html"], help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
-    what = "folder of results, archive, or several of them (default: results)"
+    what = (
+        "folder of results, archive, or several; 'example': real runs that come with plab (default: results)"
+    )
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
+    what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
+    parser.add_argument("--accuracy", type=Path, help=what)
+    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
+    parser.add_argument("--bench", type=Path, default=Path("reports/bench"), help=what)
+    what = "html: draw no pictures, which takes minutes; those that are there stay"
+    parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
     options.words += [item for item in options.results if "=" in item]
-    options.results = [item for item in options.results if "=" not in item]
+    options.results = [resolve(item) for item in options.results if "=" not in item]
     return options
 
 
@@ -109,7 +145,9 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     return tables
 
 
-def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str) -> list[Drawing]:
+def write_curves(
+    runs: Runs, ablation: Ablation | None, out: Path, command: str, errors: pd.DataFrame | None = None
+) -> list[Drawing]:
     """Draw all figures that there are runs for.
 
     Args:
@@ -117,6 +155,7 @@ def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str)
         ablation: Runs that differ in the yield stress, or None.
         out: Folder to write to.
         command: What is given as the command that makes them.
+        errors: What ``python -m plab.bench.accuracy`` measured, or None.
 
     Returns:
         The figures.
@@ -134,6 +173,8 @@ def write_curves(runs: Runs, ablation: Ablation | None, out: Path, command: str)
         if ablation is not None:
             groups = {value: [load_rows(path) for path in paths] for value, paths in ablation.paths.items()}
             drawings += yield_ablation(groups, f"{ablation.task}-v{ablation.variant}", ablation.method)
+        if errors is not None:
+            drawings += [drawing for drawing in [work_precision(errors)] if drawing is not None]
         _write_runs(runs, out)
         save(drawings, out, _origin(runs, command, deep=False))
     return drawings
@@ -163,28 +204,11 @@ def _write_runs(runs: Runs, out: Path) -> None:
     (out / "runs.json").write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
-def _benchmark(path: Path) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path, comment="#")
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"cannot read {path}: {error}") from error
-    wanted = {"task", "device", "batch", "forward_ms", "gradient_ms"}
-    if missing := sorted(wanted - set(table)):
-        raise ResultsError(f"{path} lacks {', '.join(missing)}: make it with plab.bench.speed --paper --csv")
-    return table
-
-
 def _tell(runs: Runs, what: str, out: Path) -> None:
     expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
     print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
-    for count, what in (
-        (runs.unfinished, "are not finished, hence not in them"),
-        (runs.others, "are of other tasks, variants, methods or seeds, hence not in them"),
-        (runs.set_aside, "try other settings than conf/ has, hence are not in them"),
-        (len(runs.unreadable), "cannot be read: python -m plab.results check"),
-    ):
-        if count:
-            print(f"{count} run(s) {what}")
+    for line in runs.left_out():
+        print(line)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,16 @@ from plab.results import Row, lookup, rows
 from plab.selection import Selection
 from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 
-__all__ = ["KEYS", "NAMES", "Ablation", "MixedRunsError", "Runs", "collect", "collect_ablation"]
+__all__ = [
+    "KEYS",
+    "NAMES",
+    "Ablation",
+    "MixedRunsError",
+    "Runs",
+    "changed_settings",
+    "collect",
+    "collect_ablation",
+]
 
 NAMES = ("task", "variant", "method", "seed")
 
@@ -80,6 +89,16 @@ class Runs:
         lines = sorted(_fingerprint(row) for row in self.table.drop(columns="path").to_dict("records"))
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
+    def left_out(self) -> list[str]:
+        """Say which runs are not in ``table``, and why; nothing where all are."""
+        counts = (
+            (self.unfinished, "are not finished, hence not in them"),
+            (self.others, "are of other tasks, variants, methods or seeds, hence not in them"),
+            (self.set_aside, "try other settings than conf/ has, hence are not in them"),
+            (len(self.unreadable), "cannot be read: python -m plab.results check"),
+        )
+        return [f"{count} run(s) {what}" for count, what in counts if count]
+
 
 @dataclass(frozen=True)
 class Ablation:
@@ -118,7 +137,9 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     finished = _prefer_usual(complete)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
-    table = pd.DataFrame(values, columns=None if finished else [*NAMES, "score", "path", *KEYS])
+    table = pd.DataFrame(
+        values, columns=None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
+    )
     return Runs(
         table=table.astype({"seed": str}),
         tasks=asked["task"],
@@ -241,7 +262,7 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
 
 def _prefer_usual(found: Sequence[Row]) -> list[Row]:
     """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes."""
-    changes = [len(_unusual_of(row)) for row in found]
+    changes = [len(changed_settings(row.config)) for row in found]
     fewest: dict[tuple[str, str], int] = {}
     for row, count in zip(found, changes, strict=True):
         fewest[_pair(row)] = min(count, fewest.get(_pair(row), count))
@@ -256,18 +277,28 @@ def _unusual(found: Sequence[Row]) -> dict[str, list[Any]]:
     """Return the settings that are not those of plab's own files: key to the values that occur."""
     unusual: dict[str, set[str]] = defaultdict(set)
     for row in found:
-        for key, value in _unusual_of(row).items():
+        for key, value in changed_settings(row.config).items():
             unusual[key].add(json.dumps(value))
     return {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
 
 
-def _unusual_of(row: Row) -> dict[str, Any]:
-    """Return a run's settings that are not those of plab's own files."""
-    expected = _usual(row.values["method"])
-    by_variant = _changed_by_variant(row.config)
-    task = {f"task.{k}": v for k, v in _usual_task(row.values["task"]).items() if k not in by_variant}
-    own = {key: (value, lookup(row.config, key)) for key, value in (expected | task).items()}
+def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's settings that are not those of plab's own files, by dotted key.
+
+    Args:
+        config: The run's configuration.
+    """
+    expected = _usual(config["method"]["name"])
+    by_variant = _changed_by_variant(config)
+    task = {f"task.{k}": v for k, v in _usual_task(config["task"]["name"]).items() if k not in by_variant}
+    own = {key: (value, _present(config, key)) for key, value in (expected | task).items()}
     return {key: mine for key, (value, mine) in own.items() if key not in _HARMLESS and mine != value}
+
+
+def _present(config: Mapping[str, Any], key: str) -> Any:
+    """Return a setting, None where the run is older than it: that it did without, as null says."""
+    value = lookup(config, key)
+    return None if value != value else value
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
@@ -11,6 +12,7 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_hex
+from matplotlib.figure import Figure
 
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
 from plab.report.collect import Runs
@@ -42,8 +44,8 @@ def _pick(series: Series, **which: str) -> dict[str, list[pd.DataFrame]]:
     return found
 
 
-def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expected: int) -> None:
-    """Draw the bands of all methods, and say in small print which of them lack runs."""
+def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expected: int) -> bool:
+    """Draw all methods' bands, and say in small print which lack runs; return whether there are any."""
     short = []
     for name in runs.methods:
         drawn = band(tables.get(name, []), axis, column)
@@ -52,9 +54,13 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
         count = 0 if drawn is None else drawn.count
         if count < expected and name in set(runs.table["method"]):
             short.append(f"{method(name).label} {count}/{expected}")
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(bottom=0.0, top=1.05 if column == "score" else None)
+    if not tables:
+        axes.set_xticks([])
+        axes.set_yticks([])
     text = "\n".join(short) if tables else "no runs"
     axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=5, color="#666666")
+    return bool(tables)
 
 
 # ---------------------------------------------------------------------------------------------------- rewards
@@ -70,16 +76,16 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         *settings_note(runs),
     ]
     per_task = _per_task(runs, series, "episodes", "reward", _EPISODES, "reward")
-    tasks = ordered_tasks(runs.tasks)
+    tasks, absent = _tasks_with_runs(runs)
     figure, axes = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
     for line, task in zip(axes, tasks, strict=True):
         for panel, variant in zip(line, runs.variants, strict=True):
             tables = _pick(series, task=task, variant=variant)
-            _panel(panel, runs, tables, "episodes", "reward", len(runs.seeds))
             panel.set_title(f"{task}-v{variant}")
-            log_axis(panel, _EPISODES if task == tasks[-1] else "")
+            if _panel(panel, runs, tables, "episodes", "reward", len(runs.seeds)):
+                log_axis(panel, _EPISODES if task == tasks[-1] else "")
         line[0].set_ylabel("reward")
-    legend(figure)
+    _finish(figure, absent)
     return [
         Drawing("reward_per_task", per_task, notes),
         Drawing("reward_per_configuration", figure, notes),
@@ -107,22 +113,38 @@ def score_curves(runs: Runs, series: Series) -> list[Drawing]:
     ]
 
 
-def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str):
-    tasks = ordered_tasks(runs.tasks)
+def _tasks_with_runs(runs: Runs) -> tuple[list[str], list[str]]:
+    """Return the tasks that have runs, and those that have none, hence no panel."""
+    tasks, present = ordered_tasks(runs.tasks), set(runs.table["task"])
+    return [task for task in tasks if task in present], [task for task in tasks if task not in present]
+
+
+def _finish(figure: Figure, absent: Sequence[str]) -> None:
+    """Add the legend, and say which tasks have no panel."""
+    legend(figure)
+    if absent:
+        text = textwrap.fill(f"no runs: {', '.join(absent)}", int(figure.get_figwidth() * 20))
+        figure.supxlabel(text, fontsize=6, color="#666666")
+
+
+def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str) -> Figure:
+    tasks, absent = _tasks_with_runs(runs)
     columns = min(len(tasks), 5)
     rows = -(-len(tasks) // columns)
-    figure, axes = grid(rows, columns)
+    # A few panels have room to be larger.
+    few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
+    figure, axes = grid(rows, columns, **few)
     panels = axes.ravel()
     for panel, task in zip(panels, tasks, strict=False):
         expected = len(runs.variants) * len(runs.seeds)
-        _panel(panel, runs, _pick(series, task=task), axis, column, expected)
         panel.set_title(task)
-        log_axis(panel, label)
+        if _panel(panel, runs, _pick(series, task=task), axis, column, expected):
+            log_axis(panel, label)
     for panel in panels[len(tasks) :]:
         panel.set_visible(False)
     for line in axes:
         line[0].set_ylabel(title)
-    legend(figure)
+    _finish(figure, absent)
     return figure
 
 
@@ -130,9 +152,12 @@ def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, ti
 
 
 def rl_scores(runs: Runs) -> list[Drawing]:
-    """Return the final scores of the RL methods per task, with their limit."""
+    """Return the final scores of the RL methods per task, with their limit; nothing without RL runs."""
     tasks = ordered_tasks(runs.tasks)
-    methods = [name for name in runs.methods if method(name).kind == RL]
+    present = set(runs.table["method"])
+    methods = [name for name in runs.methods if method(name).kind == RL and name in present]
+    if not methods:
+        return []
     with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
         known = pd.read_csv(file).groupby("task")["score"].mean()
     figure, axes = grid(1, 1, width=7.0, height=2.4)
@@ -157,6 +182,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     panel.set_ylim(0.0, 1.08)
     panel.set_ylabel("normalised incremental IoU")
     panel.grid(axis="x", visible=False)
+    panel.set_axisbelow(True)
     legend(figure)
     notes = [
         "Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs.",

@@ -13,11 +13,23 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from plab.report.methods import method
 from plab.report.series import Band
 
-__all__ = ["Drawing", "draw_band", "grid", "legend", "log_axis", "save", "style"]
+__all__ = [
+    "Drawing",
+    "draw_band",
+    "fix_layout",
+    "grid",
+    "legend",
+    "legend_of_methods",
+    "log_axis",
+    "save",
+    "style",
+]
 
 _STYLE = {
     "pdf.fonttype": 42,  # TrueType: text stays text, and journals take it
@@ -95,22 +107,53 @@ def draw_band(
     axes.fill_between(drawn.x, low, high, color=colour, alpha=0.18, linewidth=0)
 
 
-def log_axis(axes: Axes, label: str) -> None:
-    """Make the horizontal axis logarithmic."""
-    axes.set_xscale("log")
-    axes.set_xlabel(label)
+def log_axis(axes: Axes, label: str, *, vertical: bool = False) -> None:
+    """Make an axis logarithmic, with numbers that have room; to be called after drawing."""
+    axis = axes.yaxis if vertical else axes.xaxis
+    axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}label": label})
+    low, high = axis.get_view_interval()
+    # A decade or less would have one number, or all of them on top of each other.
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 30 * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(_tick))
+    axis.set_minor_formatter(NullFormatter())
 
 
-def legend(figure: Figure) -> None:
-    """Put one legend for all axes above them."""
+def _tick(value: float, _position: int) -> str:
+    if 1e-3 <= value < 1e4:
+        return f"{value:g}"
+    exponent = int(np.floor(np.log10(value) + 1e-9))
+    lead = round(value / 10.0**exponent)
+    power = f"10^{{{exponent}}}"
+    return f"${power}$" if lead == 1 else rf"${lead}\cdot{power}$"
+
+
+def legend(figure: Figure, columns: int | None = None) -> None:
+    """Put one legend for all axes above them, in as many columns as there is room for, or as asked for."""
     entries: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if entries:
         # An entry takes about an inch.
-        columns = min(len(entries), int(figure.get_figwidth() / 1.1))
+        columns = columns or min(len(entries), int(figure.get_figwidth() / 1.1))
         figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=columns)
+
+
+def legend_of_methods(figure: Figure, names: Sequence[str]) -> None:
+    """Put a legend of methods, as dots, above all axes."""
+    looks = [method(name) for name in names]
+    dots = [Line2D([], [], marker="o", linestyle="none", color=look.colour) for look in looks]
+    if dots:
+        labels = [look.label for look in looks]
+        figure.legend(dots, labels, loc="outside upper center", ncols=len(dots), handletextpad=0.1)
+
+
+def fix_layout(figure: Figure) -> None:
+    """Place the axes once, not for each file: for fifty panels that takes longer than drawing them."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
 
 
 def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -> None:
@@ -127,6 +170,7 @@ def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -
     with style():
         for drawing in drawings:
             path = folder / drawing.name
+            fix_layout(drawing.figure)
             # Without the time of day the same runs give the same bytes.
             drawing.figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None, "Subject": made})
             drawing.figure.savefig(path.with_suffix(".png"), metadata={"Description": made})

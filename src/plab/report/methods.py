@@ -31,6 +31,11 @@ class Method:
     colour: str
     dashes: str = "-"
 
+    @property
+    def on_dark(self) -> str:
+        """Its colour on a dark ground, where black would not be seen."""
+        return "#FFFFFF" if self.colour == "#000000" else self.colour
+
 
 # Okabe and Ito's palette, which people with any colour vision can tell apart.
 _KNOWN = (

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs
-from plab.results import read
+from plab.results import RunResult, read
 
-__all__ = ["AXES", "Band", "band", "load_rows", "load_series"]
+__all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
 
 AXES = ("episodes", "seconds", "substeps")
 """What curves are drawn against: episodes, wall time [s], simulated substeps."""
@@ -60,7 +60,11 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
 
 def load_rows(path: str | Path) -> pd.DataFrame:
     """Return the iterations of one run as :func:`load_series` does."""
-    run = read(path)
+    return rows_on_axes(read(path))
+
+
+def rows_on_axes(run: RunResult) -> pd.DataFrame:
+    """Return the iterations of a run that has been read as :func:`load_series` does."""
     table, sim = run.iterations.copy(), run.config["sim"]
     table["seconds"] = table["seconds"].cumsum()
     table["substeps"] = (table["steps"] + sim["horizon"]) * sim["substeps"]

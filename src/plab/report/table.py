@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -144,6 +145,8 @@ def _latex(table: Table) -> str:
         position_float=None if table.long else "centering",
     )
     if table.long:
+        # The pages after the first need no caption.
+        text = re.sub(r"\\caption\[\].*\n", "", text)
         return f"{{{size}\n{text}}}\n"
     return text.replace("\\centering\n", f"\\centering\n{size}\n", 1)
 

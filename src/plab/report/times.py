@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs
+from plab.report.measurements import origin
 from plab.report.reference import paper_table
 from plab.report.statistics import Interval, Summary, stratified_difference, summarise
 from plab.report.table import NOTHING, Table, number, spread
@@ -37,14 +38,15 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
                     _time_row(task, f"runs, {device}", "forward + backward", mine["gradient"], theirs)
                 )
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
-            where = f"benchmark, {row['device']}, batch {row['batch']}"
+            kind = [row["device"], *([row["precision"]] if "precision" in row else [])]
+            where = f"benchmark, {', '.join(kind)}, batch {row['batch']}"
             for column, kind, printed in _BENCHMARK:
                 theirs = float(paper.loc[task, printed])
                 compared.append(_time_row(task, where, kind, np.array([row[column]]), theirs))
     return [
         _our_times(rows, runs),
         _papers_times(tasks, paper),
-        _compared_times(compared, runs),
+        _compared_times(compared, runs, origin(benchmark)),
     ]
 
 
@@ -74,8 +76,14 @@ def _step_times(runs: Runs) -> pd.DataFrame:
     steps = np.where(kind == "gradient", table["iterations"] - 1, table["method.episodes"]) * horizon
     optimise = table.get("seconds_optimise", pd.Series(np.nan, table.index))
     ms = 1e3 * optimise / np.where(steps > 0, steps, np.nan)
-    found = pd.DataFrame({"task": table["task"], "device": table["device"], "kind": kind, "ms": ms})
+    device = [_where(*each) for each in zip(table["device"], table["batch"], strict=True)]
+    found = pd.DataFrame({"task": table["task"], "device": device, "kind": kind, "ms": ms})
     return found.dropna()
+
+
+def _where(device: str, batch: float) -> str:
+    """Say where a run was computed, and with how many others."""
+    return f"{device}, {batch:.0f} runs at once" if batch > 1 else device
 
 
 def _devices(steps: pd.DataFrame, task: str) -> list[str]:
@@ -151,7 +159,7 @@ def _papers_times(tasks: Sequence[str], paper: pd.DataFrame) -> Table:
     return Table("timing", "paper", "Time per environment step, the paper", cells, data, notes=notes)
 
 
-def _compared_times(rows: list[dict[str, object]], runs: Runs) -> Table:
+def _compared_times(rows: list[dict[str, object]], runs: Runs, more: list[str]) -> Table:
     cells = [
         {
             "task": row["task"],
@@ -179,6 +187,7 @@ def _compared_times(rows: list[dict[str, object]], runs: Runs) -> Table:
         _TIMES,
         "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
         "measurements, for the paper gives no spread.",
+        *more,
         *settings_note(runs),
     ]
     data = pd.DataFrame(rows, columns=None if rows else ["task", "measured", "what", "measurements", "ms"])

@@ -51,7 +51,8 @@ def pack(
     """Write runs into an archive, in one atomic step.
 
     Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
-    where the archive itself lies there. Numbers keep all their digits.
+    where the archive itself lies there. Numbers keep all their digits; only ``results_dir`` is no longer the
+    folder that the run was computed in.
 
     Args:
         source: Folder of results, archive, result file, or several of them.
@@ -83,7 +84,11 @@ def pack(
         for name, row in sorted(chosen.items()):
             run = read(row.path)
             run = replace(
-                run, masses=run.masses if keep_masses else {}, resume=run.resume if keep_resume else None
+                run,
+                # A path of the computer that made it means nothing elsewhere.
+                config=run.config | {"results_dir": "results"},
+                masses=run.masses if keep_masses else {},
+                resume=run.resume if keep_resume else None,
             )
             member = zipfile.ZipInfo(name, _EPOCH)
             member.external_attr = 0o644 << 16

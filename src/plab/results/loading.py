@@ -40,6 +40,7 @@ _SUMMARY_COLUMNS = (
     "started",
     "device",
     "precision",
+    "batch",
     "plab",
     "git_commit",
     "config_hash",
@@ -50,6 +51,7 @@ _ORIGIN = {
     "started": "start_time",
     "device": "device",
     "precision": "precision",
+    "batch": "batch",
     "plab": "plab",
     "git_commit": "git_commit",
 }
@@ -241,7 +243,12 @@ def _row(file: h5py.File, path: Path) -> Row:
         "seconds": float(sum(phases.values())),
         "config_hash": file.attrs["config_hash"],
         "path": str(path),
-    } | {name: origin.get(attribute, np.nan) for name, attribute in _ORIGIN.items()}
+    } | {name: _plain(origin.get(attribute, np.nan)) for name, attribute in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)
+
+
+def _plain(value: Any) -> Any:
+    """Return a scalar as JSON, hence the index, can hold it."""
+    return value.item() if isinstance(value, np.generic) else value

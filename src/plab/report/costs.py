@@ -1,0 +1,196 @@
+"""What results cost: times of steps and phases, run time against error, what the contact model changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from plab.report.collect import Runs
+from plab.report.curves import Series
+from plab.report.figures import Drawing, grid, legend, legend_of_methods, log_axis
+from plab.report.measurements import origin
+from plab.report.methods import method
+from plab.report.tables import ordered_tasks
+
+__all__ = [
+    "PHASES",
+    "contact_models",
+    "phases",
+    "precision_summary",
+    "step_times",
+    "work_precision",
+]
+
+PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
+"""Phases of a run, with their colours."""
+
+_FLOOR = 1e-16
+"""Errors are drawn no smaller than this."""
+
+
+def step_times(compared: pd.DataFrame) -> Drawing | None:
+    """Draw times per environment step beside the paper's; None without any.
+
+    Args:
+        compared: Data of the table ``timing`` in the form ``comparison``.
+    """
+    if compared.empty:
+        return None
+    tasks = ordered_tasks(list(dict.fromkeys(compared["task"])))
+    kinds = [kind for kind in ("forward", "forward + backward") if kind in set(compared["what"])]
+    figure, axes = grid(1, len(kinds), width=3.6, height=0.3 * len(tasks) + 0.7)
+    markers = dict(zip(dict.fromkeys(compared["measured"]), "osD^vP*X" * 9, strict=False))
+    for panel, kind in zip(axes[0], kinds, strict=True):
+        for row in compared[compared["what"] == kind].to_dict("records"):
+            y = tasks.index(row["task"])
+            panel.plot([row["ms"], row["paper_ms"]], [y, y], color="#CCCCCC", zorder=1)
+            panel.plot(row["paper_ms"], y, "o", color="white", markeredgecolor="#555555", markersize=5,
+                       label="the paper, GTX 1080 Ti", zorder=2)  # fmt: skip
+            panel.plot(row["ms"], y, markers[row["measured"]], color="#0072B2", markersize=5,
+                       label=f"plab: {row['measured']}", zorder=3)  # fmt: skip
+        log_axis(panel, f"{kind} [ms per environment step]")
+        panel.set_yticks(range(len(tasks)), tasks)
+        panel.set_ylim(len(tasks) - 0.5, -0.5)
+    legend(figure, columns=1)
+    return Drawing("step_times", figure, ["Time of an environment step of one environment."])
+
+
+def phases(runs: Runs) -> Drawing | None:
+    """Draw how long the phases of the runs took, mean per task and method; None without runs."""
+    names = [name for name in PHASES if f"seconds_{name}" in runs.table]
+    if runs.table.empty or not names:
+        return None
+    columns = [f"seconds_{name}" for name in names]
+    means = runs.table.groupby(["task", "method"])[columns].mean()
+    keys = [(t, m) for t in ordered_tasks(runs.tasks) for m in runs.methods if (t, m) in means.index]
+    figure, axes = grid(1, 1, width=6.4, height=0.24 * len(keys) + 0.6)
+    panel = axes[0, 0]
+    left = np.zeros(len(keys))
+    for name, column in zip(names, columns, strict=True):
+        values = means.loc[keys, column].fillna(0.0).to_numpy()
+        panel.barh(range(len(keys)), values, left=left, color=PHASES[name], label=name, height=0.7)
+        left += values
+    panel.set_yticks(range(len(keys)), [f"{task}, {method(name).label}" for task, name in keys])
+    panel.set_ylim(len(keys) - 0.5, -0.5)
+    panel.set_xlabel("seconds of a run")
+    panel.grid(axis="y", visible=False)
+    legend(figure)
+    notes = ["Mean over the runs. Of runs in one batch each one's share of the time."]
+    return Drawing("phases", figure, notes)
+
+
+# ----------------------------------------------------------------------------------------- run time and error
+
+
+def work_precision(table: pd.DataFrame) -> Drawing | None:
+    """Draw run time against error, per task and contact model; None where nothing was varied.
+
+    Args:
+        table: What ``python -m plab.bench.accuracy`` wrote, see :func:`plab.report.measurements.measured`.
+    """
+    table = table[(table["axis"] == "substeps") & (table["material"] == "series")]
+    if table.empty:
+        return None
+    tasks, contacts = list(dict.fromkeys(table["task"])), list(dict.fromkeys(table["contact"]))
+    shown = {"positions": "final positions, RMS", "gradient": "norm of the gradient, relative"}
+    columns = [(column, text, contact) for column, text in shown.items() for contact in contacts]
+    figure, axes = grid(len(tasks), len(columns), width=2.2, height=1.9)
+    for line, task in zip(axes, tasks, strict=True):
+        for panel, (column, text, contact) in zip(line, columns, strict=True):
+            own = table[(table["task"] == task) & (table["contact"] == contact)]
+            _errors(panel, own, column)
+            panel.set_title(f"{task}, {contact} contact")
+            log_axis(panel, "ms per step with gradient")
+            log_axis(panel, text, vertical=True)
+    legend(figure)
+    notes = [
+        "Error against a reference in float64 with many more substeps; numbers: substeps per environment "
+        "step. Settings that diverge are left out.",
+        *origin(table),
+    ]
+    return Drawing("run_time_against_error", figure, notes)
+
+
+def _errors(panel: Axes, own: pd.DataFrame, column: str) -> None:
+    """Draw a line per precision, each point with its number of substeps."""
+    for precision, rows in own.groupby("precision", sort=False):
+        stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
+        colour, mark = _PRECISIONS.get(precision, ("#777777", "x"))
+        times, error = stable["ms_per_step"], stable[column].astype(float).clip(lower=_FLOOR)
+        panel.plot(times, error, f"{mark}-", color=colour, markersize=3.5, label=precision)
+        for x, y, steps in zip(times, error, stable["substeps"], strict=True):
+            panel.annotate(str(steps), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
+
+
+_PRECISIONS = {"float32": ("#D55E00", "o"), "float64": ("#0072B2", "s")}
+
+
+def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the worst and the median difference of float32 from float64, per task and kind of actions.
+
+    Args:
+        table: What ``python -m plab.bench.precision`` wrote, read by the same.
+    """
+    rows = []
+    for (task, kind), own in table.groupby(["task", "actions"], sort=False):
+        score, turn = own["difference"].astype(float).abs(), own["angle_deg"].astype(float)
+        rows.append(
+            {
+                "task": task,
+                "actions": kind,
+                "configurations": len(own),
+                "largest difference of scores": f"{score.max():.1e}",
+                "median": f"{score.median():.1e}",
+                "largest angle of gradients [deg]": f"{turn.max():.2g}",
+                "median angle [deg]": f"{turn.median():.2g}",
+                "failures": int(own["failures"].fillna("").ne("").sum()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+# --------------------------------------------------------------------------------------------- contact models
+
+
+def contact_models(runs: Runs, series: Series) -> Drawing | None:
+    """Draw the score of each run's best row against that of its final evaluation; None without runs.
+
+    Gradient methods find their actions in the contact model of their rollouts (soft but for Adam-H) and are
+    judged in the hard one.
+
+    Args:
+        runs: Our runs.
+        series: Their rows, in the order of ``runs.table``.
+    """
+    if runs.table.empty:
+        return None
+    figure, axes = grid(1, 1, width=3.6, height=3.1)
+    panel = axes[0, 0]
+    panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
+    gaps: Mapping[str, list[float]] = {name: [] for name in runs.methods}
+    for row, (_, rows) in zip(runs.table.to_dict("records"), series, strict=True):
+        best = rows[rows["iteration"] == row["best_iteration"]]["score"]
+        if len(best):
+            before = min(max(float(best.iloc[0]), 0.0), 1.0)
+            panel.plot(
+                before, row["score"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
+            )
+            gaps[row["method"]].append(row["score"] - before)
+    panel.set_xlim(-0.02, 1.02)
+    panel.set_ylim(-0.02, 1.02)
+    panel.set_xlabel("score of the best row, in its own contact model")
+    panel.set_ylabel("score of the final evaluation, hard contact")
+    legend_of_methods(figure, [name for name in runs.methods if gaps[name]])
+    numbers = {
+        name: {"runs": len(own), "mean": float(np.mean(own)), "largest": _largest(own)}
+        for name, own in gaps.items()
+        if own
+    }
+    return Drawing("contact_models", figure, ["A point per run."], numbers)
+
+
+def _largest(values: Sequence[float]) -> float:
+    return float(max(values, key=abs))

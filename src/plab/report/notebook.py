@@ -1,0 +1,118 @@
+"""What the report notebooks in ``reports/`` have in common: finding runs, showing tables and figures."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from IPython.display import HTML, Image, Markdown, display
+
+from plab.examples import resolve
+from plab.report.collect import NAMES, Runs, collect
+from plab.report.figures import Drawing, fix_layout, style
+from plab.report.measurements import Benchmark, measured
+from plab.report.table import Table
+from plab.results import ResultsError
+from plab.selection import select
+
+__all__ = ["benchmark", "gather", "say", "show_figure", "show_origin", "show_table"]
+
+_DPI = 180
+_COLOURS = {
+    "same": "same",
+    "higher": "good",
+    "lower": "bad",
+    "undecided": "unsure",
+    "too": "unsure",
+    "no": "nothing",
+}
+"""Class of a cell by the first word of its verdict."""
+
+
+def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
+    """Find the runs, and say so in one line where there are none.
+
+    Args:
+        results: Folders or archives; ``example`` is the archive that comes with plab.
+        words: Which runs, as for ``python -m plab.report``.
+    """
+    runs = collect([resolve(source) for source in results], select(words, NAMES))
+    if runs.table.empty:
+        say(
+            f"There are no finished runs in {', '.join(map(str, results))}: `python -m plab.run task=Move` "
+            "makes one, and `--results example` shows those that come with plab."
+        )
+    return runs
+
+
+def show_origin(runs: Runs, command: str) -> None:
+    """Show which command and which result files everything below comes from."""
+    lines = [
+        f"Made by <code>{escape(command)}</code> from {len(runs.table)} run(s); SHA-256 over them "
+        f"<code>{runs.digest}</code>."
+    ]
+    lines += [escape(line) + "." for line in runs.left_out()]
+    names = runs.table.reindex(columns=["task", "variant", "method", "seed", "config_hash", "path"])
+    files = names.to_html(index=False, border=0, classes="plain")
+    display(HTML(f"<p>{' '.join(lines)}</p><details><summary>The result files</summary>{files}</details>"))
+
+
+def say(text: str) -> None:
+    """Show a line of Markdown."""
+    display(Markdown(text))
+
+
+def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
+    """Show a table of the report, or cells of text; verdicts are coloured."""
+    cells = table.cells if isinstance(table, Table) else table
+    notes = table.notes if isinstance(table, Table) else notes
+    bold = table.bold if isinstance(table, Table) else None
+    head = "".join(f"<th>{escape(str(name))}</th>" for name in cells.columns)
+    body = "".join(
+        f"<tr>{''.join(_cell(text, bold is not None and bold[r, c]) for c, text in enumerate(line))}</tr>"
+        for r, line in enumerate(cells.to_numpy(dtype=str))
+    )
+    html = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    display(HTML(html + f'<p class="note">{escape(" ".join(notes))}</p>'))
+
+
+def _cell(text: str, bold: bool) -> str:
+    kind = _COLOURS.get(text.split(" ")[0], "") if text else ""
+    shown = f"<b>{escape(text)}</b>" if bold else escape(text)
+    return f'<td class="{kind}">{shown}</td>' if kind else f"<td>{shown}</td>"
+
+
+def show_figure(drawing: Drawing | None) -> None:
+    """Show a figure with its notes; of None, that there is nothing to draw."""
+    if drawing is None:
+        say("*Nothing to draw: there are no runs for it.*")
+        return
+    content = io.BytesIO()
+    with style():
+        fix_layout(drawing.figure)
+        drawing.figure.savefig(content, format="png", dpi=_DPI)
+    width = int(np.ceil(drawing.figure.get_figwidth() * 110))
+    display(Image(content.getvalue(), width=width, alt=drawing.name))
+    display(HTML(f'<p class="note">{escape(" ".join(drawing.notes))}</p>'))
+
+
+def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
+    """Return what a benchmark measured, or say what makes its file.
+
+    Args:
+        folder: Folder of the benchmarks' files.
+        which: The benchmark.
+
+    Returns:
+        Its rows; None where the file is missing or not what it should be.
+    """
+    try:
+        return measured(Path(folder) / which.file, which)
+    except ResultsError as error:
+        text = str(error)
+        say(f"{text[0].upper()}{text[1:]}.")
+        return None

@@ -1,0 +1,126 @@
+"""The report notebooks, executed without a browser and turned into pages."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from plab.results import ResultsError
+from plab.runners.progress import show_progress
+
+__all__ = ["NOTEBOOKS", "execute", "notebook_folder", "require_packages"]
+
+NOTEBOOKS = ("reproduction", "speed", "accuracy", "anatomy")
+"""Names of the notebooks."""
+
+_PACKAGES = ("jupytext", "nbclient", "nbconvert", "ipykernel")
+
+
+def notebook_folder() -> Path:
+    """Return the folder of the notebooks' sources: the source tree's ``reports/``, or that of a wheel.
+
+    Raises:
+        plab.results.ResultsError: If the installation is incomplete.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "reports", package.parents[1] / "reports"):
+        if (folder / f"{NOTEBOOKS[0]}.py").is_file():
+            return folder
+    raise ResultsError(f"no reports/ next to {package}: the installation is incomplete, install plab again")
+
+
+def require_packages() -> None:
+    """Raise :class:`plab.results.ResultsError` if a package that executes notebooks is missing."""
+    missing = [name for name in _PACKAGES if find_spec(name) is None]
+    if missing:
+        raise ResultsError(
+            f"notebooks need {', '.join(missing)}, not installed here: pip install 'plab[report]'"
+        )
+
+
+def execute(names: Sequence[str], parameters: Mapping[str, Any], out: Path) -> list[Path]:
+    """Execute notebooks and write each as a page, and as a notebook with its outputs.
+
+    Args:
+        names: Names among :data:`NOTEBOOKS`.
+        parameters: Values for the names in the notebooks' cell ``parameters``.
+        out: Folder to write to.
+
+    Returns:
+        The pages.
+
+    Raises:
+        plab.results.ResultsError: If a notebook breaks off.
+    """
+    require_packages()
+    out.mkdir(parents=True, exist_ok=True)
+    pages = []
+    with show_progress("notebooks", 0, len(names), plain_every=1) as report:
+        for number, name in enumerate(names, start=1):
+            notebook = _executed(name, parameters)
+            (out / f"{name}.ipynb").write_text(_text(notebook), encoding="utf-8", newline="\n")
+            page = out / f"{name}.html"
+            page.write_text(_page(notebook, name, names), encoding="utf-8", newline="\n")
+            pages.append(page)
+            report(number, name)
+    return pages
+
+
+def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
+    import jupytext
+    import nbformat
+    from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError
+
+    notebook = jupytext.read(notebook_folder() / f"{name}.py")
+    at = next(k for k, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", []))
+    given = "\n".join(f"{key} = {value!r}" for key, value in parameters.items())
+    notebook.cells.insert(at + 1, nbformat.v4.new_code_cell(f"# Given on the command line\n{given}"))
+    # It runs where the command was given, so that relative paths mean the same.
+    client = NotebookClient(
+        notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": os.getcwd()}}
+    )
+    client.create_kernel_manager()
+    if os.name == "posix":
+        # Files of the user's own; what goes over TCP others on the computer can read.
+        client.km.transport = "ipc"
+    try:
+        # What a kernel itself says is about Jupyter; what cells say is in the notebook.
+        client.execute(stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except CellExecutionError as error:
+        raise ResultsError(f"notebook {name} broke off: {error.ename}: {error.evalue}") from error
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            # Everything that is to be seen is displayed; what is printed is libraries' talk.
+            cell.outputs = [output for output in cell.outputs if output.output_type != "stream"]
+    return notebook
+
+
+def _text(notebook: Any) -> str:
+    import nbformat
+
+    return nbformat.writes(notebook)
+
+
+def _page(notebook: Any, name: str, names: Sequence[str]) -> str:
+    from nbconvert import HTMLExporter
+
+    exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
+    body, _ = exporter.from_notebook_node(notebook)
+    folder = files("plab.report") / "web"
+    text = {
+        file: (folder / file).read_text(encoding="utf-8")
+        for file in ("notebook.html", "page.css", "notebook.css")
+    }
+    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["notebook.html"])
+    return template.render(
+        style=Markup(text["page.css"] + text["notebook.css"]), body=Markup(body), name=name, names=names
+    )
