@@ -1,12 +1,21 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
 # make test   set up .venv and run the tests but the slow ones (those marked gpu skip themselves without a GPU)
+# make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
+#
+# With the development tools; CONTRIBUTING.md has more about them:
+# make test-unit   only the tests that simulate nothing
 # make test-slow   the slow ones: all fifty configurations at full size, about half an hour on two cores
-# make lint   check style
-# make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
+# make lint        style, spelling, imports, unused code and dependencies
+# make typecheck   types of src/
+# make coverage    which lines of src/ the tests run, kernels left out
+# make docs        the documentation as a site, in site/; make docs-serve shows it while it is written
+# make build       wheel and sdist in dist/, and a run of the wheel in an environment and a folder of its own
+#
 # make tables   the paper's tables beside ours, from results alone: reports/tables; RESULTS=folder or archive
 # make curves   the paper's curves and more, from results alone: reports/curves
-# make tex-packages   on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
-# make clean  remove everything that can be made again, except results
+# make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
+# make tex-packages      on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
+# make clean    remove everything that can be made again, except results
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -16,13 +25,20 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint clean system-packages tex-packages tables curves
+.PHONY: run dev test test-unit test-slow lint typecheck coverage docs docs-serve build clean system-packages \
+	tex-packages tables curves
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
 
+dev: $(VENV)/.dev.stamp $(VENV)/.docs.stamp
+	$(BIN)/pre-commit install
+
 test: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m "not slow"
+
+test-unit: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest -m "not physics and not slow and not gpu"
 
 test-slow: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m slow
@@ -30,6 +46,26 @@ test-slow: $(VENV)/.dev.stamp
 lint: $(VENV)/.dev.stamp
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
+	$(BIN)/typos
+	$(BIN)/lint-imports
+	$(BIN)/vulture
+	$(BIN)/deptry .
+
+typecheck: $(VENV)/.dev.stamp
+	$(BIN)/python -m mypy
+
+coverage: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term --cov-report=html
+
+docs: $(VENV)/.docs.stamp
+	$(BIN)/python -m mkdocs build --strict
+
+docs-serve: $(VENV)/.docs.stamp
+	$(BIN)/python -m mkdocs serve
+
+build: $(VENV)/.dev.stamp
+	$(BIN)/python -m build
+	PYTHON=$(BIN)/python tools/check_wheel.sh
 
 system-packages:
 	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri
@@ -44,10 +80,11 @@ curves: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.report curves --results $(RESULTS) --out $(REPORTS)/curves
 
 clean:
-	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov
-	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	find src tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Installed again only when what is to be installed has changed. The dev set-up includes the other.
+# Installed again only when what is to be installed has changed. The dev set-up includes that of runs.
 $(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e .
 	touch $@
@@ -55,6 +92,10 @@ $(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.dev.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
 	touch $@ $(VENV)/.run.stamp
+
+$(VENV)/.docs.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e ".[docs]"
+	touch $@
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -241,7 +241,7 @@ def test_pictures(env: PlabEnv, monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(shown[0][0], state.x[0])
     np.testing.assert_array_equal(shown[0][1], state.poses[0])
     # Puts back what closing takes away: the other tests go on with this environment.
-    monkeypatch.setattr(env.batch, "problem", env.batch.problem)
+    monkeypatch.setattr(env.batch, "_problem", env.batch.problem)
     env.close()
     assert shown[1:] == ["closed"]
 

@@ -70,8 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # be made.
         if tally.started:
             raise
-        writing = isinstance(error, OSError) and error.filename is not None
-        reason = f"cannot write {error.filename}: {error.strerror}" if writing else str(error)
+        reason = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            reason = f"cannot write {error.filename}: {error.strerror}"
         return _complain(reason, EXIT_USER_ERROR)
     except KeyboardInterrupt:
         tally.report()
@@ -98,7 +99,7 @@ def _job(tally: Tally) -> TaskFunction:
             return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
-    job.tally = tally
+    job.tally = tally  # type: ignore[attr-defined]
     return job
 
 
@@ -139,7 +140,7 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
         unknown = message.partition("unrecognized arguments: ")[2]
         raise ConfigError(f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown else message)
 
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]
     arguments = parser.parse_intermixed_args(argv)
     check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)

@@ -118,7 +118,10 @@ def rows(
     unreadable: list[ResultsError] = []
     for root in map(Path, sources):
         for entry in _all_rows(root, index):
-            (unreadable if isinstance(entry, ResultsError) else found).append(entry)
+            if isinstance(entry, ResultsError):
+                unreadable.append(entry)
+            else:
+                found.append(entry)
     return _without_repetitions(found), unreadable
 
 
@@ -188,8 +191,9 @@ def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
             )
             continue
         fresh = list(read_rows(path))
-        if known is not None and not any(isinstance(row, ResultsError) for row in fresh):
-            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in fresh])
+        sound = [row for row in fresh if isinstance(row, Row)]
+        if known is not None and len(sound) == len(fresh):
+            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in sound])
         yield from fresh
     if known is not None:
         known.save()
