@@ -22,15 +22,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.checks import check_device, check_sources, cuda_is_usable
+from plab.checks import check_device, check_sources
 from plab.cli_help import help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
 from plab.scene import SceneError
-from plab.sweep.tally import Refusal, Tally
+from plab.tally import Refusal, Tally
 from plab.targets import TargetError
 
-__all__ = ["cuda_is_usable", "main"]
+__all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
 EXIT_USER_ERROR = 2

@@ -12,12 +12,12 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from omegaconf import OmegaConf
 
+from plab.checks import cuda_is_usable
 from plab.config import load_config
 from plab.config_types import Config, SimConfig, TaskConfig
 from plab.problem import Problem
 from plab.render.graphics import RenderError
 from plab.results import read
-from plab.run import cuda_is_usable
 from plab.scene import Scene
 
 __all__ = ["Recording", "demonstration", "record", "result", "starts"]

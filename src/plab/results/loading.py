@@ -8,7 +8,7 @@ import warnings
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ import pandas as pd
 from plab.results.files import attributes, opened, opened_image, split_archive
 from plab.results.index import Index
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
+from plab.selection import lookup
 
-__all__ = ["Row", "load", "lookup", "read_rows", "rows", "run_files"]
+__all__ = ["Row", "load", "read_rows", "rows", "run_files"]
 
 _SUMMARY_COLUMNS = (
     "task",
@@ -163,14 +164,6 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
                 yield _member_row(archive, path, name)
     except (OSError, zipfile.BadZipFile) as error:
         yield ResultsError(f"{path} is truncated or damaged ({error})")
-
-
-def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """Return a configuration's value of a dotted key, NaN where there is none."""
-    value: Any = config
-    for part in key.split("."):
-        value = value.get(part, np.nan) if isinstance(value, Mapping) else np.nan
-    return value
 
 
 # ---------------------------------------------------------------------------------------------------- details
