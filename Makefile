@@ -58,10 +58,10 @@ coverage: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term --cov-report=html
 
 docs: $(VENV)/.docs.stamp
-	$(BIN)/python -m mkdocs build --strict
+	$(BIN)/python -m properdocs build --strict -f mkdocs.yml
 
 docs-serve: $(VENV)/.docs.stamp
-	$(BIN)/python -m mkdocs serve
+	$(BIN)/python -m properdocs serve -f mkdocs.yml
 
 build: $(VENV)/.dev.stamp
 	$(BIN)/python -m build
