@@ -29,6 +29,8 @@ from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, observation, total_loss
 from plab.suite import suite_tasks
 
+pytestmark = pytest.mark.physics
+
 HORIZON = 4
 COARSE = [
     "sim.grid_size=32",

@@ -79,7 +79,7 @@ def run_random_search(jobs: Sequence[Job], note: str = "") -> None:
 
 # plab learns of the method: its keys, its runner, and that it adds no column to the results.
 ConfigStore.instance().store(group="schema/method", name="random_search", node=RandomSearchConfig)
-RUNNERS["random_search"] = "random_search:run_random_search"
+RUNNERS["random_search"] = f"{__name__}:run_random_search"
 FAMILY_COLUMNS["random_search"] = ()
 
 if __name__ == "__main__":

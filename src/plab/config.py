@@ -110,7 +110,8 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Refuse a folder that is missing, or that has a file by a name of plab's own, which Hydra would ignore.
+    """Refuse a folder that is missing, or that has a file that is no text or has a name of plab's own, by which
+    Hydra would ignore it.
 
     Args:
         config_dir: Folder with files of the user's own, in subfolders named like the groups.
@@ -124,6 +125,10 @@ def _check_config_dir(config_dir: str | Path) -> None:
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
+            try:
+                path.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError):
+                raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -177,6 +182,8 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
         _check_config_dir(config_dir)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, text = override.key_or_group, str(override.input_line)
+        if not key:
+            raise ConfigError(f"cannot read '{text}': write key=value")
         if override.is_hydra_override() or key.startswith("hydra/"):
             continue
         if override.is_delete():

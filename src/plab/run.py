@@ -142,6 +142,10 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
 
     parser.error = refuse  # type: ignore[method-assign]
     arguments = parser.parse_intermixed_args(argv)
+    if arguments.package and not arguments.cfg:
+        raise ConfigError(
+            "--package has no effect without --cfg: write --cfg job --package sim, or leave it out"
+        )
     check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)
     for override in arguments.overrides:
