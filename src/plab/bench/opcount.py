@@ -7,6 +7,7 @@ what they use of Taichi, on numbers each of whose operations adds one to a count
 
 from __future__ import annotations
 
+import inspect
 import types
 from collections import defaultdict
 from collections.abc import Callable
@@ -76,7 +77,7 @@ _modules: dict[int, dict[str, Any]] = {}
 
 def plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the Python function behind one of Taichi's; what it calls is plain, too."""
-    inner = function.__wrapped__
+    inner = inspect.unwrap(function)
     return types.FunctionType(
         inner.__code__, _namespace(inner.__globals__), inner.__name__, inner.__defaults__, inner.__closure__
     )

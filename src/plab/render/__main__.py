@@ -155,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     def refuse(message: str) -> NoReturn:
         raise RenderError(message)
 
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]
     return parser
 
 
