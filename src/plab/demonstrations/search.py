@@ -19,7 +19,7 @@ from plab.config import Config, build_scene
 from plab.config_types import TrajectoryConfig
 from plab.demonstrations import known_actions
 from plab.problem import Problem
-from plab.runners.progress import show_progress
+from plab.progress import show_progress
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.targets import EPISODE_STEPS, BodiesTarget, make_recipe
 from plab.targets.scripted import DECIMALS, Track

@@ -90,9 +90,9 @@ def _draw_rollout(arguments: argparse.Namespace) -> None:
 
 
 def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
+    from plab.progress import show_progress
     from plab.render.pictures import save_contact_sheet
     from plab.render.recording import starts
-    from plab.runners.progress import show_progress
 
     tasks = choices("task", arguments.config_dir)
     rows = {}

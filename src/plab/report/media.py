@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plab.progress import show_progress
 from plab.report.collect import Runs
-from plab.runners.progress import show_progress
 
 if TYPE_CHECKING:
     from plab.config_types import Config
@@ -154,7 +154,7 @@ def _replayed(group: Sequence[Shown]) -> dict[tuple[str, str], Recording]:
             cfg, actions = recording.result(Path(run["path"]))
             kind = json.dumps([dataclasses.asdict(cfg.sim), actions.shape])
             alike[kind].append(((shown.name, method), cfg, actions))
-    made = {}
+    made: dict[tuple[str, str], Any] = {}
     for cases in alike.values():
         names, cfgs, actions = zip(*cases, strict=True)
         made |= dict(zip(names, recording.record_all(cfgs, np.stack(actions)), strict=True))

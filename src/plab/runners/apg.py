@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from plab.config_types import ApgConfig
+from plab.progress import show_progress
 from plab.results import RunFile
 from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_threads
 from plab.runners.jobs import Job, title
-from plab.runners.progress import show_progress
 from plab.torch import rollout
 
 if TYPE_CHECKING:

@@ -21,6 +21,7 @@ from stable_baselines3.common.logger import Logger, configure
 
 from plab.config import ConfigError, RlConfig
 from plab.envs.core import EpisodeBatch
+from plab.progress import Report, show_progress
 from plab.results import RunFile
 from plab.runners.common import (
     PolicyEpisode,
@@ -31,7 +32,6 @@ from plab.runners.common import (
     torch_threads,
 )
 from plab.runners.jobs import Job, title
-from plab.runners.progress import Report, show_progress
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
 

@@ -18,10 +18,10 @@ import torch
 
 from plab.config_types import TrajectoryConfig
 from plab.problem import Episodes, Problem, build_scenes
+from plab.progress import show_progress
 from plab.results import ResultsError
 from plab.runners.common import COLUMNS, kept, measures, simulation_errors
 from plab.runners.jobs import Job, RunError, TogetherError, batch_title
-from plab.runners.progress import show_progress
 from plab.sim import DeviceError, Simulator
 
 if TYPE_CHECKING:
