@@ -1,16 +1,26 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
 # make test   set up .venv and run the tests but the slow ones (those marked gpu skip themselves without a GPU)
+# make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
+#
+# With the development tools; CONTRIBUTING.md has more about them:
+# make test-unit   only the tests that simulate nothing
 # make test-slow   the slow ones: all fifty configurations at full size, about half an hour on two cores
-# make lint   check style
-# make system-packages   on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
+# make lint        style, spelling, imports, unused code and dependencies
+# make typecheck   types of src/
+# make coverage    which lines of src/ the tests run, kernels left out
+# make docs        the documentation as a site, in site/; make docs-serve shows it while it is written
+# make build       wheel and sdist in dist/, and a run of the wheel in an environment and a folder of its own
+#
 # make tables   the paper's tables beside ours, from results alone: reports/tables; RESULTS=folder or archive, or
 #               RESULTS=example: real runs that come with plab
 # make curves   the paper's curves and more, from results alone: reports/curves
 # make report   notebooks on reproduction, speed, accuracy and a single run: reports/notebooks/*.html
 # make html     a page of all results, with curves, pictures and films: reports/html/index.html
-# make browser-packages   on Debian or Ubuntu, as root: Chromium, with which the page is tested
-# make tex-packages   on Debian or Ubuntu, as root: a small LaTeX, to typeset the tables
-# make clean  remove everything that can be made again, except results
+#
+# make system-packages    on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
+# make browser-packages   the same: Chromium, with which the page is tested
+# make tex-packages       the same: a small LaTeX, to typeset the tables
+# make clean    remove everything that can be made again, except results
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -20,13 +30,23 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint clean system-packages tex-packages browser-packages tables curves report html
+# A file of tests per process and core at a time: kernels are compiled once per process.
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+
+.PHONY: run dev test test-unit test-slow lint typecheck coverage docs docs-serve build clean system-packages \
+	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
 	$(BIN)/python -m plab.run $(ARGS)
 
+dev: $(VENV)/.dev.stamp $(VENV)/.docs.stamp
+	$(BIN)/pre-commit install
+
 test: $(VENV)/.dev.stamp
-	$(BIN)/python -m pytest -m "not slow"
+	$(PARALLEL) -m "not slow"
+
+test-unit: $(VENV)/.dev.stamp
+	$(PARALLEL) -m "not physics and not slow and not gpu"
 
 test-slow: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m slow
@@ -34,6 +54,26 @@ test-slow: $(VENV)/.dev.stamp
 lint: $(VENV)/.dev.stamp
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
+	$(BIN)/typos
+	$(BIN)/lint-imports
+	$(BIN)/vulture
+	$(BIN)/deptry .
+
+typecheck: $(VENV)/.dev.stamp
+	$(BIN)/python -m mypy
+
+coverage: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term --cov-report=html
+
+docs: $(VENV)/.docs.stamp
+	$(BIN)/python -m properdocs build --strict -f mkdocs.yml
+
+docs-serve: $(VENV)/.docs.stamp
+	$(BIN)/python -m properdocs serve -f mkdocs.yml
+
+build: $(VENV)/.dev.stamp
+	$(BIN)/python -m build
+	PYTHON=$(BIN)/python tools/check_wheel.sh
 
 system-packages:
 	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri
@@ -57,10 +97,11 @@ html: $(VENV)/.report.stamp
 	$(BIN)/python -m plab.report html --results $(RESULTS) --out $(REPORTS)/html
 
 clean:
-	rm -rf $(VENV) build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .coverage htmlcov
-	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	find src tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Installed again only when what is to be installed has changed. The dev set-up includes the other.
+# Installed again only when what is to be installed has changed. The dev set-up includes that of runs.
 $(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e .
 	touch $@
@@ -72,6 +113,10 @@ $(VENV)/.report.stamp: pyproject.toml constraints.txt | $(BIN)/python
 $(VENV)/.dev.stamp: pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
 	touch $@ $(VENV)/.run.stamp $(VENV)/.report.stamp
+
+$(VENV)/.docs.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install -c constraints.txt -e ".[docs]"
+	touch $@
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

@@ -6,9 +6,9 @@ import os
 
 import pytest
 
+from plab.checks import cuda_is_usable
 from plab.config import Config
-from plab.run import cuda_is_usable
-from plab.sweep.tally import Outcome
+from plab.tally import Outcome
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,8 @@ from plab.bench.diagrams import draw
 from plab.bench.precision import angle, compare, markdown, starts
 from plab.scene import Body
 
+pytestmark = pytest.mark.physics
+
 
 def test_angle_is_exact_for_small_and_large_ones() -> None:
     a = np.random.default_rng(0).normal(size=(5, 3))

@@ -21,6 +21,8 @@ from plab.sim import linalg as linear_algebra
 from plab.sim.memory import array_bytes
 from plab.suite import suite_tasks
 
+pytestmark = pytest.mark.physics
+
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
 STEPS = 6
 PARTICLES = 25_000

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from plab.checks import cuda_is_usable
 from plab.config import Config, choices
 from plab.results import ResultsError
-from plab.run import cuda_is_usable, main
+from plab.run import main
 from plab.runners import RunError
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")

@@ -15,6 +15,8 @@ from plab.demonstrations.__main__ import main, replay
 from plab.demonstrations.search import carry, search
 from plab.targets import demonstration
 
+pytestmark = pytest.mark.physics
+
 TASKS = (
     "Assembly", "Chopsticks", "Move", "Pinch", "RollingPin", "Rope", "Table", "Torus", "TripleMove", "Writer",
 )  # fmt: skip

@@ -29,6 +29,8 @@ from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, observation, total_loss
 from plab.suite import suite_tasks
 
+pytestmark = pytest.mark.physics
+
 HORIZON = 4
 COARSE = [
     "sim.grid_size=32",
@@ -241,7 +243,7 @@ def test_pictures(env: PlabEnv, monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(shown[0][0], state.x[0])
     np.testing.assert_array_equal(shown[0][1], state.poses[0])
     # Puts back what closing takes away: the other tests go on with this environment.
-    monkeypatch.setattr(env.batch, "problem", env.batch.problem)
+    monkeypatch.setattr(env.batch, "_problem", env.batch.problem)
     env.close()
     assert shown[1:] == ["closed"]
 

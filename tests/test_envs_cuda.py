@@ -14,7 +14,7 @@ from plab.torch import TensorEnv, rollout
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.physics, pytest.mark.gpu]
 
 
 def episode(device: str) -> list[tuple]:

@@ -28,6 +28,8 @@ from plab.runners.rl_models import ALGORITHMS, LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
 from plab.sim import SimulationError
 
+pytestmark = pytest.mark.physics
+
 HORIZON = 4
 
 COARSE = (

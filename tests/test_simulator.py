@@ -13,6 +13,8 @@ from plab.sim import SimulationError, Simulator
 from plab.sim.order import curve_order, hilbert_index
 from plab.sim.runtime import available_threads
 
+pytestmark = pytest.mark.physics
+
 STEPS = 4
 
 

@@ -13,6 +13,8 @@ from plab.scene import sample_particles
 from plab.sim import Simulator, State
 from suite import batch
 
+pytestmark = pytest.mark.physics
+
 SCENES = batch()
 STEPS = 1
 WEIGHTS = (10.0, 10.0, 1.0)

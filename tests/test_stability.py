@@ -11,6 +11,8 @@ from plab.bench.stress_cases import Plan, bang_bang_actions, refusals, stress_ca
 from plab.config import build_scene, load_config
 from plab.scene import SceneError
 
+pytestmark = pytest.mark.physics
+
 
 @pytest.mark.parametrize("name", refusals())
 def test_what_cannot_be_simulated_is_refused(name: str) -> None:

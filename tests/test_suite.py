@@ -16,6 +16,8 @@ from plab.scene import Scene
 from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.targets.__main__ import moments
 
+pytestmark = pytest.mark.physics
+
 TASKS = suite_tasks()
 COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
 # The sticks and the rope are thinner than two cells of the coarse grid: they would not hold it.

@@ -22,6 +22,8 @@ from plab.results import RunResult, read, result_path
 from plab.run import main
 from plab.runners import run_batch
 
+pytestmark = pytest.mark.physics
+
 LAUNCHERS = {"batch_joblib": "loky", "batch_submitit_local": "submitit", "batch_ray": "ray::"}
 """Launcher to a word in the command lines of its jobs' processes."""
 

@@ -16,6 +16,8 @@ from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import run_batch, run_config
 from plab.sim import Simulator
 
+pytestmark = pytest.mark.physics
+
 COARSE = (
     "sim.grid_size=16",
     "sim.horizon=3",

@@ -25,6 +25,8 @@ from plab.targets import (
 )
 from plab.targets.store import TargetStore
 
+pytestmark = pytest.mark.physics
+
 RING = {"recipe": "ring", "around": 2, "radius": 0.135, "section": 0.06, "floor": 0.0}
 BALL = {"shape": "sphere", "center": [0.5, 0.5, 0.5], "size": [0.1]}
 CUBE = {"shape": "box", "center": [0.3, 0.2, 0.5], "size": [0.2, 0.2, 0.2]}

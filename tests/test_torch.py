@@ -19,6 +19,8 @@ from plab.runners import apg, run_config
 from plab.runners.common import COLUMNS
 from plab.torch import TensorEnv, rollout
 
+pytestmark = pytest.mark.physics
+
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "rl.md"
 HORIZON = 3
 COARSE = [

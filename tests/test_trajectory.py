@@ -21,6 +21,8 @@ from plab.runners.common import measures
 from plab.runners.trajectory import ActionSequence, make_problem
 from plab.sim import SimulationError, Simulator
 
+pytestmark = pytest.mark.physics
+
 ITERATIONS = 4
 
 COARSE = (

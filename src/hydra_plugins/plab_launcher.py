@@ -20,7 +20,7 @@ from omegaconf import DictConfig, open_dict
 
 if TYPE_CHECKING:
     from plab.config import Config
-    from plab.sweep.tally import Outcome
+    from plab.tally import Outcome
 
 __all__ = ["BatchLauncher", "BatchSweeper"]
 
@@ -35,7 +35,7 @@ class BatchSweeper(BasicSweeper):
 class BatchLauncher(Launcher):
     """Runs the jobs of a sweep in batches that share a simulator.
 
-    How they ended is noted in the :class:`plab.sweep.tally.Tally` that the task function has as ``tally``:
+    How they ended is noted in the :class:`plab.tally.Tally` that the task function has as ``tally``:
     Hydra gives a launcher no other way to tell the command line.
     """
 
@@ -60,7 +60,7 @@ class BatchLauncher(Launcher):
         from plab.results import result_path
         from plab.sweep.carry import carry_here, run_sweep
         from plab.sweep.compose import Refused, compose_jobs
-        from plab.sweep.tally import Outcome, Tally
+        from plab.tally import Outcome, Tally
 
         if self._size is not None and self._size < 1:
             raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")

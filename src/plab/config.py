@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -39,7 +39,7 @@ from plab.config_types import (
     TrajectoryConfig,
 )
 from plab.random_variant import draw_variant
-from plab.scene import Scene
+from plab.scene import Scene, vector3
 from plab.suite import conf_folder
 from plab.variants import RANDOM, merge_variant, undone_key, variant_changes
 
@@ -110,7 +110,9 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Refuse a folder that is missing, or that has a file by a name of plab's own, which Hydra would ignore.
+    """Refuse a folder that is missing, that has a file that is no text, or one with a name of plab's own.
+
+    The last Hydra would ignore.
 
     Args:
         config_dir: Folder with files of the user's own, in subfolders named like the groups.
@@ -124,6 +126,10 @@ def _check_config_dir(config_dir: str | Path) -> None:
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
+            try:
+                path.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError):
+                raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -176,7 +182,9 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
     if config_dir is not None:
         _check_config_dir(config_dir)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key, text = override.key_or_group, override.input_line
+        key, text = override.key_or_group, str(override.input_line)
+        if not key:
+            raise ConfigError(f"cannot read '{text}': write key=value")
         if override.is_hydra_override() or key.startswith("hydra/"):
             continue
         if override.is_delete():
@@ -214,7 +222,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         _choose_profile(composed.method)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
-        cfg = OmegaConf.to_object(composed)
+        cfg = cast(Config, OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
     cfg.check()
@@ -234,7 +242,8 @@ def variant_task(cfg: Config) -> TaskConfig:
         ConfigError: If the variant does not exist or does not fit the task.
     """
     try:
-        return OmegaConf.to_object(merge_variant(OmegaConf.structured(cfg.task), cfg.variant))
+        merged = merge_variant(OmegaConf.structured(cfg.task), cfg.variant)
+        return cast(TaskConfig, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
 
@@ -261,7 +270,7 @@ def build_scene(cfg: Config) -> Scene:
         poisson_ratio=task.poisson_ratio,
         yield_stress=task.yield_stress,
         floor_friction=task.floor_friction,
-        gravity=tuple(task.gravity),
+        gravity=vector3(task.gravity),
         grid_size=sim.grid_size,
         dt=sim.dt,
         substeps=sim.substeps,
@@ -308,9 +317,9 @@ def _reject_unknown(node: Any, path: str) -> None:
     if not isinstance(node, DictConfig):
         return
     kind = OmegaConf.get_type(node)
-    for key in node:
+    for key in map(str, node):
         if dataclasses.is_dataclass(kind) and key not in _field_names(kind):
-            raise ConfigError(f"unknown key '{path}{key}'; {pick(str(key), _field_names(kind))}")
+            raise ConfigError(f"unknown key '{path}{key}'; {pick(key, _field_names(kind))}")
         if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
             _reject_unknown(node[key], f"{path}{key}.")
 

@@ -110,7 +110,7 @@ def _paths(node: object, prefix: str = "") -> Iterator[str]:
     """Dotted paths of all keys of dataclass nodes below a node."""
     if not isinstance(node, DictConfig) or not dataclasses.is_dataclass(OmegaConf.get_type(node)):
         return
-    for key in node:
+    for key in map(str, node):
         if key != "hydra":
             yield f"{prefix}{key}"
             if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):

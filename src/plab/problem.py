@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from plab.sim import Rollout, Simulator
 from plab.targets import TargetError, build_targets, load_release_target
 
 if TYPE_CHECKING:
+    import torch
+
     from plab.config import Config
     from plab.scene import Scene
 
@@ -37,7 +39,8 @@ class Episodes:
         iou: Soft IoU with the target after each step, shape [batch, T].
         final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
         scores: How close each environment came.
-        gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
+        gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None; a tensor if the
+            actions were one on the device.
         failures: Environments that broke off, and when and why; their numbers mean nothing.
     """
 
@@ -116,7 +119,7 @@ class Problem:
         self.initial_scores = [judged[kind] for kind in kinds]
 
     def rollout(
-        self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True
+        self, actions: np.ndarray | torch.Tensor, *, gradient: bool, strict: bool = True, exact: bool = True
     ) -> Episodes:
         """Run actions from the initial states, in the simulator's current contact model.
 
@@ -142,7 +145,7 @@ class Problem:
             iou=result.step_iou,
             final_mass=final_mass,
             scores=self._final_scores(result, final_mass),
-            gradient=result.gradient,
+            gradient=cast(Any, result.gradient),
             failures=result.failures,
         )
 

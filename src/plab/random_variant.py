@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config_errors import ConfigError, explain, pick
 from plab.config_types import RandomConfig, RangeConfig, TaskConfig
-from plab.scene import Body, Scene, SceneError
+from plab.scene import Body, Scene, SceneError, vector3
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 from plab.variants import variant_changes
 
@@ -59,14 +59,14 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     fixed = OmegaConf.create({})
     if random.variant is not None:
         fixed = variant_changes(task, random.variant)
-    base = OmegaConf.merge(task, fixed)
+    base = cast(DictConfig, OmegaConf.merge(task, fixed))
     if "seed" in base.target.keys():
-        fixed = OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}})
+        fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}}))
     rng = np.random.default_rng([seed_scene, _NUMBERS])
     for _ in range(ATTEMPTS):
-        changes = OmegaConf.merge(fixed, _draw(base, random, rng))
+        changes = cast(DictConfig, OmegaConf.merge(fixed, _draw(base, random, rng)))
         try:
-            _check(OmegaConf.to_object(OmegaConf.merge(base, changes)), random)
+            _check(cast(TaskConfig, OmegaConf.to_object(OmegaConf.merge(base, changes))), random)
         except (ConfigError, SceneError, TargetError) as error:
             flaw = error
             continue
@@ -78,7 +78,8 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
 
 def _ranges(task: DictConfig) -> RandomConfig:
     try:
-        random = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RandomConfig), task.random))
+        merged = OmegaConf.merge(OmegaConf.structured(RandomConfig), task.random)
+        random = cast(RandomConfig, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
         raise ConfigError(f"task.random: {explain(error)}") from None
     random.check("task.random")
@@ -171,7 +172,7 @@ def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
 
 
 def _half_extent(body: TargetBody) -> np.ndarray:
-    return Body(body.shape, tuple(body.center), tuple(body.size), 1).half_extent()
+    return Body(body.shape, vector3(body.center), tuple(body.size), 1).half_extent()
 
 
 def _check_reach(task: TaskConfig, goals: dict[str, TargetBody], reach: float) -> None:

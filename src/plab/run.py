@@ -22,15 +22,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.checks import check_device, check_sources, cuda_is_usable
+from plab.checks import check_device, check_sources
 from plab.cli_help import help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
 from plab.scene import SceneError
-from plab.sweep.tally import Refusal, Tally
+from plab.tally import Refusal, Tally
 from plab.targets import TargetError
 
-__all__ = ["cuda_is_usable", "main"]
+__all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
 EXIT_USER_ERROR = 2
@@ -70,8 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # be made.
         if tally.started:
             raise
-        writing = isinstance(error, OSError) and error.filename is not None
-        reason = f"cannot write {error.filename}: {error.strerror}" if writing else str(error)
+        reason = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            reason = f"cannot write {error.filename}: {error.strerror}"
         return _complain(reason, EXIT_USER_ERROR)
     except KeyboardInterrupt:
         tally.report()
@@ -98,7 +99,7 @@ def _job(tally: Tally) -> TaskFunction:
             return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
-    job.tally = tally
+    job.tally = tally  # type: ignore[attr-defined]
     return job
 
 
@@ -139,8 +140,12 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
         unknown = message.partition("unrecognized arguments: ")[2]
         raise ConfigError(f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown else message)
 
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]
     arguments = parser.parse_intermixed_args(argv)
+    if arguments.package and not arguments.cfg:
+        raise ConfigError(
+            "--package has no effect without --cfg: write --cfg job --package sim, or leave it out"
+        )
     check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)
     for override in arguments.overrides:

@@ -8,6 +8,7 @@ from it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "sample_particles",
+    "vector3",
 ]
 
 Vec3 = tuple[float, float, float]
@@ -30,6 +32,16 @@ Quaternion = tuple[float, float, float, float]
 ROLL_RADIUS = 0.03
 """Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
 release."""
+
+
+def vector3(values: Sequence[float]) -> Vec3:
+    """Return three numbers as a tuple.
+
+    Raises:
+        ValueError: If they are not three.
+    """
+    x, y, z = values
+    return x, y, z
 
 
 class SceneError(ValueError):

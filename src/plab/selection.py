@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Selection", "SelectionError", "select"]
+__all__ = ["Selection", "SelectionError", "lookup", "select"]
 
 
 class SelectionError(ValueError):
@@ -32,8 +33,6 @@ class Selection:
             values: The run's values of the names.
             config: Its configuration.
         """
-        from plab.results import lookup
-
         return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
             any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
         )
@@ -71,6 +70,14 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
         texts = list(override.sweep_string_iterator()) if sweep else [str(override.value())]
         (keys if "." in name else choices)[name] = texts
     return Selection(choices, keys)
+
+
+def lookup(config: Mapping[str, Any], key: str) -> Any:
+    """Return a configuration's value of a dotted key, NaN where there is none."""
+    value: Any = config
+    for part in key.split("."):
+        value = value.get(part, math.nan) if isinstance(value, Mapping) else math.nan
+    return value
 
 
 def _same(value: Any, text: str) -> bool:

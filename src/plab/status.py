@@ -14,11 +14,11 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from plab.locks import held
 from plab.results import ResultsError, Row, lookup, rows
@@ -33,6 +33,9 @@ STATES = ("done", "running", "interrupted", "failed", "missing")
 """What a run can be, best first; ``interrupted`` goes on when its command is given again."""
 
 NAMES = ("task", "variant", "method", "seed")
+
+Key: TypeAlias = tuple[str, str, str, str]
+"""Task, variant, method and seed of a run."""
 
 _RECENT_ROWS = 20
 """Rows of a run under way that its speed is taken from."""
@@ -126,12 +129,12 @@ class Survey:
     @property
     def eta(self) -> float | None:
         """Time until all is done [s], if as many processes stay at work; None if it is not known."""
-        left = [group.left for group in self.groups]
-        if not self.workers or None in left:
+        left = _sum(group.left for group in self.groups)
+        if not self.workers or left is None:
             return None
         # No process can help another one.
         longest = max((run.left or 0.0) * run.together for run in self.running)
-        return max(sum(left) / self.workers, longest)
+        return max(left / self.workers, longest)
 
 
 def survey(source: str | Path, chosen: Selection) -> Survey:
@@ -169,7 +172,7 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
 # --------------------------------------------------------------------------------------------------- counting
 
 
-def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[tuple[str, ...]]:
+def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[Key]:
     present = {name: {str(row.values[name]) for row in found} for name in ("method", "seed")}
     methods = [m for m in PAPER_METHODS if m in present["method"]] + sorted(
         present["method"] - {*PAPER_METHODS}
@@ -180,11 +183,17 @@ def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[tuple[str, ..
         "method": methods or list(PAPER_METHODS),
         "seed": sorted(present["seed"], key=int) or list(PAPER_SEEDS),
     }
-    return itertools.product(*(chosen.choices.get(name, open_choices[name]) for name in NAMES))
+    task, variant, method, seed = (chosen.choices.get(name, open_choices[name]) for name in NAMES)
+    return itertools.product(task, variant, method, seed)
 
 
-def _key(row: Row) -> tuple[str, ...]:
-    return tuple(str(row.values[name]) for name in NAMES)
+def _key(row: Row) -> Key:
+    return _names(row.values)
+
+
+def _names(values: Mapping[str, Any]) -> Key:
+    task, variant, method, seed = (str(values[name]) for name in NAMES)
+    return task, variant, method, seed
 
 
 def _state(row: Row) -> str:
@@ -210,13 +219,13 @@ def _take(run: Run, row: Row) -> None:
         _measure(run)
 
 
-def _starting(source: Path, runs: dict[tuple[str, ...], Run]) -> Iterable[Run]:
+def _starting(source: Path, runs: dict[Key, Run]) -> Iterable[Run]:
     """Yield missing runs that somebody has begun: there is a lock, but no file yet."""
     if not source.is_dir():
         return
     for lock in source.rglob("*.lock"):
         names = parse_member(lock)
-        run = None if names is None else runs.get(tuple(names[name] for name in NAMES))
+        run = None if names is None else runs.get(_names(names))
         if run is not None and run.state not in ("done", "running") and held(lock.with_suffix(".h5")):
             yield run
 
@@ -286,7 +295,6 @@ def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, s
     own = [run for run in runs if (run.task, run.method) == (task, method)]
     counts = Counter(run.state for run in own)
     rates = [run.rate for run in own if run.rate is not None]
-    left = [run.left for run in own]
     return Group(
         task,
         method,
@@ -294,8 +302,18 @@ def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, s
         {state: counts[state] for state in STATES},
         means.get((task, method)),
         sum(rates) / len(rates) if rates else None,
-        None if None in left else sum(left),
+        _sum(run.left for run in own),
     )
+
+
+def _sum(values: Iterable[float | None]) -> float | None:
+    """Add numbers; None if one of them is not known."""
+    total = 0.0
+    for value in values:
+        if value is None:
+            return None
+        total += value
+    return total
 
 
 # ----------------------------------------------------------------------------------------------------- output

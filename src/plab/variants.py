@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -54,7 +55,7 @@ def merge_variant(task: DictConfig, name: str) -> DictConfig:
         raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
     merged.variants = {name: changes}
     merged.random = {}
-    return merged
+    return cast(DictConfig, merged)
 
 
 def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:

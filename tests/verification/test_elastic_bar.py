@@ -10,6 +10,8 @@ import pytest
 from free_bodies import BAR_LENGTH, GRID, bar, index
 from plab.sim import Simulator, State
 
+pytestmark = pytest.mark.physics
+
 SPEED = 1e-3
 """Velocity amplitude: strains of 1e-5, so that the bar is linear."""
 

@@ -18,6 +18,8 @@ import touched_bodies as tb
 from plab.sim import Simulator
 from touched_bodies import ACTIONS, MATERIAL, TOUCHING, Point, X, components, differences, put, start
 
+pytestmark = pytest.mark.physics
+
 SIZES = 10.0 ** -np.arange(2.0, 7.1, 0.5)
 BOTTOM = 1e-6
 """Largest relative error at the bottom of the V."""

@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -205,7 +206,9 @@ class Attempt:
         self.task = task
         self.scene = build_scene(cfg)
         self.components = own_components(self.scene, PLACES)
-        self.demonstration = common_actions(self.scene, known_actions(cfg)[: plan.steps], PLACES)
+        self.demonstration = common_actions(
+            self.scene, cast(np.ndarray, known_actions(cfg))[: plan.steps], PLACES
+        )
         self.targets: dict[str, np.ndarray] = {}
         self._plan = plan
 
@@ -277,18 +280,18 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int) -> Ite
 def _roll(simulator: Simulator, attempt: Attempt, repeats: int, mass: float) -> Result:
     """Run and time one task in one contact model."""
     actions = EFFORT * attempt.demonstration[None]
-    seconds, rollout = [], None
+    seconds = []
     # The first rollout compiles.
     for _ in range(repeats + 1):
         begin = time.perf_counter()
         rollout = simulator.rollout(actions, strict=False)
         seconds.append((time.perf_counter() - begin) / actions.shape[1])
-    gradient = rollout.gradient[0][:, attempt.components] / mass
+    gradient = cast(np.ndarray, rollout.gradient)[0][:, attempt.components] / mass
     outcome = next(iter(rollout.failures.values()), "stable")
     return Result(simulator.state().x[0], gradient, min(seconds[1:]), outcome)
 
 
-def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, grid: int) -> dict[str, object]:
+def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, grid: int) -> dict[str, float]:
     """Compare a result with the reference's.
 
     Args:
@@ -309,11 +312,11 @@ def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, gri
     tensors = [spread_mass(x, grid, 1.0 / len(x)) for x in (start, result.x, exact.x)]
     judged = [scores(tensors[0], tensor, target).score for tensor in tensors[1:]]
     if setting.axis == "substeps":
-        errors["positions"] = np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean())
-    errors["mass"] = np.abs(tensors[1] - tensors[2]).sum()
+        errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
+    errors["mass"] = float(np.abs(tensors[1] - tensors[2]).sum())
     errors["score"] = abs(judged[0] - judged[1])
     length = np.linalg.norm(exact.gradient)
-    errors["gradient"] = abs(np.linalg.norm(result.gradient) / length - 1.0)
+    errors["gradient"] = float(abs(np.linalg.norm(result.gradient) / length - 1.0))
     errors["angle_deg"] = angle(result.gradient, exact.gradient)
     return errors
 

@@ -9,6 +9,8 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+from typing import Any
+
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
@@ -68,7 +70,12 @@ def _panel(place: Axes, rows: pd.DataFrame, name: str, axis: str) -> None:
     label = "substeps" if axis == "substeps" else "grid"
     for (precision, material), line in rows.groupby(["precision", "material"], sort=False):
         stable = line[line["outcome"] == "stable"]
-        style = {"color": COLOURS[precision], "marker": MARKERS[material], "markersize": 4, "linewidth": 1}
+        style: dict[str, Any] = {
+            "color": COLOURS[precision],
+            "marker": MARKERS[material],
+            "markersize": 4,
+            "linewidth": 1,
+        }
         text = f"{precision}, {material}"
         place.plot(stable["ms_per_step"], stable[name].clip(lower=FLOOR), label=text, **style)
         for _, row in stable.iterrows():

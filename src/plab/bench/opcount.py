@@ -7,6 +7,7 @@ what they use of Taichi, on numbers each of whose operations adds one to a count
 
 from __future__ import annotations
 
+import inspect
 import types
 from collections import defaultdict
 from collections.abc import Callable
@@ -76,7 +77,7 @@ _modules: dict[int, dict[str, Any]] = {}
 
 def plain(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the Python function behind one of Taichi's; what it calls is plain, too."""
-    inner = function.__wrapped__
+    inner = inspect.unwrap(function)
     return types.FunctionType(
         inner.__code__, _namespace(inner.__globals__), inner.__name__, inner.__defaults__, inner.__closure__
     )
@@ -155,22 +156,19 @@ def _stress_adjoint(precision: str) -> None:
 
 
 def _scatter() -> None:
-    """Weights, the affine field and its sums at 27 nodes; as ParticlePhases.scatter_particle."""
+    """Weights, the affine field and its sums at 27 nodes; as TransferTiles.scatter_momentum."""
     grid: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
-
-    def add(_grid: object, node: int, value: np.ndarray) -> None:
-        grid[node] = grid[node] + value
-
+    work: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     fx = _vector(3)
-    scene = SimpleNamespace(dx=Counting(), axis=10, add=add)
+    scene = SimpleNamespace(dx=Counting())
     field = plain(ParticlePhases.affine_field)(
         scene, Counting() * _vector(3), Counting(), _numbers(9), fx, 1.0
     )
-    plain(ParticlePhases.scatter)(scene, grid, 0, plain(transfer.spline)(fx), field)
+    plain(transfer.scatter)(grid, 0, 100, 10, plain(transfer.spline)(fx), field, work, 0)
 
 
 def _gather() -> None:
-    """Sums over 27 nodes, and v, C and x from them; as ParticlePhases.gather_particle."""
+    """Sums over 27 nodes, and v, C and x from them; as TransferTiles.gather_particle."""
     grid: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     work: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     fx = _vector(3)
@@ -180,7 +178,7 @@ def _gather() -> None:
 
 
 def _gather_adjoint() -> None:
-    """What a particle's adjoint needs of the grid; as ParticlePhases.gather_particle_adjoint."""
+    """What a particle's adjoint needs of the grid; as TransferTiles.gather_particle_adjoint."""
     grid: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     work: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     fx = _vector(3)

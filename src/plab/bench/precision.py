@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -88,7 +89,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 
 def starts(tasks: Sequence[str], variants: Sequence[str], particles: int) -> list[Start]:
     """Return all configurations of some tasks."""
-    out = []
+    out: list[Start] = []
     for task in tasks:
         for variant in variants:
             cfg = load_config([f"task={task}", f"variant={variant}"])
@@ -130,7 +131,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
             soft = simulator.rollout(actions[None], strict=False)
             x, failures = final[kind]
             text = "; ".join([*failures, *soft.failures.values()])
-            outcomes[kind] = Outcome(x, soft.gradient[0][:, start.components], text)
+            outcomes[kind] = Outcome(x, cast(np.ndarray, soft.gradient)[0][:, start.components], text)
         yield target, outcomes
 
 

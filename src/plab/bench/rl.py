@@ -24,7 +24,7 @@ from stable_baselines3.common.logger import Logger
 
 from plab.bench.table import report
 from plab.config import Config, PpoConfig, load_config
-from plab.config_types import OffPolicyConfig
+from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.runners.common import torch_threads
 from plab.runners.rl_trainer import Trainer
@@ -45,7 +45,7 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
         batches: Batches of episodes to time, after one that compiles the kernels.
     """
     seconds: dict[str, float] = defaultdict(float)
-    method, steps = cfg.method, batches * cfg.sim.horizon
+    method, steps = cfg.method_as(RlConfig), batches * cfg.sim.horizon
     with tempfile.TemporaryDirectory() as folder, torch_threads(method.torch_threads):
         batch = EpisodeBatch([cfg] * method.num_envs, contact=method.contact)
         trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
@@ -106,7 +106,7 @@ def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Ca
 def _config(overrides: list[str], method: str, num_envs: int, batches: int) -> Config:
     """Return a training of a few batches of episodes, each followed by its share of updates."""
     cfg = load_config([*overrides, f"method={method}", f"method.num_envs={num_envs}"])
-    own = cfg.method
+    own = cfg.method_as(RlConfig)
     own.episodes = num_envs * (batches + 1)
     if isinstance(own, OffPolicyConfig):
         # Learning begins with the batch that is timed.

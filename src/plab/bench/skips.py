@@ -6,8 +6,9 @@ Both simulators are there at once and take turns, so that whatever else the mach
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -147,7 +148,7 @@ def _row(case: Case, with_it: Workload, without: Workload, kind: str, repeats: i
     }
 
 
-def _alternate(calls: Sequence[object], repeats: int) -> np.ndarray:
+def _alternate(calls: Sequence[Callable[[], object]], repeats: int) -> np.ndarray:
     """Time calls in turn, each first as often as the others; seconds, shape [repeats, call]."""
     for call in calls:
         for _ in range(WARM_UP):
@@ -168,7 +169,7 @@ def _differences(a: Workload, b: Workload, gradient: bool) -> tuple[float, float
     losses = [r.step_terms @ [weights.density, weights.sdf, weights.contact] for r in results]
     return (
         _relative(*losses),
-        _relative(results[0].gradient, results[1].gradient) if gradient else 0.0,
+        _relative(*(cast(np.ndarray, r.gradient) for r in results)) if gradient else 0.0,
     )
 
 

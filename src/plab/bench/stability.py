@@ -18,6 +18,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -71,7 +72,13 @@ def run_refusals() -> Iterator[dict[str, object]]:
         A row of :data:`COLUMNS` per scene; ``where`` is the message.
     """
     for name, scene in refusals().items():
-        row = {"precision": "any", "family": "refusal", "case": name, "speed": "", "gradient": ""}
+        row: dict[str, object] = {
+            "precision": "any",
+            "family": "refusal",
+            "case": name,
+            "speed": "",
+            "gradient": "",
+        }
         try:
             scene.validate()
             yield row | {"outcome": "was not refused", "where": ""}
@@ -114,7 +121,7 @@ def _run_together(simulator: Simulator, cases: Sequence[Case]) -> list[dict[str,
     speeds = iter(_speeds(simulator, alive) if alive else [])
     rows = []
     for e, case in enumerate(cases):
-        sizes = np.abs(rollout.gradient[e]).max(axis=1, initial=0.0)
+        sizes = np.abs(cast(np.ndarray, rollout.gradient)[e]).max(axis=1, initial=0.0)
         speed, outcome = math.nan, outcomes[e]
         if outcome == "survived":
             speed = next(speeds) * case.scene.dt / case.scene.dx

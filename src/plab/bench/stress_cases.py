@@ -10,12 +10,13 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from plab.bench.common_scene import common_actions, common_scene
 from plab.config import build_scene, load_config
-from plab.scene import Body, Manipulator, Scene
+from plab.scene import Body, Manipulator, Scene, Vec3, vector3
 from plab.suite import SUITE_VARIANTS, suite_tasks
 
 __all__ = ["Case", "Plan", "refusals", "stress_cases"]
@@ -137,15 +138,15 @@ def long_horizons(plan: Plan) -> Iterator[Case]:
 # ----------------------------------------------------------------------------------------------------- scenes
 
 
-def box_scene(*manipulators: Manipulator, center: tuple = (0.5, 0.1, 0.5), **changes: object) -> Scene:
+def box_scene(*manipulators: Manipulator, center: Vec3 = (0.5, 0.1, 0.5), **changes: Any) -> Scene:
     """Return a cube of plasticine with edge 0.2, on the floor unless moved."""
-    values = {"substeps": 19, "dt": STEP_TIME / 19, **changes}
+    values: dict[str, Any] = {"substeps": 19, "dt": STEP_TIME / 19, **changes}
     return Scene("cube", (Body("box", center, (0.2,) * 3, 1000),), manipulators, **values)
 
 
 def sphere(*position: float) -> Manipulator:
     """Return a ball as the tasks have it, a little faster."""
-    return Manipulator("Sphere", (0.04,), position, scale=(0.03,) * 3)
+    return Manipulator("Sphere", (0.04,), vector3(position), scale=(0.03,) * 3)
 
 
 def squeezing(plan: Plan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
@@ -176,7 +177,7 @@ def stiff(plan: Plan) -> Iterator[Case]:
     """Materials that need all the substeps that they are given: E times 100, and nu up to 0.49."""
     tools, actions = squeezing(plan)
     substeps = math.ceil(STEP_TIME / replace(box_scene(), youngs_modulus=5e5).stable_dt)
-    time_step = {"substeps": substeps, "dt": STEP_TIME / substeps}
+    time_step: dict[str, Any] = {"substeps": substeps, "dt": STEP_TIME / substeps}
     kinds = itertools.product((0.2, 0.45, 0.49), (0.0, 50.0, 1e4, math.inf), ("soft", "hard"))
     for nu, flow, contact in kinds:
         scene = box_scene(*tools, poisson_ratio=nu, yield_stress=flow, **time_step)
@@ -219,7 +220,9 @@ def crushing(plan: Plan) -> Iterator[Case]:
         ),
     }
     pillar = Manipulator("Cylinder", (0.1, 0.3), (0.29, 0.1, 0.5))
-    scenes = {shape: ((tool,), action) for shape, (tool, action) in tools.items()}
+    scenes: dict[str, tuple[tuple[Manipulator, ...], tuple[float, ...]]] = {
+        shape: ((tool,), action) for shape, (tool, action) in tools.items()
+    }
     scenes["two balls"] = ((sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)), (1, 0, 0, -1, 0, 0))
     scenes["ball and pillar"] = ((sphere(0.65, 0.1, 0.5), pillar), (-1, 0, 0))
     scenes["six balls"] = (
@@ -361,10 +364,10 @@ def refusals() -> dict[str, Scene]:
     scene = box_scene(tool)
     body = scene.bodies[0]
 
-    def with_body(**changes: object) -> Scene:
+    def with_body(**changes: Any) -> Scene:
         return replace(scene, bodies=(replace(body, **changes),))
 
-    def with_tool(**changes: object) -> Scene:
+    def with_tool(**changes: Any) -> Scene:
         return replace(scene, manipulators=(replace(tool, **changes),))
 
     return {

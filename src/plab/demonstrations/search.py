@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
 from plab.config import Config, build_scene
+from plab.config_types import TrajectoryConfig
 from plab.demonstrations import known_actions
 from plab.problem import Problem
-from plab.runners.progress import show_progress
+from plab.progress import show_progress
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.targets import EPISODE_STEPS, BodiesTarget, make_recipe
 from plab.targets.scripted import DECIMALS, Track
@@ -62,8 +63,9 @@ def search(
     problem = Problem([cfgs[owner] for owner in owners])
     parameters = [torch.tensor(start, requires_grad=True) for start in starts]
     groups = [{"params": [p], "lr": lr} for p, lr in zip(parameters, rates, strict=True)]
-    method = cfgs[0].method
-    adam = torch.optim.Adam(groups, betas=tuple(method.betas), eps=method.eps)
+    method = cfgs[0].method_as(TrajectoryConfig)
+    first, second = method.betas
+    adam = torch.optim.Adam(groups, betas=(first, second), eps=method.eps)
     best: dict[int, Found] = {}
     title = f"{cfgs[0].task.name}, {len(parameters)} candidates"
     with show_progress(title, 0, iterations, enabled=cfgs[0].progress) as report:
@@ -81,11 +83,13 @@ def _candidates(
 ) -> tuple[list[np.ndarray], list[int], list[float]]:
     """First actions, number of the configuration and learning rate of every candidate."""
     rng = np.random.default_rng(seed)
-    starts, owners, rates = [], [], []
+    starts: list[np.ndarray] = []
+    owners: list[int] = []
+    rates: list[float] = []
     for owner, cfg in enumerate(cfgs):
         dim = sum(len(m.scale) for m in cfg.task.manipulators.values())
         known = known_actions(cfg)
-        size = cfg.method.action_init
+        size = cfg.method_as(TrajectoryConfig).action_init
         starts += [rng.uniform(-size, size, (cfg.sim.horizon, dim)) for _ in lrs]
         rates += lrs
         carried = carry(build_scene(cfg), cfg.task.target)
@@ -139,7 +143,7 @@ def _improve(
 ) -> None:
     problem.simulator.set_contact(cfg.method.contact, cfg.method.softness)
     actions = np.stack([p.detach().numpy() for p in parameters])
-    gradient = problem.rollout(actions, gradient=True).gradient
+    gradient = cast(np.ndarray, problem.rollout(actions, gradient=True).gradient)
     for parameter, slope in zip(parameters, gradient, strict=True):
         parameter.grad = torch.from_numpy(slope.copy())
     adam.step()

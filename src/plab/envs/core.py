@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -37,6 +37,9 @@ __all__ = [
     "compose_configs",
     "refuse_options",
 ]
+
+Array: TypeAlias = Any
+"""A NumPy array, or a CUDA tensor where the caller gave one."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 """Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
@@ -91,7 +94,7 @@ def _check_overrides(overrides: Sequence[str], task: str) -> None:
             raise ValueError(f"'{override}' in an environment of task {task}: make that task's environment")
 
 
-def action_array(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+def action_array(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
     """Return actions as an array, float64.
 
     Args:
@@ -103,7 +106,7 @@ def action_array(actions: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     """
     array = np.asarray(actions, np.float64)
     if array.shape != shape:
-        raise ValueError(f"actions have shape {list(array.shape)}, not {list(shape)}")
+        raise ValueError(f"actions have shape {list(array.shape)}, not {list(shape or ())}")
     return array
 
 
@@ -139,17 +142,16 @@ class Transition:
         info: The entries of ``info``, each of shape [batch], in type like the rewards.
     """
 
-    observation: np.ndarray | torch.Tensor
-    reward: np.ndarray | torch.Tensor
+    observation: Array
+    reward: Array
     truncated: bool
-    info: dict[str, np.ndarray | torch.Tensor]
+    info: dict[str, Array]
 
 
 class EpisodeBatch:
     """Sub-environments in one simulator, all in the same step of their episodes.
 
     Attributes:
-        problem: Their scenes, targets and simulator.
         size: Number of sub-environments.
         horizon: Steps of an episode.
         observation_space: Space of one sub-environment's observation.
@@ -173,7 +175,7 @@ class EpisodeBatch:
         """
         if contact not in CONTACT_MODELS:
             raise ValueError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
-        self.problem: Problem | None = Problem(cfgs)
+        self._problem: Problem | None = Problem(cfgs)
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
         scenes = self.problem.scenes
@@ -191,9 +193,18 @@ class EpisodeBatch:
         self._initial_observation = self._observe()
 
     @property
-    def _simulator(self) -> Simulator:
-        if self.problem is None:
+    def problem(self) -> Problem:
+        """Scenes, targets and simulator of the sub-environments.
+
+        Raises:
+            RuntimeError: If the environment is closed.
+        """
+        if self._problem is None:
             raise RuntimeError("the environment is closed: make a new one")
+        return self._problem
+
+    @property
+    def _simulator(self) -> Simulator:
         return self.problem.simulator
 
     def reset(self, like: torch.Tensor | None = None) -> tuple[Any, dict[str, Any]]:
@@ -215,7 +226,7 @@ class EpisodeBatch:
         # Copies: a caller may keep and change what it is given.
         return self._initial_observation.copy(), {name: v.copy() for name, v in self._initial_info.items()}
 
-    def step(self, actions: np.ndarray | torch.Tensor) -> Transition:
+    def step(self, actions: Array) -> Transition:
         """Advance all sub-environments by one step.
 
         Args:
@@ -260,10 +271,11 @@ class EpisodeBatch:
         for renderer in self._renderers:
             renderer.close()
         self._renderers = []
-        self.problem = None
+        self._problem = None
 
-    def _observe(self, like: object = None) -> Any:
-        particles, poses = self._simulator.observe(self._stride, like), self._simulator.poses(like)
+    def _observe(self, like: Array = None) -> Array:
+        particles: Array = self._simulator.observe(self._stride, like)
+        poses: Array = self._simulator.poses(like)
         rows = particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]
         if on_device(like):
             # Whoever gave a tensor has imported torch.
@@ -273,7 +285,7 @@ class EpisodeBatch:
         out = np.empty((self.size, *self.observation_space.shape), np.float32)
         return np.concatenate(rows, axis=1, out=out, casting="same_kind")
 
-    def _info(self, like: object = None) -> dict[str, Any]:
+    def _info(self, like: Array = None) -> dict[str, Array]:
         measures = self._simulator.measure(like)
         terms, iou = measures.terms, measures.iou
         score, printed = batch_scores(self._start_iou, iou, self._best_iou)

@@ -95,7 +95,7 @@ class PlabVecEnv(VecEnv):
         Raises:
             ValueError: If the shape is wrong.
         """
-        self._actions = action_array(actions, (self.num_envs, *self.action_space.shape))
+        self._actions = action_array(actions, (self.num_envs, *self.batch.action_space.shape))
 
     def step_wait(self) -> VecEnvStepReturn:
         """Advance all sub-environments by one step, and reset them if that ends their episodes.

@@ -32,7 +32,7 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         batch: The episode, a batch of one, with its scene, target and simulator.
     """
 
-    metadata: ClassVar[dict[str, Any]] = dict(METADATA)
+    metadata: ClassVar[dict[str, Any]] = dict(METADATA)  # type: ignore[misc]
 
     def __init__(
         self,

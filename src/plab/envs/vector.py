@@ -34,7 +34,9 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         batch: The episodes, with their scenes, targets and simulator.
     """
 
-    metadata: ClassVar[dict[str, Any]] = METADATA | {"autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: ClassVar[dict[str, Any]] = METADATA | {  # type: ignore[misc]
+        "autoreset_mode": AutoresetMode.SAME_STEP
+    }
 
     def __init__(
         self,

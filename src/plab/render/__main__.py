@@ -90,9 +90,9 @@ def _draw_rollout(arguments: argparse.Namespace) -> None:
 
 
 def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
+    from plab.progress import show_progress
     from plab.render.pictures import save_contact_sheet
     from plab.render.recording import starts
-    from plab.runners.progress import show_progress
 
     tasks = choices("task", arguments.config_dir)
     rows = {}
@@ -155,7 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     def refuse(message: str) -> NoReturn:
         raise RenderError(message)
 
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]
     return parser
 
 

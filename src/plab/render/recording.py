@@ -8,19 +8,23 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from omegaconf import OmegaConf
 
+from plab.checks import cuda_is_usable
 from plab.config import load_config
 from plab.config_types import Config, SimConfig, TaskConfig
 from plab.problem import Problem
 from plab.render.graphics import RenderError
 from plab.results import read
-from plab.run import cuda_is_usable
 from plab.scene import Scene
 
 __all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts"]
+
+
+Section = TypeVar("Section")
 
 
 @dataclass(frozen=True)
@@ -56,14 +60,17 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
-    parts = {
-        name: OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), run.config[name]))
-        for name, kind in (("task", TaskConfig), ("sim", SimConfig))
-    }
-    if parts["sim"].device == "cuda" and not cuda_is_usable():
+    task, sim = _section(run.config["task"], TaskConfig), _section(run.config["sim"], SimConfig)
+    if sim.device == "cuda" and not cuda_is_usable():
         _say("the run used CUDA, which this computer has not: replaying it on the CPU")
-        parts["sim"].device = "cpu"
-    return dataclasses.replace(load_config(), variant=str(run.config["variant"]), **parts), run.best_actions
+        sim.device = "cpu"
+    cfg = dataclasses.replace(load_config(), variant=str(run.config["variant"]), task=task, sim=sim)
+    return cfg, run.best_actions
+
+
+def _section(values: dict[str, Any], kind: type[Section]) -> Section:
+    """Return a section of a configuration that was read from a file."""
+    return cast(Section, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), values)))
 
 
 def demonstration(cfg: Config) -> np.ndarray:

@@ -62,9 +62,10 @@ class Renderer:
         self._scene = scene
         self._slices, self._surfaces = body_slices(scene), body_surfaces(scene)
         self._particle_area = (sum(map(body_volume, scene.bodies)) / scene.particle_count) ** (2 / 3)
-        self._plotter: pv.Plotter | None = self._open_window()
-        self._light = self._add_lights()
-        self._floor = Floor(self._plotter, PAPER, INK, self.camera.pixel(size[1]))
+        plotter = self._open_window()
+        self._plotter: pv.Plotter | None = plotter
+        self._light = _add_lights(plotter, self.camera)
+        self._floor = Floor(plotter, PAPER, INK, self.camera.pixel(size[1]))
         rest = sample_particles(scene)
         self._bodies = [
             Clay(self._plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)])
@@ -98,7 +99,7 @@ class Renderer:
         ambient = AmbientLight(clouds)
         for body, field in zip(self._bodies, fields, strict=True):
             body.mould(surface_mesh(field), ambient)
-        shown = [actor for thing in (*self._bodies, *self._manipulators) for actor in thing.actors]
+        shown = [actor for thing in self._things if thing is not self._target for actor in thing.actors]
         if self._target is not None:
             self._target.fade(fields)
             shown.append(self._target.ghost)
@@ -123,7 +124,8 @@ class Renderer:
         clouds = [self._target.cloud, *(rigid.cloud for rigid in fixed)]
         solid = self._target.solid
         solid.mould(self._target.mesh, AmbientLight(clouds))
-        return self._draw([actor for thing in (solid, *fixed) for actor in thing.actors], clouds)
+        things: list[Clay | Rigid] = [solid, *fixed]
+        return self._draw([actor for thing in things for actor in thing.actors], clouds)
 
     def close(self) -> None:
         """Free the window; closing twice is allowed."""
@@ -134,8 +136,7 @@ class Renderer:
 
     def _place(self, poses: np.ndarray) -> None:
         """Put the manipulators at their poses, shape [manipulator, 8]."""
-        if self._plotter is None:
-            raise RuntimeError("this renderer is closed: make a new one")
+        self._window()
         if np.shape(poses) != (len(self._manipulators), 8):
             raise ValueError(f"poses have shape {np.shape(poses)}, not {(len(self._manipulators), 8)}")
         for rigid, pose in zip(self._manipulators, np.asarray(poses, np.float64), strict=True):
@@ -143,13 +144,23 @@ class Renderer:
 
     def _draw(self, shown: Sequence[pv.Actor], clouds: Sequence[Cloud]) -> np.ndarray:
         """Draw some of the actors, and the shadows of clouds."""
-        for thing in (*self._bodies, *self._manipulators, *([self._target] if self._target else [])):
+        plotter = self._window()
+        for thing in self._things:
             for actor in thing.actors:
                 actor.visibility = any(actor is other for other in shown)
         self._floor.shade(floor_light(clouds, self._light))
-        self._plotter.renderer.ResetCameraClippingRange()
-        self._plotter.render()
-        return self._plotter.screenshot(return_img=True)
+        plotter.renderer.ResetCameraClippingRange()
+        plotter.render()
+        return plotter.screenshot(return_img=True)
+
+    @property
+    def _things(self) -> list[Clay | Rigid | Target]:
+        return [*self._bodies, *self._manipulators, *([self._target] if self._target else [])]
+
+    def _window(self) -> pv.Plotter:
+        if self._plotter is None:
+            raise RuntimeError("this renderer is closed: make a new one")
+        return self._plotter
 
     def _open_window(self) -> pv.Plotter:
         plotter = pv.Plotter(off_screen=True, lighting="none", window_size=list(self.size))
@@ -163,12 +174,13 @@ class Renderer:
         plotter.camera_set = True
         return plotter
 
-    def _add_lights(self) -> np.ndarray:
-        """Add the lights; return the direction, shape [3], towards the one that throws shadows."""
-        right, up = self.camera.axes()[0], np.array([0.0, 1.0, 0.0])
-        axes = np.stack([right, up, np.cross(right, up)])
-        for toward, strength, color in _LIGHTS:
-            light = pv.Light(position=toward @ axes, color=color, intensity=strength)
-            light.positional = False
-            self._plotter.add_light(light)
-        return _LIGHTS[0][0] @ axes
+
+def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:
+    """Add the lights; return the direction, shape [3], towards the one that throws shadows."""
+    right, up = camera.axes()[0], np.array([0.0, 1.0, 0.0])
+    axes = np.stack([right, up, np.cross(right, up)])
+    for toward, strength, color in _LIGHTS:
+        light = pv.Light(position=toward @ axes, color=color, intensity=strength)
+        light.positional = False
+        plotter.add_light(light)
+    return _LIGHTS[0][0] @ axes

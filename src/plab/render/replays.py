@@ -15,10 +15,10 @@ import numpy as np
 
 from plab.config import ConfigError
 from plab.config_types import Config
+from plab.progress import show_progress
 from plab.render import recording
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.pictures import save, save_set
-from plab.runners.progress import show_progress
 from plab.scene import SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError

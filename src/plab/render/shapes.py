@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +52,7 @@ def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     if manipulator.shape == "Chopsticks":
         stick = _revolve(_capsule(-size[0], 0.0, size[1]))
         return [Part(*stick, side=-0.5), Part(*stick, side=0.5)]
-    profiles = {
+    profiles: dict[str, Callable[..., np.ndarray]] = {
         "Sphere": lambda radius: _capsule(0.0, 0.0, radius),
         "Capsule": lambda h, r: _capsule(-h / 2, h / 2, r),
         "RollingPin": lambda h, r: _capsule(-h / 2, h / 2, r),

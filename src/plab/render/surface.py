@@ -150,7 +150,7 @@ class _Grid:
 
     def nodes(self) -> np.ndarray:
         """Return the nodes' positions, shape [i, j, k, 3]."""
-        return np.stack(np.indices(self.shape), axis=-1) * self.spacing + self.origin
+        return np.stack([*np.indices(self.shape)], axis=-1) * self.spacing + self.origin
 
     def coordinates(self, x: np.ndarray) -> np.ndarray:
         """Return positions [..., 3] in units of the grid's indices."""

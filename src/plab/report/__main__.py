@@ -20,6 +20,7 @@ import pandas as pd
 
 import plab
 from plab.examples import resolve
+from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
 from plab.report.costs import work_precision
@@ -35,7 +36,6 @@ from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
-from plab.runners.progress import show_progress
 from plab.selection import SelectionError, select
 
 __all__ = ["main", "write_curves", "write_tables"]

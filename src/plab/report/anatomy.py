@@ -8,7 +8,7 @@ import pandas as pd
 from plab.report.costs import PHASES
 from plab.report.figures import Drawing, grid, legend
 from plab.report.methods import method
-from plab.results import RunResult
+from plab.results import ResultsError, RunResult
 
 __all__ = ["actions", "facts", "loss_terms", "measures", "times"]
 
@@ -70,6 +70,8 @@ def measures(run: RunResult) -> Drawing:
 def actions(run: RunResult) -> Drawing:
     """Draw the best actions, a row per component and a column per environment step."""
     names = list(run.config["task"]["manipulators"])
+    if run.best_actions is None:
+        raise ResultsError("the run has no actions yet")
     figure, axes = grid(1, 1, width=6.4, height=0.2 * run.best_actions.shape[1] + 0.5)
     panel = axes[0, 0]
     image = panel.imshow(

@@ -89,7 +89,7 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
         notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": os.getcwd()}}
     )
     client.create_kernel_manager()
-    if os.name == "posix":
+    if client.km is not None and os.name == "posix":
         # Files of the user's own; what goes over TCP others on the computer can read.
         client.km.transport = "ipc"
     try:

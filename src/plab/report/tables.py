@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from plab.report.collect import Runs
 from plab.report.methods import GRADIENT, RL, method
@@ -94,7 +95,9 @@ class Cells:
     def task(self, task: str, name: str) -> Cell:
         """Return the cell of a task and method, over all variants."""
         if self.source == "ours":
-            scores = [self._scores.get((task, variant, name), []) for variant in self._runs.variants]
+            scores: list[ArrayLike] = [
+                self._scores.get((task, variant, name), []) for variant in self._runs.variants
+            ]
             return Cell(summarise(np.concatenate(scores)), len(self._runs.variants) * len(self._runs.seeds))
         return Cell(_printed(self._tasks, (task, name), 5 * PAPER_SEED_COUNT), 0)
 
@@ -117,12 +120,12 @@ def ordered_tasks(tasks: Sequence[str]) -> list[str]:
 def iou_per_task(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per task and method: ours, the paper's, and the two compared."""
     what = "over variants and seeds"
-    keys = [(task,) for task in ordered_tasks(runs.tasks)]
+    keys: list[tuple[str, ...]] = [(task,) for task in ordered_tasks(runs.tasks)]
     ours, theirs = Cells("ours", runs), Cells("paper", runs)
 
     def difference(key: tuple[str, ...], name: str) -> Interval:
         pairs = [
-            (ours.configuration(*key, variant, name), theirs.configuration(*key, variant, name))
+            (ours.configuration(key[0], variant, name), theirs.configuration(key[0], variant, name))
             for variant in runs.variants
         ]
         return stratified_difference([a.summary for a, _ in pairs], [b.summary for _, b in pairs])
@@ -135,8 +138,11 @@ def iou_per_task(runs: Runs) -> list[Table]:
 
 def iou_per_configuration(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
-    keys = [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
-    ours, theirs = Cells("ours", runs).configuration, Cells("paper", runs).configuration
+    keys: list[tuple[str, ...]] = [
+        (task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants
+    ]
+    ours: Look = Cells("ours", runs).configuration
+    theirs: Look = Cells("paper", runs).configuration
 
     def difference(key: tuple[str, ...], name: str) -> Interval:
         return stratified_difference([ours(*key, name).summary], [theirs(*key, name).summary])
@@ -230,7 +236,7 @@ def _compared(
             shown = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
             cells.append(where | {"method": method(m).label} | shown | {INTERVAL: ends(gap)})
             printed = {f"paper_{k}": v for k, v in _numbers(theirs, "paper").items()}
-            gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
+            gaps: dict[str, Any] = {"difference": gap.value, "low": gap.low, "high": gap.high}
             data.append(where | {"method": m} | _numbers(mine, "ours") | printed | gaps)
     notes = [_DIFFERENCE, *settings_note(runs)]
     return Table(
@@ -293,7 +299,9 @@ def solvability(runs: Runs) -> list[Table]:
         known = pd.read_csv(file, dtype={"variant": str}).set_index(["task", "variant"])["score"]
     paper = paper_table("iou_per_configuration")
     best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
-    keys = [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
+    keys: list[tuple[str, ...]] = [
+        (task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants
+    ]
     rows = []
     for key in keys:
         score = float(known.get(key, np.nan))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -123,7 +124,7 @@ def _measured(ms: Summary) -> str:
     return f"{spread(ms)} ({ms.count})" if ms.count else NOTHING
 
 
-def _our_times(rows: list[dict[str, object]], runs: Runs) -> Table:
+def _our_times(rows: Sequence[dict[str, Any]], runs: Runs) -> Table:
     cells, data = [], []
     for row in rows:
         shown = {"task": row["task"], "device": row["device"]}
@@ -159,7 +160,7 @@ def _papers_times(tasks: Sequence[str], paper: pd.DataFrame) -> Table:
     return Table("timing", "paper", "Time per environment step, the paper", cells, data, notes=notes)
 
 
-def _compared_times(rows: list[dict[str, object]], runs: Runs, more: list[str]) -> Table:
+def _compared_times(rows: Sequence[dict[str, Any]], runs: Runs, more: list[str]) -> Table:
     cells = [
         {
             "task": row["task"],

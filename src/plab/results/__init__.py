@@ -10,7 +10,7 @@ reading results is quick.
 from plab.results.archive import pack, unpack
 from plab.results.checking import Problem, check
 from plab.results.files import read, write
-from plab.results.loading import Row, load, lookup, rows
+from plab.results.loading import Row, load, rows
 from plab.results.running import RunFile
 from plab.results.schema import (
     SCHEMA_VERSION,
@@ -23,6 +23,7 @@ from plab.results.schema import (
     config_hash,
     result_path,
 )
+from plab.selection import lookup
 
 __all__ = [
     "SCHEMA_VERSION",

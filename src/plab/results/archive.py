@@ -94,7 +94,7 @@ def pack(
             member.external_attr = 0o644 << 16
             members.writestr(member, encode(run, compress=True), zipfile.ZIP_DEFLATED, 9)
             size += row.path.stat().st_size if row.path.is_file() else 0
-    archive.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(archive)
     replace_file(archive, content.getvalue(), sync=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
 
@@ -123,13 +123,18 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
         if path.exists():
             continue
         run = read(row.path)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+        _make_folder(path)
         replace_file(path, encode(run, compress=True), sync=False)
         written += 1
     return written, len(found) - written
+
+
+def _make_folder(path: Path) -> None:
+    """Make the folder that a file is to be written to."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _member(row: Row) -> Path:

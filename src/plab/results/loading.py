@@ -8,7 +8,7 @@ import warnings
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,9 @@ import pandas as pd
 from plab.results.files import attributes, opened, opened_image, split_archive
 from plab.results.index import Index
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
+from plab.selection import lookup
 
-__all__ = ["Row", "load", "lookup", "read_rows", "rows", "run_files"]
+__all__ = ["Row", "load", "read_rows", "rows", "run_files"]
 
 _SUMMARY_COLUMNS = (
     "task",
@@ -120,7 +121,10 @@ def rows(
     unreadable: list[ResultsError] = []
     for root in map(Path, sources):
         for entry in _all_rows(root, index):
-            (unreadable if isinstance(entry, ResultsError) else found).append(entry)
+            if isinstance(entry, ResultsError):
+                unreadable.append(entry)
+            else:
+                found.append(entry)
     return _without_repetitions(found), unreadable
 
 
@@ -164,14 +168,6 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
         yield ResultsError(f"{path} is truncated or damaged ({error})")
 
 
-def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """Return a configuration's value of a dotted key, NaN where there is none."""
-    value: Any = config
-    for part in key.split("."):
-        value = value.get(part, np.nan) if isinstance(value, Mapping) else np.nan
-    return value
-
-
 # ---------------------------------------------------------------------------------------------------- details
 
 
@@ -190,8 +186,9 @@ def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
             )
             continue
         fresh = list(read_rows(path))
-        if known is not None and not any(isinstance(row, ResultsError) for row in fresh):
-            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in fresh])
+        sound = [row for row in fresh if isinstance(row, Row)]
+        if known is not None and len(sound) == len(fresh):
+            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in sound])
         yield from fresh
     if known is not None:
         known.save()

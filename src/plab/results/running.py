@@ -62,7 +62,10 @@ class RunFile:
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
         # Rows not yet in the table, the last one first: ``(row, (row before, ...))``. One object with
         # the result: an interrupt may arrive between any two assignments.
-        self._state = RunResult(config, config_hash(config), provenance=provenance(config)), ()
+        self._state: tuple[RunResult, tuple[Any, ...]] = (
+            RunResult(config, config_hash(config), provenance=provenance(config)),
+            (),
+        )
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
         _refuse_newer(self.path, self.partial_path)
@@ -101,7 +104,7 @@ class RunFile:
     def result(self) -> RunResult:
         """What is known so far; from an earlier process where there was one."""
         known, pending = self._state
-        rows = []
+        rows: list[dict[str, float]] = []
         while pending:
             row, pending = pending
             rows.insert(0, row)

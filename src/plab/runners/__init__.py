@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
-from plab.sweep.tally import Outcome
+from plab.tally import Outcome
 
 if TYPE_CHECKING:
     from plab.config import Config

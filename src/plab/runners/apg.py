@@ -13,19 +13,20 @@ import io
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 
+from plab.config_types import ApgConfig
+from plab.progress import show_progress
 from plab.results import RunFile
 from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_threads
 from plab.runners.jobs import Job, title
-from plab.runners.progress import show_progress
 from plab.torch import rollout
 
 if TYPE_CHECKING:
-    from plab.config import ApgConfig, Config
+    from plab.config import Config
     from plab.envs.core import EpisodeBatch
 
 __all__ = ["PolicyTraining", "run_apg"]
@@ -43,21 +44,22 @@ def run_apg(jobs: Sequence[Job], note: str = "") -> None:
         plab.runners.RunError: If the loss, the gradient or the state stops being finite.
     """
     (job,) = jobs
-    cfg, run = job.cfg, job.run
-    with torch_threads(cfg.method.torch_threads), simulation_errors():
+    cfg, run, method = job.cfg, job.run, job.cfg.method_as(ApgConfig)
+    with torch_threads(method.torch_threads), simulation_errors():
         with run.phase("build"):
-            (episode,) = kept_batches(cfg, (1, cfg.method.contact))
+            (episode,) = kept_batches(cfg, (1, method.contact))
             sizes = episode.observation_space.shape[0], episode.action_space.shape[0]
-            training = PolicyTraining(cfg.method, *sizes, cfg.seed)
+            training = PolicyTraining(method, *sizes, cfg.seed)
             if run.result.resume is not None:
                 training.restore(run.result.resume)
         _optimise(cfg, episode, training, run, note)
         problem = episode.problem
         with run.phase("evaluate"):
             problem.simulator.set_contact("hard")
-            judged = problem.rollout(run.result.best_actions[None], gradient=False)
+            best = cast(np.ndarray, run.result.best_actions)
+            judged = problem.rollout(best[None], gradient=False)
     masses = {"initial": problem.initial_mass[0], "target": problem.target_mass[0]}
-    run.finish(measures(judged), masses | {"final": judged.final_mass[0]})
+    run.finish(measures(judged), masses | {"final": cast(np.ndarray, judged.final_mass)[0]})
 
 
 class PolicyTraining:
@@ -90,7 +92,8 @@ class PolicyTraining:
         """Improve the policy by the gradient of a loss; return the gradient's norm over all weights."""
         self._optimizer.zero_grad()
         loss.backward()
-        norm = torch.cat([parameter.grad.flatten() for parameter in self.policy.parameters()]).norm()
+        gradients = [parameter.grad for parameter in self.policy.parameters()]
+        norm = torch.cat([part.flatten() for part in gradients if part is not None]).norm()
         self._optimizer.step()
         return float(norm)
 
@@ -116,7 +119,7 @@ def _network(widths: Sequence[int]) -> torch.nn.Sequential:
 
 def _optimise(cfg: Config, episode: EpisodeBatch, training: PolicyTraining, run: RunFile, note: str) -> None:
     """Do the iterations that the file does not hold yet."""
-    start, total = len(run.result.iterations), cfg.method.iterations
+    start, total = len(run.result.iterations), cfg.method_as(ApgConfig).iterations
     with show_progress(note + title(cfg), start, total, enabled=cfg.progress) as report:
         for iteration in range(start, total):
             # The first rollout of a process compiles the kernels.
@@ -124,7 +127,11 @@ def _optimise(cfg: Config, episode: EpisodeBatch, training: PolicyTraining, run:
                 row, actions = _iterate(episode, training, iteration)
             # Written so that the first loss beats the NaN that stands for none.
             better = not row["loss"] >= run.result.best_loss
-            best = {"best_actions": actions, "best_iteration": iteration, "best_loss": row["loss"]}
+            best: dict[str, Any] = {
+                "best_actions": actions,
+                "best_iteration": iteration,
+                "best_loss": row["loss"],
+            }
             run.record(row, training.state(), **(best if better else {}))
             best_text = f"best {run.result.best_loss:.5g}"
             report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best_text}")
@@ -139,6 +146,7 @@ def _iterate(
     # The actions again, now as functions of the weights; the same numbers but for rounding.
     actions = training.policy(torch.from_numpy(done.observations))
     norm = training.step(rollout(episode.problem, actions[None]).sum())
-    row = {"iteration": iteration, "episodes": iteration, "steps": iteration * episode.horizon}
+    row: dict[str, float] = {"iteration": iteration, "episodes": iteration}
+    row["steps"] = iteration * episode.horizon
     row |= done.measures | {"gradient_norm": norm, "seconds": time.perf_counter() - start}
     return row, done.actions

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from plab.config_errors import ConfigError
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
 from plab.scene import SceneError
-from plab.sweep.tally import Outcome
+from plab.tally import Outcome
 from plab.targets import TargetError
 
 if TYPE_CHECKING:

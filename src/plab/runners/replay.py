@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -129,7 +129,7 @@ class EpisodeReplay(ReplayBuffer):
             np.zeros((len(batch_inds), 1), np.float32),
             self._normalize_reward(self.rewards[batch_inds, envs].reshape(-1, 1), env),
         )
-        return ReplayBufferSamples(*(self.to_torch(array) for array in data))
+        return ReplayBufferSamples(*(self.to_torch(cast(np.ndarray, array)) for array in data))
 
     def flush(self) -> None:
         """Wait until the disk has everything that was added."""

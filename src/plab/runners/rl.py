@@ -12,15 +12,16 @@ import importlib.util
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 
-from plab.config import ConfigError
+from plab.config import ConfigError, RlConfig
 from plab.envs.core import EpisodeBatch
+from plab.progress import Report, show_progress
 from plab.results import RunFile
 from plab.runners.common import (
     PolicyEpisode,
@@ -31,12 +32,11 @@ from plab.runners.common import (
     torch_threads,
 )
 from plab.runners.jobs import Job, title
-from plab.runners.progress import Report, show_progress
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
 
 if TYPE_CHECKING:
-    from plab.config import Config, RlConfig
+    from plab.config import Config
 
 __all__ = ["Evaluator", "run_rl"]
 
@@ -55,12 +55,12 @@ def run_rl(jobs: Sequence[Job], note: str = "") -> None:
         plab.runners.RunError: If a state stops being finite.
     """
     (job,) = jobs
-    cfg, run = job.cfg, job.run
-    _check_installed(cfg.method)
-    replay_path, total = run.path.with_suffix(".replay"), total_steps(cfg.method, cfg.sim.horizon)
-    with torch_threads(cfg.method.torch_threads), simulation_errors():
+    cfg, run, method = job.cfg, job.run, job.cfg.method_as(RlConfig)
+    _check_installed(method)
+    replay_path, total = run.path.with_suffix(".replay"), total_steps(method, cfg.sim.horizon)
+    with torch_threads(method.torch_threads), simulation_errors():
         with run.phase("build"):
-            kinds = (cfg.method.num_envs, cfg.method.contact), (1, "hard")
+            kinds = (method.num_envs, method.contact), (1, "hard")
             training, evaluation = kept_batches(cfg, *kinds)
             evaluator = Evaluator(evaluation)
         if run.result.resume is None or int(run.result.resume["steps"]) < total:
@@ -68,7 +68,7 @@ def run_rl(jobs: Sequence[Job], note: str = "") -> None:
         # The partial file holds the last checkpoint, after which nothing is sampled any more.
         replay_path.unlink(missing_ok=True)
         with run.phase("evaluate"):
-            judged, final_mass = evaluator.judge(run.result.best_actions)
+            judged, final_mass = evaluator.judge(cast(np.ndarray, run.result.best_actions))
     masses = {"initial": evaluator.initial_mass, "final": final_mass, "target": evaluator.target_mass}
     run.finish(judged, masses)
 
@@ -93,7 +93,7 @@ class Evaluator:
     def judge(self, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         """Run actions of shape [T, A]; return the scalars of the evaluation and the last mass tensor."""
         result = self._batch.problem.rollout(actions[None], gradient=False)
-        return measures(result), result.final_mass[0]
+        return measures(result), cast(np.ndarray, result.final_mass)[0]
 
 
 def _train(
@@ -102,7 +102,7 @@ def _train(
     """Train from where the file stands to the end."""
     with run.phase("build"):
         trainer = Trainer(cfg, training, replay_path, run.result.resume)
-        trainer.set_logger(_logger(cfg.method, run))
+        trainer.set_logger(_logger(cfg.method_as(RlConfig), run))
     try:
         if run.result.resume is None:
             # The untrained policy; the first episode compiles the kernels.
@@ -114,7 +114,7 @@ def _train(
 
 def _alternate(cfg: Config, trainer: Trainer, evaluator: Evaluator, run: RunFile, note: str) -> None:
     """Train and evaluate in turn until all episodes are done."""
-    total, every = trainer.total_steps // cfg.sim.horizon, cfg.method.evaluate_every
+    total, every = trainer.total_steps // cfg.sim.horizon, cfg.method_as(RlConfig).evaluate_every
     heading = note + title(cfg)
     with show_progress(heading, trainer.episodes, total, enabled=cfg.progress, plain_every=every) as report:
         watch = _Watch(trainer, run, report)
@@ -132,13 +132,13 @@ def _look(trainer: Trainer, evaluator: Evaluator, run: RunFile, phase: str, star
     with run.phase(phase):
         done = evaluator.episode(trainer)
     number = len(run.result.iterations)
-    row = {"iteration": number, "episodes": trainer.episodes, "steps": trainer.steps}
+    row: dict[str, float] = {"iteration": number, "episodes": trainer.episodes, "steps": trainer.steps}
     row |= done.measures | trainer.take_statistics()
     row["seconds"] = time.perf_counter() - start
     trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
     # Written so that the first loss beats the NaN that stands for none.
     better = not row["loss"] >= run.result.best_loss
-    best = {"best_actions": done.actions, "best_iteration": number, "best_loss": row["loss"]}
+    best: dict[str, Any] = {"best_actions": done.actions, "best_iteration": number, "best_loss": row["loss"]}
     # Each time: the replay buffer's file follows the training, and the state has to follow it.
     run.record(row, trainer.state(), keep=True, **(best if better else {}))
 

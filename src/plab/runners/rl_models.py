@@ -97,7 +97,7 @@ def _sac(method: SacConfig, env: VecEnv) -> dict[str, Any]:
 
 
 def _td3(method: Td3Config, env: VecEnv) -> dict[str, Any]:
-    size = env.action_space.shape[0]
+    (size,) = env.action_space.shape or ()
     return _off_policy(method) | {
         "action_noise": NormalActionNoise(np.zeros(size), np.full(size, method.exploration_noise)),
         "target_policy_noise": method.target_noise,

@@ -7,16 +7,18 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from plab.config_types import OffPolicyConfig
+from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.replay import EpisodeReplay
@@ -53,7 +55,7 @@ class Trainer:
         Raises:
             plab.results.ResultsError: If there is no room for the replay buffer, or it is gone.
         """
-        method, self.horizon = cfg.method, cfg.sim.horizon
+        method, self.horizon = cfg.method_as(RlConfig), cfg.sim.horizon
         self._cycle = cycle_steps(method, self.horizon)
         self.total_steps = total_steps(method, self.horizon)
         self.replay_path = replay_path
@@ -137,7 +139,7 @@ class Trainer:
             self._replay.flush()
         buffer = io.BytesIO()
         self.model.save(buffer)
-        shape = (-1, self._env.num_envs, *self._env.action_space.shape)
+        shape = (-1, self._env.num_envs, *(self._env.action_space.shape or ()))
         return {
             "steps": self.steps,
             "model": np.frombuffer(buffer.getvalue(), np.uint8),
@@ -149,7 +151,7 @@ class Trainer:
     def close(self) -> None:
         """Let go of the replay buffer's file; the environments may serve the next run."""
         self.model.logger.close()
-        if self._replay is not None:
+        if isinstance(self.model, OffPolicyAlgorithm):
             self.model.replay_buffer = None
 
     @property
@@ -193,17 +195,20 @@ def _statistics(cfg: Config, env: VecEnv) -> VecNormalize | None:
     """Return the wrapper that scales observations and rewards, if the method wants one."""
     if not getattr(cfg.method, "normalise", False):
         return None
-    return VecNormalize(env, gamma=cfg.method.gamma, clip_obs=CLIP, clip_reward=CLIP)
+    return VecNormalize(env, gamma=cfg.method_as(RlConfig).gamma, clip_obs=CLIP, clip_reward=CLIP)
 
 
 def _statistics_state(env: VecNormalize) -> dict[str, Any]:
-    parts = {"observation": env.obs_rms, "return": env.ret_rms}
-    moments = {name: {"mean": s.mean, "var": s.var, "count": s.count} for name, s in parts.items()}
+    parts = {"observation": cast(RunningMeanStd, env.obs_rms), "return": env.ret_rms}
+    moments: dict[str, Any] = {
+        name: {"mean": s.mean, "var": s.var, "count": s.count} for name, s in parts.items()
+    }
     return moments | {"returns": env.returns.copy()}
 
 
 def _restore_statistics(env: VecNormalize, state: Mapping[str, Any]) -> None:
-    for name, moments in (("observation", env.obs_rms), ("return", env.ret_rms)):
+    parts = {"observation": cast(RunningMeanStd, env.obs_rms), "return": env.ret_rms}
+    for name, moments in parts.items():
         moments.mean, moments.var = state[name]["mean"], state[name]["var"]
         moments.count = float(state[name]["count"])
     env.returns = state["returns"]

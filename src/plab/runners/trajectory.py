@@ -11,20 +11,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 
+from plab.config_types import TrajectoryConfig
 from plab.problem import Episodes, Problem, build_scenes
+from plab.progress import show_progress
 from plab.results import ResultsError
 from plab.runners.common import COLUMNS, kept, measures, simulation_errors
 from plab.runners.jobs import Job, RunError, TogetherError, batch_title
-from plab.runners.progress import show_progress
 from plab.sim import DeviceError, Simulator
 
 if TYPE_CHECKING:
-    from plab.config import Config, TrajectoryConfig
+    from plab.config import Config
 
 __all__ = ["OPTIMIZERS", "ActionSequence", "make_problem", "run_trajectory"]
 
@@ -74,6 +75,7 @@ class _Sequence:
 
     Attributes:
         job: Configuration, file, and how it ended.
+        method: The configuration's settings of the method.
         environment: Number of its environment in the batch.
         actions: Actions and optimiser, as far as the file has come.
     """
@@ -81,7 +83,8 @@ class _Sequence:
     def __init__(self, job: Job, environment: int, problem: Problem) -> None:
         self.job, self.environment = job, environment
         scene, result = problem.scenes[environment], job.run.result
-        self.actions = ActionSequence(job.cfg.method, scene.horizon, scene.action_dim, job.cfg.seed)
+        self.method = job.cfg.method_as(TrajectoryConfig)
+        self.actions = ActionSequence(self.method, scene.horizon, scene.action_dim, job.cfg.seed)
         if result.resume is not None:
             self.actions.restore(result.resume)
         self.iteration, self.best_loss = len(result.iterations), result.best_loss
@@ -89,7 +92,7 @@ class _Sequence:
     @property
     def active(self) -> bool:
         """Whether there are iterations to do."""
-        return self.job.open and self.iteration < self.job.cfg.method.iterations
+        return self.job.open and self.iteration < self.method.iterations
 
     def update(self, tried: np.ndarray, episodes: Episodes, seconds: float) -> dict[str, float]:
         """Take the result of an iteration: update the actions, write the row.
@@ -106,24 +109,30 @@ class _Sequence:
             plab.results.ResultsError: If the file cannot be written.
         """
         start = time.perf_counter()
-        gradient = episodes.gradient[self.environment]
+        gradient = cast(np.ndarray, episodes.gradient)[self.environment]
         self.actions.step(gradient)
         measured = measures(episodes, self.environment)
         # What the actions have cost: the rollouts, of an episode each, that led to them.
-        row = {"iteration": self.iteration, "episodes": self.iteration, "steps": self.iteration * len(tried)}
+        row: dict[str, float] = {"iteration": self.iteration, "episodes": self.iteration}
+        row["steps"] = self.iteration * len(tried)
         row |= {name: measured[name] for name in COLUMNS}
         row["gradient_norm"] = float(np.linalg.norm(gradient))
         row["seconds"] = seconds + time.perf_counter() - start
         # Written so that the first loss beats the NaN that stands for none.
         better = not row["loss"] >= self.best_loss
-        best = {"best_actions": tried, "best_iteration": self.iteration, "best_loss": row["loss"]}
+        best: dict[str, Any] = {
+            "best_actions": tried,
+            "best_iteration": self.iteration,
+            "best_loss": row["loss"],
+        }
         self.job.run.record(row, self.actions.state(), **(best if better else {}))
         self.iteration, self.best_loss = self.iteration + 1, row["loss"] if better else self.best_loss
         return row
 
 
 def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
-    return torch.optim.Adam([parameter], lr=method.lr, betas=tuple(method.betas), eps=method.eps)
+    first, second = method.betas
+    return torch.optim.Adam([parameter], lr=method.lr, betas=(first, second), eps=method.eps)
 
 
 def _momentum(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
@@ -196,7 +205,7 @@ class ActionSequence:
 
 def _optimise(problem: Problem, batch: Sequence[_Sequence], note: str) -> None:
     """Do the iterations that the files do not hold yet."""
-    methods = [one.job.cfg.method for one in batch]
+    methods = [one.method for one in batch]
     problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
     start, total = min(one.iteration for one in batch), max(method.iterations for method in methods)
     heading = note + batch_title([one.job.cfg for one in batch])
@@ -261,7 +270,7 @@ def _evaluate(problem: Problem, batch: Sequence[_Sequence]) -> None:
             continue
         masses = {
             "initial": problem.initial_mass,
-            "final": episodes.final_mass,
+            "final": cast(np.ndarray, episodes.final_mass),
             "target": problem.target_mass,
         }
         try:

@@ -6,17 +6,14 @@ with more environments than threads every thread has environments of its own. On
 is one launch over all environments.
 """
 
-import time
-from collections.abc import Callable, Sequence
-
 import taichi as ti
 
+from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
-from plab.sim.particle_phases import ParticlePhases
 from plab.sim.pose_phases import PosePhases
-from plab.sim.storage import BLOCK, MEASURES, STAGE, STATE, WORK
-from plab.sim.transfer import spline
+from plab.sim.storage import BLOCK, MEASURES, PLACES, SPREAD, STAGE, STATE, WORK
+from plab.sim.teams import TeamChoice
 
 __all__ = ["CpuEngine"]
 
@@ -29,50 +26,8 @@ thread's work."""
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
 
-PROBE = 50
-"""Every so many launches the team that is not the best so far is tried again."""
 
-
-class TeamChoice:
-    """Chooses between teams of threads for a kernel's launches, by what they take.
-
-    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
-    Results do not depend on the choice.
-    """
-
-    def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first team.
-
-        Args:
-            sizes: Threads that work on one environment, in the order in which they are tried.
-        """
-        self._sizes = tuple(dict.fromkeys(sizes))
-        self._seconds: dict[int, float] = {}
-        self._launches = 0
-
-    def run(self, kernel: Callable, args: tuple) -> None:
-        """Launch a kernel with a team's size before its other arguments."""
-        self._launches += 1
-        size = self._next()
-        start = time.perf_counter()
-        kernel(size, *args)
-        seconds = time.perf_counter() - start
-        # The first launch compiles.
-        if self._launches > 1:
-            old = self._seconds.get(size, seconds)
-            self._seconds[size] = 0.7 * old + 0.3 * seconds
-
-    def _next(self) -> int:
-        untried = [size for size in self._sizes if size not in self._seconds]
-        if untried:
-            return untried[0]
-        best = min(self._sizes, key=self._seconds.__getitem__)
-        if self._launches % PROBE == 0:
-            return next((size for size in self._sizes if size != best), best)
-        return best
-
-
-class Phases(ParticlePhases, GridPhases, PosePhases, LossPhases):
+class Phases(TransferTiles, GridPhases, PosePhases, LossPhases):
     """All phases."""
 
 
@@ -119,6 +74,12 @@ class CpuEngine(Phases):
                 pass
 
     @ti.func
+    def first_chunk(self, rank, size):
+        """First chunk of a thread's share. Neighbouring chunks are neighbours in space, so that threads share
+        few grid nodes."""
+        return rank * self.chunks // size
+
+    @ti.func
     def first_tile(self, c):
         """First tile of a chunk."""
         return c * self.tiles // self.chunks
@@ -130,8 +91,9 @@ class CpuEngine(Phases):
 
     @ti.func
     def first_entry(self, e, c):
-        """First entry of a chunk's share of the environment's block list."""
-        return e * self.blocks + c * self.block_count[e] // self.chunks
+        """First entry of a chunk's share of the environment's block list: the blocks that no earlier chunk
+        holds."""
+        return e * self.blocks + self.block_first[e, c]
 
     # -- phases of one chunk ------------------------------------------------------------------------
 
@@ -139,16 +101,30 @@ class CpuEngine(Phases):
     def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
         """Material update and scatter of momentum and mass."""
         grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
             self.material_tile(
-                state, source, self.tile_entry(after, e, tile), entry9, e, grid_index * STAGE, True
+                state,
+                source,
+                self.tile_entry(after, e, tile),
+                entry9,
+                e,
+                self.bounded(grid_index * STAGE),
+                True,
             )
+            self.stencil_tile(state, source, at, places_at, False)
+            self.momentum_tile(state, source, entry9, at)
             for lane in range(self.lanes_of(tile)):
-                base, fx = self.stencil(self.vector(state, source, lane))
-                self.mark(grid_index, base, stamp)
-                self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
+                key = self.places[places_at + KEY][lane]
+                if key != known:
+                    self.mark(grid_index, key, stamp)
+                    known = key
+                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at, self.bounded(grid_index * WORK))
 
     @ti.func
     def grid_chunk(self, e, c, s):
@@ -182,31 +158,44 @@ class CpuEngine(Phases):
     @ti.func
     def gather_chunk(self, state: ti.template(), before, after, e, c, time):
         """Velocities, affine matrices and positions after the substep."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
+            self.stencil_tile(state, source, at, places_at, False)
             for lane in range(self.lanes_of(tile)):
-                self.gather_particle(state, source, target, lane, e, time, (e * self.chunks + c) * WORK)
+                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
+                self.gather_particle(
+                    state, source, target, lane, node, e, time, at, self.bounded(grid_index * WORK)
+                )
 
     @ti.func
     def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
         """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        work_at = self.bounded(grid_index * WORK)
+        known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
-            self.material_tile(state, source, target, entry9, e, grid_index * STAGE, False)
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STAGE), False)
+            self.stencil_tile(state, source, at, places_at, False)
+            self.momentum_tile(state, source, entry9, at)
+            self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
-                x = self.vector(state, source, lane)
-                base, fx = self.stencil(x)
-                self.mark(grid_index, base, stamp)
-                self.scatter_particle(state, source, entry9, lane, grid_index, base, fx)
-                h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
-                self.scatter(
-                    self.velocity_bar, grid_index * self.nodes + self.node_index(base), spline(fx), h
-                )
+                key = self.places[places_at + KEY][lane]
+                if key != known:
+                    self.mark(grid_index, key, stamp)
+                    known = key
+                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at, work_at)
+                self.scatter_adjoint(bar, entry, lane, node, at, work_at)
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
@@ -229,16 +218,32 @@ class CpuEngine(Phases):
     @ti.func
     def gather_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c):
         """Adjoints of the particles before the substep."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
-            entry9 = (e * self.tiles + tile) * 9
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.stencil_tile(state, source, at, places_at, True)
+            self.momentum_tile(state, source, entry9, at)
+            self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
+                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
                 self.gather_particle_adjoint(
-                    state, source, target, bar, entry, entry9, lane, e, (e * self.chunks + c) * WORK
+                    state,
+                    source,
+                    target,
+                    bar,
+                    entry,
+                    entry9,
+                    lane,
+                    node,
+                    at,
+                    self.bounded(grid_index * WORK),
                 )
-            self.material_tile_adjoint(state, source, bar, entry, entry9, e, (e * self.chunks + c) * STAGE)
+            self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded(grid_index * STAGE))
 
     # -- losses of one chunk ------------------------------------------------------------------------
 
@@ -246,16 +251,18 @@ class CpuEngine(Phases):
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
         """Spread mass, and find the particle nearest to each manipulator."""
         grid_index = e * self.chunks + c
+        places_at = self.bounded(grid_index * PLACES)
         search = self.weighs(2)
         for m in ti.static(range(self.manipulators)):
             self.contact_part[e, c, m] = ti.select(search, 1e9, 0.0)
             self.contact_particle[e, c, m] = 0
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
+            self.stencil_tile(state, source, self.bounded(grid_index * SPREAD), places_at, False)
             for lane in range(self.lanes_of(tile)):
+                self.mark(grid_index, self.places[places_at + KEY][lane], stamp)
                 x = self.vector(state, source, lane)
                 base, fx = self.stencil(x)
-                self.mark(grid_index, base, stamp)
                 self.scatter_mass(grid_index, base, fx)
                 if search:
                     self.find_nearest(e, c, tile * self.lanes + lane, x)
@@ -317,23 +324,18 @@ class CpuEngine(Phases):
         self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at
     ):
         """Measures of one environment."""
-        for r in range(self.rounds(rank, size)):
-            self.scatter_mass_chunk(state, slot, e, rank + r * size, stamp)
+        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+            self.scatter_mass_chunk(state, slot, e, c, stamp)
         self.barrier(team, size)
         if rank == 0:
             self.collect_blocks(e, stamp)
         self.barrier(team, size)
-        for r in range(self.rounds(rank, size)):
-            self.grid_loss_chunk(e, rank + r * size)
+        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+            self.grid_loss_chunk(e, c)
         self.barrier(team, size)
         if rank == 0:
             self.join_losses(e, terms, at)
         self.barrier(team, size)
-
-    @ti.func
-    def rounds(self, rank, size):
-        """Chunks that a thread of a team works on."""
-        return (self.chunks - rank + size - 1) // size
 
     @ti.func
     def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
@@ -378,19 +380,17 @@ class CpuEngine(Phases):
                         self.advance_manipulators(e, actions, poses, t, pose_before, pose_after)
                     for s in range(self.substeps):
                         before = slot + s * stride
-                        for r in range(self.rounds(rank, size)):
-                            self.scatter_chunk(state, before, before + stride, e, rank + r * size, stamp + s)
+                        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                            self.scatter_chunk(state, before, before + stride, e, c, stamp + s)
                         self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, stamp + s)
                         self.barrier(team, size)
-                        for r in range(self.rounds(rank, size)):
-                            self.grid_chunk(e, rank + r * size, s)
+                        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                            self.grid_chunk(e, c, s)
                         self.barrier(team, size)
-                        for r in range(self.rounds(rank, size)):
-                            self.gather_chunk(
-                                state, before, before + stride, e, rank + r * size, t * self.substeps + s
-                            )
+                        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                            self.gather_chunk(state, before, before + stride, e, c, t * self.substeps + s)
 
     @ti.kernel
     def losses_kernel(
@@ -451,8 +451,8 @@ class CpuEngine(Phases):
                     self.barrier(team, size)
                     self.losses_of_team(state, end, e, team, rank, size, stamp, terms, MEASURES * e)
                     if contact:
-                        for r in range(self.rounds(rank, size)):
-                            self.loss_gradient_chunk(state, end, bar, e, rank + r * size)
+                        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                            self.loss_gradient_chunk(state, end, bar, e, c)
                     self.barrier(team, size)
                     if rank == 0:
                         self.contact_gradient(state, end, bar, e)
@@ -461,24 +461,20 @@ class CpuEngine(Phases):
                         s = self.substeps - 1 - back
                         now = stamp + 1 + back
                         if contact:
-                            for r in range(self.rounds(rank, size)):
-                                self.scatter_chunk_adjoint(
-                                    state, slot + s, slot + s + 1, bar, e, rank + r * size, now
-                                )
+                            for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                                self.scatter_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c, now)
                             self.barrier(team, size)
                             if rank == 0:
                                 self.collect_blocks(e, now)
                             self.barrier(team, size)
-                            for r in range(self.rounds(rank, size)):
-                                self.grid_chunk_adjoint(e, rank + r * size, s)
+                            for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                                self.grid_chunk_adjoint(e, c, s)
                             self.barrier(team, size)
                         if rank == 0:
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
                         if contact:
-                            for r in range(self.rounds(rank, size)):
-                                self.gather_chunk_adjoint(
-                                    state, slot + s, slot + s + 1, bar, e, rank + r * size
-                                )
+                            for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+                                self.gather_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c)
                             self.barrier(team, size)
 
     @ti.kernel

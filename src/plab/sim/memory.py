@@ -7,12 +7,13 @@ import math
 import taichi as ti
 
 from plab.scene import Scene
-from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE
+from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE, STATE_MASK
 
 __all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
-ENTRIES_MAX = 2**31 - 1
-"""Entries of one array: Taichi counts them in 32 bits."""
+ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
+"""Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
+:data:`plab.sim.storage.STATE_MASK`."""
 
 REAL_BYTES = {"float32": 4, "float64": 8}
 
@@ -60,7 +61,7 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
     # The sparsest way to keep states, by the entries of the longer of its two arrays.
     longest = min(max(length * slots_per_step + 1, -(-scene.horizon // length)) for length in lengths)
-    return max(1, min(fitting, ENTRIES_MAX // (longest * entries)))
+    return max(1, min(fitting, ENTRIES_MAX[device] // (longest * entries)))
 
 
 def array_bytes(data: ti.Field | ti.Ndarray) -> int:

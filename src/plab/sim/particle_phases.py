@@ -21,8 +21,8 @@ from plab.sim.spectral import (
     spectral_return_map,
     spectral_return_map_adjoint,
 )
-from plab.sim.storage import BLOCK, BLOCK_BITS, STAGE, STATE, Storage
-from plab.sim.transfer import column, gather, gather_adjoint, spline, spline_slope, widen
+from plab.sim.storage import BLOCK, BLOCK_BITS, INDEX_MASK, STAGE, STATE, STATE_MASK, Storage
+from plab.sim.transfer import column, widen
 
 __all__ = ["ParticlePhases"]
 
@@ -55,7 +55,20 @@ class ParticlePhases(Storage):
     @ti.func
     def tile_entry(self, slot, e, tile):
         """Index of the first entry of a tile."""
-        return ((slot * self.batch + e) * self.tiles + tile) * STATE
+        entry = ((slot * self.batch + e) * self.tiles + tile) * STATE
+        if ti.static(not self.cuda):
+            # As in :meth:`bounded`.
+            entry = entry & STATE_MASK
+        return entry
+
+    @ti.func
+    def bounded(self, index):
+        """An index on the CPU, the same: one of which LLVM can tell that sums with it do not overflow.
+
+        So it computes one address for all that lies at fixed distances, and finds neighbours to be
+        neighbours. Without, each of a stencil's nodes takes four instructions for its address.
+        """
+        return index & INDEX_MASK
 
     @ti.func
     def load(self, state: ti.template(), entry, lane, count: ti.template()):
@@ -393,27 +406,6 @@ class ParticlePhases(Storage):
     # -- transfers ----------------------------------------------------------------------------------
 
     @ti.func
-    def add(self, grid: ti.template(), node, value):
-        """Add to a grid node that one thread owns."""
-        grid[node] = grid[node] + value
-
-    @ti.func
-    def scatter(self, grid: ti.template(), node, w: ti.template(), q: ti.template()):
-        """Scatter an affine field of 4-vectors: value at the base node q[0] and increments q[1:4] along x,
-        y, z."""
-        for i in ti.static(range(3)):
-            qi = q[0] + float(i) * q[1]
-            for j in ti.static(range(3)):
-                qj = qi + float(j) * q[2]
-                wij = w[i][0] * w[j][1]
-                row = node + (i * self.axis + j) * self.axis
-                r = wij * qj
-                z = wij * q[3]
-                self.add(grid, row, w[0][2] * r)
-                self.add(grid, row + 1, w[1][2] * r + w[1][2] * z)
-                self.add(grid, row + 2, w[2][2] * r + (2.0 * w[2][2]) * z)
-
-    @ti.func
     def affine_field(self, value, last, a: ti.template(), fx, scale):
         """An affine field value + scale A (node - particle) in the form that :meth:`scatter` takes."""
         c0 = column(a, 0, scale * self.dx)
@@ -422,99 +414,12 @@ class ParticlePhases(Storage):
         return [widen(value, last) - fx[0] * c0 - fx[1] * c1 - fx[2] * c2, c0, c1, c2]
 
     @ti.func
-    def scatter_particle(self, state: ti.template(), source, entry9, lane, grid_index, base, fx):
-        """Particle to grid: momentum and mass."""
-        a = self.load(self.affine, entry9, lane, 9)
-        v = self.vector(state, source + 3, lane)
-        q = self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
-        self.scatter(self.momentum, grid_index * self.nodes + self.node_index(base), spline(fx), q)
-
-    @ti.func
     def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
         """The affine field that the particle's adjoint contributes to the adjoint of the grid velocities."""
         open_axes = self.unclamped(x, self.vector(state, after + 3, lane))
         v_bar = self.vector(bar, target + 3, lane) + self.dt * open_axes * self.vector(bar, target, lane)
         c_bar = self.load(bar, target + 6, lane, 9)
         return self.affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx * self.inv_dx)
-
-    @ti.func
-    def gather_particle(self, state: ti.template(), source, target, lane, e, time, at):
-        """Grid to particle: v, C and x after the substep.
-
-        Args:
-            state: Particle state.
-            source: Entry of the tile before the substep.
-            target: Entry of the tile after it.
-            lane: Particle of the tile.
-            e: Environment.
-            time: Substep, noted where the speed is not sane.
-            at: First entry of the thread's share of ``work``.
-        """
-        x = self.vector(state, source, lane)
-        base, fx = self.stencil(x)
-        node = e * self.nodes + self.node_index(base)
-        gather(self.velocity, node, self.axis * self.axis, self.axis, spline(fx), self.work, at)
-        scale = 4.0 * self.inv_dx
-        speed = 0.0 * fx[0]
-        for i in ti.static(range(3)):
-            v = self.work[at][i]
-            state[target + 3 + i][lane] = v
-            state[target + 6 + 3 * i][lane] = scale * (self.work[at + 1][i] - fx[0] * v)
-            state[target + 7 + 3 * i][lane] = scale * (self.work[at + 2][i] - fx[1] * v)
-            state[target + 8 + 3 * i][lane] = scale * (self.work[at + 3][i] - fx[2] * v)
-            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v, 0.0), self.x_max)
-            speed += v * v
-        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
-        if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
-            self.fault[e] = time + 1
-
-    @ti.func
-    def gather_particle_adjoint(
-        self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e, at
-    ):
-        """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
-        x = self.vector(state, source, lane)
-        base, fx = self.stencil(x)
-        a = self.load(self.affine, entry9, lane, 9)
-        v_after = self.vector(state, after + 3, lane)
-        q = self.affine_field(self.mass * self.vector(state, source + 3, lane), self.mass, a, fx, 1.0)
-        h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
-        for i in ti.static(range(4)):
-            self.work[at + 7 + i] = q[i]
-            self.work[at + 11 + i] = h[i]
-        w = spline(fx)
-        dw = spline_slope(fx)
-        for i in ti.static(range(3)):
-            self.work[at + 15][i] = w[i][0]
-            self.work[at + 16][i] = dw[i][0]
-            self.work[at + 17][i] = float(i)
-        node = e * self.nodes + self.node_index(base)
-        gather_adjoint(
-            self.velocity,
-            self.momentum_bar,
-            node,
-            self.axis * self.axis,
-            self.axis,
-            w,
-            dw,
-            self.work,
-            at,
-        )
-        c_bar = self.load(bar, target + 6, lane, 9)
-        scale = 4.0 * self.inv_dx * self.inv_dx
-        open_axes = self.unclamped(x, v_after)
-        m0 = ti.Vector([self.work[at][0], self.work[at][1], self.work[at][2]])
-        for i in ti.static(range(3)):
-            slope = self.work[at + 4 + i].sum()
-            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
-            # the scatter.
-            offsets = scale * (
-                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
-            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
-            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope - offsets
-            bar[target + 3 + i][lane] = self.mass * m0[i]
-            for j in ti.static(range(3)):
-                self.affine[entry9 + 3 * i + j][lane] = self.dx * (self.work[at + 1 + j][i] - fx[j] * m0[i])
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 
@@ -540,47 +445,6 @@ class ParticlePhases(Storage):
             + ((corner >> 2) & 1)
         )
         return block + shift
-
-    @ti.func
-    def mark(self, grid_index, base, stamp):
-        """Note on the CPU that a chunk's particle touches the blocks around a base node."""
-        block, crossing = self.block_of(base)
-        entry = grid_index * self.blocks + block
-        if self.mark_stamp[entry] != stamp:
-            self.mark_stamp[entry] = stamp
-            self.mark_code[entry] = 0
-            count = self.mark_count[grid_index]
-            self.mark_list[grid_index * self.blocks + count] = block
-            self.mark_count[grid_index] = count + 1
-        self.mark_code[entry] = self.mark_code[entry] | (1 << crossing)
-
-    @ti.func
-    def collect_blocks(self, e, stamp):
-        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing
-        else."""
-        count = 0
-        for c in range(self.chunks):
-            grid_index = e * self.chunks + c
-            for r in range(self.mark_count[grid_index]):
-                block = self.mark_list[grid_index * self.blocks + r]
-                code = self.mark_code[grid_index * self.blocks + block]
-                for corner in ti.static(range(8)):
-                    if code & ti.static(REACHING[corner]):
-                        entry = e * self.blocks + self.neighbour(block, corner)
-                        if self.block_stamp[entry] != stamp:
-                            self.block_stamp[entry] = stamp
-                            self.block_chunks[entry] = 0
-                            self.block_list[e * self.blocks + count] = entry - e * self.blocks
-                            count += 1
-                        self.block_chunks[entry] = self.block_chunks[entry] | (1 << c)
-            self.mark_count[grid_index] = 0
-        if ti.static(not self.skips.empty_blocks):
-            for block in range(self.blocks):
-                if self.block_stamp[e * self.blocks + block] != stamp:
-                    self.block_chunks[e * self.blocks + block] = 0
-                    self.block_list[e * self.blocks + count] = block
-                    count += 1
-        self.block_count[e] = count
 
     @ti.func
     def mark_shared(self, e, base, stamp):

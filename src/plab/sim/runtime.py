@@ -130,8 +130,7 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         arch=ti.cuda if device == "cuda" else ti.cpu,
         default_fp=ti.f32 if precision == "float32" else ti.f64,
         cpu_max_num_threads=threads,
-        # Square roots in float64 on CUDA lose digits under fast_math; on the CPU it is what lets LLVM use
-        # FMA.
+        # Square roots in float64 on CUDA lose digits under fast_math.
         fast_math=device == "cpu" or precision == "float32",
         # Taichi's own passes take minutes on kernels of this size and gain nothing over LLVM's; one of them
         # asserts.

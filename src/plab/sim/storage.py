@@ -27,7 +27,21 @@ from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.skips import Skips
 
-__all__ = ["BLOCK", "BLOCK_BITS", "CHUNKS", "FRAME_ADJOINT", "MEASURES", "STATE", "WORK", "Storage"]
+__all__ = [
+    "BLOCK",
+    "BLOCK_BITS",
+    "CHUNKS",
+    "FRAME_ADJOINT",
+    "INDEX_MASK",
+    "MEASURES",
+    "PLACES",
+    "SPREAD",
+    "STAGE",
+    "STATE",
+    "STATE_MASK",
+    "WORK",
+    "Storage",
+]
 
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9)."""
@@ -46,11 +60,27 @@ FRAME_ADJOINT = 25
 """Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap
 (1)."""
 
-WORK = 20
-"""4-vectors per thread of work for the transfers of one particle."""
+STATE_MASK = 2**27 - 1
+"""Largest entry of an array of states on the CPU, all bits set; LLVM must see that eight times an entry and
+its successors fit into 32 bits."""
 
-STAGE = 49
-"""Lane vectors per thread for the intermediate results of one tile's material update."""
+INDEX_MASK = 2**30 - 1
+"""Largest index into other fields on the CPU, all bits set."""
+
+# What follows are strides of the threads' working areas, which keep apart what two threads write: a cache
+# line that both of them use costs more than the work itself.
+
+WORK = 32
+"""4-vectors per chunk of particles for the transfers of one particle; 18 are used."""
+
+SPREAD = 32
+"""Lane vectors per chunk for weights and affine fields of one tile; 27 are used."""
+
+PLACES = 8
+"""Lane vectors of integers per chunk for where one tile's particles are; 2 are used."""
+
+STAGE = 56
+"""Lane vectors per chunk for the intermediate results of one tile's material update; 49 are used."""
 
 LANES = {"cpu": 8, "cuda": 32}
 
@@ -72,6 +102,7 @@ class Storage:
         self.full_gradient = full_gradient
         first = scenes[0]
         self.skips = skips
+        self.device = runtime.device
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
         self.batch = len(scenes)
@@ -145,6 +176,11 @@ class Storage:
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
+        if not self.cuda and b * self.chunks * self.nodes > INDEX_MASK:
+            raise MemoryError(
+                f"{b} environments of {self.n}^3 nodes are more than one simulator can number: "
+                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
+            )
         m = max(1, self.manipulators)
         grids = b * self.chunks
         self.lane_type = ti.types.vector(self.lanes, real)
@@ -169,6 +205,8 @@ class Storage:
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         self.work = ti.Vector.field(4, real, shape=1 if self.cuda else grids * WORK)
+        self.spread = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * SPREAD)
+        self.places = ti.Vector.field(self.lanes, ti.i32, shape=1 if self.cuda else grids * PLACES)
         # Intermediate results of the material update of one tile per chunk.
         self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
@@ -199,6 +237,7 @@ class Storage:
         self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
         self.block_list = ti.field(ti.i32, shape=b * self.blocks)
         self.block_count = ti.field(ti.i32, shape=b)
+        self.block_first = ti.field(ti.i32, shape=(1, 1) if self.cuda else (b, self.chunks + 1))
         self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
         # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
         # block.

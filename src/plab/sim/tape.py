@@ -75,7 +75,7 @@ class Tape:
         def cost(length: int) -> int:
             return kept_states(steps, slots_per_step, length) * slot_bytes + fixed
 
-        slots = ENTRIES_MAX // self._particles.slot_entries
+        slots = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
         fitting = [
             length
             for length in range(1, steps + 1)

@@ -12,6 +12,7 @@ __all__ = [
     "column",
     "gather",
     "gather_adjoint",
+    "scatter",
     "spline",
     "spline_slope",
     "widen",
@@ -43,6 +44,50 @@ def column(a: ti.template(), j: ti.template(), scale):
 
 
 @ti.func
+def scatter(
+    grid: ti.template(), node, stride_x, stride_y, w: ti.template(), q: ti.template(), work: ti.template(), at
+):
+    """Add an affine field of 4-vectors, weighted, to a particle's stencil.
+
+    Args:
+        grid: Field of 4-vectors that one thread owns.
+        node: Index of the base node.
+        stride_x: Index distance of neighbours along x.
+        stride_y: Index distance of neighbours along y.
+        w: :func:`spline` weights.
+        q: The field's value at the base node, and its increments along x, y and z.
+        work: Field of 4-vectors for intermediate results.
+        at: First of nine entries.
+    """
+    # Weighted along z, node by node: the values at the base node, and increments along x and y.
+    for k in ti.static(range(3)):
+        work[at + k] = w[k][2] * (q[0] + float(k) * q[3])
+        work[at + 3 + k] = w[k][2] * q[1]
+        work[at + 6 + k] = w[k][2] * q[2]
+    x0 = work[at]
+    x1 = work[at + 1]
+    x2 = work[at + 2]
+    for i in ti.static(range(3)):
+        y0 = x0
+        y1 = x1
+        y2 = x2
+        for j in ti.static(range(3)):
+            wij = w[i][0] * w[j][1]
+            row = node + i * stride_x + j * stride_y
+            grid[row] = grid[row] + wij * y0
+            grid[row + 1] = grid[row + 1] + wij * y1
+            grid[row + 2] = grid[row + 2] + wij * y2
+            if ti.static(j < 2):
+                y0 += work[at + 6]
+                y1 += work[at + 7]
+                y2 += work[at + 8]
+        if ti.static(i < 2):
+            x0 += work[at + 3]
+            x1 += work[at + 4]
+            x2 += work[at + 5]
+
+
+@ti.func
 def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work: ti.template(), at):
     """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil.
 
@@ -58,21 +103,29 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work
             and z.
     """
     for i in ti.static(range(3)):
-        r0 = grid[node] * 0.0
-        ry = r0
-        rz = r0
-        for j in ti.static(range(3)):
-            row = node + i * stride_x + j * stride_y
-            g1 = w[1][2] * grid[row + 1]
-            g2 = w[2][2] * grid[row + 2]
-            s0 = w[0][2] * grid[row] + g1 + g2
-            r0 += w[j][1] * s0
-            rz += w[j][1] * (g1 + 2.0 * g2)
-            if ti.static(j > 0):
-                ry += (float(j) * w[j][1]) * s0
+        row = node + i * stride_x
+        g1 = w[1][2] * grid[row + 1]
+        g2 = w[2][2] * grid[row + 2]
+        g = g1 + g2
+        r0 = w[0][1] * (w[0][2] * grid[row] + g)
+        rz = w[0][1] * (g + g2)
+        row1 = row + stride_y
+        g1 = w[1][2] * grid[row1 + 1]
+        g2 = w[2][2] * grid[row1 + 2]
+        g = g1 + g2
+        t1 = w[1][1] * (w[0][2] * grid[row1] + g)
+        rz += w[1][1] * (g + g2)
+        row2 = row1 + stride_y
+        g1 = w[1][2] * grid[row2 + 1]
+        g2 = w[2][2] * grid[row2 + 2]
+        g = g1 + g2
+        t2 = w[2][1] * (w[0][2] * grid[row2] + g)
+        rz += w[2][1] * (g + g2)
+        t12 = t1 + t2
+        r0 += t12
         if ti.static(i == 0):
             work[at] = w[i][0] * r0
-            work[at + 2] = w[i][0] * ry
+            work[at + 2] = w[i][0] * (t12 + t2)
             work[at + 3] = w[i][0] * rz
         else:
             r = w[i][0] * r0
@@ -80,8 +133,8 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work
             if ti.static(i == 1):
                 work[at + 1] = r
             else:
-                work[at + 1] = work[at + 1] + 2.0 * r
-            work[at + 2] = work[at + 2] + w[i][0] * ry
+                work[at + 1] = work[at + 1] + (r + r)
+            work[at + 2] = work[at + 2] + w[i][0] * (t12 + t2)
             work[at + 3] = work[at + 3] + w[i][0] * rz
 
 

@@ -12,7 +12,7 @@ from plab.locks import held, lock_path
 from plab.results import ResultsError, RunFile, read, result_path
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
-from plab.sweep.tally import Outcome
+from plab.tally import Outcome
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

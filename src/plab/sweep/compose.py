@@ -73,15 +73,14 @@ class _Composer:
         """Return the configuration of a job."""
         parsed = OverridesParser.create().parse_overrides(list(overrides))
         seed = next((o for o in parsed if o.key_or_group == _SEED and _sets_a_value(o)), None)
-        if seed is not None and type(seed.value()) is int:
+        value = None if seed is None else seed.value()
+        if seed is not None and type(value) is int:
             parsed.remove(seed)
-        else:
-            seed = None
         made = self._without_seed(parsed)
         if isinstance(made, str):
             return Refused(tuple(overrides), made)
         try:
-            cfg = made if seed is None else replace(made, seed=seed.value())
+            cfg = replace(made, seed=value) if type(value) is int else made
             cfg.check()
         except ConfigError as error:
             return Refused(tuple(overrides), str(error))
@@ -90,7 +89,7 @@ class _Composer:
 
     def _without_seed(self, parsed: Sequence[Override]) -> Config | str:
         """Return the configuration of some overrides, or why there is none."""
-        key = tuple(override.input_line for override in parsed)
+        key = _lines(parsed)
         if key not in self._finished:
             try:
                 self._finished[key] = finish(self._composition(parsed), key)
@@ -103,7 +102,7 @@ class _Composer:
     def _composition(self, parsed: Sequence[Override]) -> DictConfig:
         """Return what Hydra composes of some overrides, without Hydra's own section."""
         later = [o for o in parsed if o.key_or_group in self._varying and _sets_a_value(o)]
-        first = tuple(override.input_line for override in parsed if override not in later)
+        first = _lines([override for override in parsed if override not in later])
         if first not in self._composed:
             composed = self._compose(list(first))
             with open_dict(composed):
@@ -115,7 +114,7 @@ class _Composer:
                 OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
         except OmegaConfBaseException:
             # A key that does not exist, or a value of the wrong type: Hydra words it better.
-            config = self._compose([override.input_line for override in parsed])
+            config = self._compose(list(_lines(parsed)))
             with open_dict(config):
                 del config["hydra"]
         return config
@@ -145,6 +144,11 @@ def _varying_keys(jobs: Sequence[Sequence[str]]) -> set[str]:
 
 
 _TOP_LEVEL = {"variant", "seed_scene"}
+
+
+def _lines(parsed: Sequence[Override]) -> tuple[str, ...]:
+    """Return overrides as they were written."""
+    return tuple(str(override.input_line) for override in parsed)
 
 
 def _sets_a_value(override: Override) -> bool:

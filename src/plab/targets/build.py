@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -32,7 +33,9 @@ TARGET_SEED = 1
 """Seed of a geometric target's samples; not the scene's, or a target could be a shifted copy of the
 bodies."""
 
-RECIPES: dict[str, type[GeometricRecipe] | type[ScriptedRecipe]] = {
+Recipe: TypeAlias = GeometricRecipe | ScriptedRecipe
+
+RECIPES: dict[str, type[Recipe]] = {
     "bodies": geometric.BodiesTarget,
     "ring": geometric.RingTarget,
     "carry": scripted.CarryTarget,
@@ -46,7 +49,7 @@ RECIPES: dict[str, type[GeometricRecipe] | type[ScriptedRecipe]] = {
 """Recipes by the name that ``target.recipe`` gives."""
 
 
-def make_recipe(target: Mapping[str, Any]) -> GeometricRecipe | ScriptedRecipe:
+def make_recipe(target: Mapping[str, Any]) -> Recipe:
     """Turn the ``target`` section of a task into its recipe.
 
     Args:
@@ -60,14 +63,14 @@ def make_recipe(target: Mapping[str, Any]) -> GeometricRecipe | ScriptedRecipe:
     """
     parameters = dict(target)
     name = parameters.pop("recipe", None)
-    kind = RECIPES.get(name)
+    kind = RECIPES.get(str(name))
     if kind is None:
         raise TargetError(f"target.recipe '{name}' does not exist; choose from: {', '.join(RECIPES)}")
     try:
-        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), parameters))
+        return cast(Recipe, OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), parameters)))
     except OmegaConfBaseException as error:
         reason = (error.msg or str(error)).splitlines()[0]
-        names = ", ".join(kind.__dataclass_fields__)
+        names = ", ".join(field.name for field in fields(cast(Any, kind)))
         key = f"target.{error.full_key}" if error.full_key else "target"
         raise TargetError(f"{key}: {reason} (recipe {name} has the keys {names})") from None
 
@@ -86,7 +89,7 @@ def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
     """
     recipe = make_recipe(target)
-    return recipe.actions(scene) if hasattr(recipe, "actions") else None
+    return recipe.actions(scene) if isinstance(recipe, ScriptedRecipe) else None
 
 
 def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
@@ -111,7 +114,7 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             domain, or the target has to be simulated.
     """
     recipe = make_recipe(target)
-    if not hasattr(recipe, "sample"):
+    if not isinstance(recipe, GeometricRecipe):
         raise TargetError(
             f"target.recipe {target['recipe']} is simulated: build it with plab.problem.Problem"
         )
@@ -149,23 +152,23 @@ def build_targets(
     # Vectorised environments are many of one kind: each kind is built once.
     kinds = [(id(scene), id(target)) for scene, target in zip(scenes, targets, strict=True)]
     first = {kind: kinds.index(kind) for kind in kinds}
-    scripts = {kind: demonstration(scenes[k], targets[k]) for kind, k in first.items()}
-    masses: dict[tuple[int, int], np.ndarray | None] = {}
+    masses: dict[tuple[int, int], np.ndarray] = {}
+    missing: dict[tuple[int, int], np.ndarray] = {}
     for kind, k in first.items():
-        if scripts[kind] is None:
+        script = demonstration(scenes[k], targets[k])
+        if script is None:
             masses[kind] = build_target(scenes[k], targets[k])
+        elif (kept := None if rebuild else store.load(scenes[k], script)) is not None:
+            masses[kind] = kept
         else:
-            masses[kind] = None if rebuild else store.load(scenes[k], scripts[kind])
-    missing = [kind for kind, mass in masses.items() if mass is None]
+            missing[kind] = script
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
         simulator.set_contact("hard")
-        simulator.rollout(
-            np.stack([scripts[kind] if kind in missing else still for kind in kinds]), gradient=False
-        )
+        simulator.rollout(np.stack([missing.get(kind, still) for kind in kinds]), gradient=False)
         made = simulator.mass_tensor()
         simulator.reset()
-        for kind in missing:
+        for kind, script in missing.items():
             masses[kind] = made[first[kind]]
-            store.save(scenes[first[kind]], scripts[kind], masses[kind])
+            store.save(scenes[first[kind]], script, masses[kind])
     return np.stack([masses[kind] for kind in kinds])

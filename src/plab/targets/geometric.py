@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plab.scene import Body, Scene, SceneError, sample_particles
+from plab.scene import Body, Scene, SceneError, sample_particles, vector3
 from plab.targets.recipe import TargetError
 
 __all__ = ["BodiesTarget", "RingTarget", "TargetBody"]
@@ -55,7 +55,7 @@ class BodiesTarget:
         ends = np.rint(np.cumsum(volumes) / volumes.sum() * scene.particle_count).astype(int)
         counts = np.diff(ends, prepend=0)
         solids = tuple(
-            Body(body.shape, tuple(body.center), tuple(body.size), int(count))
+            Body(body.shape, vector3(body.center), tuple(body.size), int(count))
             for body, count in zip(self.bodies.values(), counts, strict=True)
         )
         filled = replace(scene, bodies=solids, particle_seed=int(rng.integers(2**31)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,7 @@ class TargetError(ValueError):
     """A target that cannot be built; the message says why."""
 
 
+@runtime_checkable
 class GeometricRecipe(Protocol):
     """A target that is a shape."""
 
@@ -34,6 +35,7 @@ class GeometricRecipe(Protocol):
         ...
 
 
+@runtime_checkable
 class ScriptedRecipe(Protocol):
     """A target that is what a demonstration makes of the scene, simulated in the hard contact model."""
 

@@ -11,8 +11,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from plab.scene import ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipe import EPISODE_STEPS, TargetError
@@ -56,7 +58,7 @@ class Track:
         """Environment steps so far."""
         return len(self._actions)
 
-    def go(self, way: Sequence[float], steps: int = 1) -> None:
+    def go(self, way: ArrayLike, steps: int = 1) -> None:
         """Add a straight, even motion.
 
         Args:
@@ -330,6 +332,10 @@ class PushTarget(Script):
         track.go(_draw(rng, "distance", self.distance) * direction, 20)
 
 
+@overload
+def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float: ...
+@overload
+def _draw(rng: np.random.Generator, name: str, limits: Sequence[float], size: int) -> np.ndarray: ...
 def _draw(
     rng: np.random.Generator, name: str, limits: Sequence[float], size: int | None = None
 ) -> float | np.ndarray:

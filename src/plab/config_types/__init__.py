@@ -1,0 +1,54 @@
+"""Types of the configuration: which keys there are, of which type and in which range.
+
+The values are in ``conf/*.yaml``; the dataclasses have no defaults of their own, except for what a YAML may
+leave out.
+"""
+
+from plab.config_types.method import (
+    ALGORITHMS,
+    CONTACTS,
+    DEVICES,
+    OPTIMIZERS,
+    ApgConfig,
+    MethodConfig,
+    OffPolicyConfig,
+    PpoConfig,
+    RlConfig,
+    SacConfig,
+    Td3Config,
+    TrajectoryConfig,
+)
+from plab.config_types.run import PRECISIONS, Config, SimConfig, TargetsConfig
+from plab.config_types.task import (
+    BodyConfig,
+    DrawConfig,
+    ManipulatorConfig,
+    RandomConfig,
+    RangeConfig,
+    TaskConfig,
+)
+
+__all__ = [
+    "ALGORITHMS",
+    "CONTACTS",
+    "DEVICES",
+    "OPTIMIZERS",
+    "PRECISIONS",
+    "ApgConfig",
+    "BodyConfig",
+    "Config",
+    "DrawConfig",
+    "ManipulatorConfig",
+    "MethodConfig",
+    "OffPolicyConfig",
+    "PpoConfig",
+    "RandomConfig",
+    "RangeConfig",
+    "RlConfig",
+    "SacConfig",
+    "SimConfig",
+    "TargetsConfig",
+    "TaskConfig",
+    "Td3Config",
+    "TrajectoryConfig",
+]

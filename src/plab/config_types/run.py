@@ -1,0 +1,121 @@
+"""Types of a whole configuration and of its sections ``sim`` and ``targets``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+from plab.config_errors import ConfigError
+from plab.config_types.method import DEVICES, MethodConfig
+from plab.config_types.ranges import at_least, one_of, positive
+from plab.config_types.task import TaskConfig
+
+__all__ = ["PRECISIONS", "Config", "SimConfig", "TargetsConfig"]
+
+PRECISIONS = ("float32", "float64")
+
+Method = TypeVar("Method", bound=MethodConfig)
+
+
+@dataclass
+class SimConfig:
+    """How the scene is simulated.
+
+    Attributes:
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+        memory_mb: Memory of the simulator with a gradient [MB]; checkpoints are spaced to fit.
+        grid_size: Grid nodes per axis.
+        dt: Time step of one substep [s].
+        substeps: Substeps per environment step.
+        horizon: Environment steps per episode.
+        particles_scale: Factor on every body's number of particles.
+    """
+
+    precision: str
+    device: str
+    memory_mb: float
+    grid_size: int
+    dt: float
+    substeps: int
+    horizon: int
+    particles_scale: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        one_of(f"{path}.precision", self.precision, PRECISIONS)
+        one_of(f"{path}.device", self.device, DEVICES)
+        positive(f"{path}.memory_mb", self.memory_mb)
+        at_least(f"{path}.grid_size", self.grid_size, 8)
+        positive(f"{path}.dt", self.dt)
+        at_least(f"{path}.substeps", self.substeps, 1)
+        at_least(f"{path}.horizon", self.horizon, 1)
+        positive(f"{path}.particles_scale", self.particles_scale)
+
+
+@dataclass
+class TargetsConfig:
+    """Where the targets come from.
+
+    Attributes:
+        source: Folder of the original release's target files; None builds the task's recipe.
+    """
+
+    source: str | None
+
+
+@dataclass
+class Config:
+    """A run: one task and variant, one method, one seed.
+
+    Attributes:
+        task: Scene, target and variants.
+        method: How the actions are found.
+        sim: How the scene is simulated.
+        targets: Where the targets come from.
+        variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
+        seed_scene: Which random variant was drawn; None of other variants.
+        seed: Seed of the method's random numbers.
+        results_dir: Folder of the result files, relative to the working directory.
+        force: Compute again although a result exists.
+        progress: Show a progress bar.
+        checkpoint_seconds: Time between two writings of the state from which a killed run goes on [s].
+    """
+
+    task: TaskConfig
+    method: MethodConfig
+    sim: SimConfig
+    targets: TargetsConfig
+    variant: str
+    seed_scene: int | None
+    seed: int
+    results_dir: str
+    force: bool
+    progress: bool
+    checkpoint_seconds: float
+
+    def check(self) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        at_least("seed", self.seed, 0)
+        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
+        if self.seed >= 2**32:
+            raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
+        if not self.results_dir.strip():
+            raise ConfigError("results_dir is empty: give a folder, such as results")
+        if self.targets.source is not None and self.seed_scene is not None:
+            raise ConfigError("targets.source has no files for variant=random: leave one of them out")
+        self.task.check("task")
+        self.method.check("method")
+        self.sim.check("sim")
+
+    def method_as(self, kind: type[Method]) -> Method:
+        """Return the section ``method``, which has to be of the kind that a runner is for.
+
+        Raises:
+            TypeError: If it is of another kind.
+        """
+        if not isinstance(self.method, kind):
+            raise TypeError(
+                f"method {self.method.name} has a {type(self.method).__name__}, not a {kind.__name__}"
+            )
+        return self.method

@@ -1,0 +1,202 @@
+"""Types of the section ``task``: bodies, manipulators, material, target, variants."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from plab.config_errors import ConfigError
+from plab.config_types.ranges import at_least, folder_name, positive, vector
+from plab.scene import Body, Manipulator, vector3
+from plab.targets import TargetError, make_recipe
+
+__all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "RangeConfig", "TaskConfig"]
+
+
+@dataclass
+class BodyConfig:
+    """A body of plasticine.
+
+    Attributes:
+        shape: ``sphere`` or ``box``.
+        center: Centre (x, y, z) [domain units].
+        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``.
+        particles: Number of particles before ``sim.particles_scale``.
+    """
+
+    shape: str
+    center: list[float]
+    size: list[float]
+    particles: int
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        vector(f"{path}.center", self.center, 3)
+        at_least(f"{path}.particles", self.particles, 1)
+
+    def build(self, particles_scale: float = 1.0) -> Body:
+        """Return the scene's body, with ``particles_scale`` times the particles, but at least one."""
+        particles = max(1, round(self.particles * particles_scale))
+        return Body(self.shape, vector3(self.center), tuple(self.size), particles)
+
+
+@dataclass
+class ManipulatorConfig:
+    """A rigid manipulator.
+
+    Attributes:
+        shape: A key of :data:`plab.scene.MANIPULATOR_SHAPES`.
+        size: Lengths that the shape asks for [domain units].
+        position: Position (x, y, z) at the start [domain units].
+        rotation: Unit quaternion (w, x, y, z) at the start.
+        scale: Motion per environment step at action 1, one per action component [domain units or radians].
+        friction: Coulomb friction with the plasticine.
+        lower_bound: Lowest position (x, y, z) [domain units].
+        upper_bound: Highest position (x, y, z) [domain units].
+        gap: Chopsticks only: distance of the two axes at the start [domain units].
+        minimal_gap: Chopsticks only: smallest gap [domain units].
+    """
+
+    shape: str
+    size: list[float]
+    position: list[float]
+    rotation: list[float]
+    scale: list[float]
+    friction: float
+    lower_bound: list[float]
+    upper_bound: list[float]
+    gap: float | None = None
+    minimal_gap: float | None = None
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        vector(f"{path}.rotation", self.rotation, 4)
+        vector(f"{path}.scale", self.scale, len(self.scale))
+        for name in ("position", "lower_bound", "upper_bound"):
+            vector(f"{path}.{name}", getattr(self, name), 3)
+        for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
+            if not low <= at <= high:
+                raise ConfigError(
+                    f"{path}.position: {axis} = {at:g} is outside its bounds {low:g} .. {high:g}"
+                )
+        for name in ("gap", "minimal_gap"):
+            if getattr(self, name) is not None:
+                positive(f"{path}.{name}", getattr(self, name))
+
+    def build(self) -> Manipulator:
+        """Return the scene's manipulator."""
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in vars(self).items()
+            if value is not None
+        }
+        return Manipulator(**values)
+
+
+@dataclass
+class RangeConfig:
+    """Numbers that are drawn uniformly and independently, each between its two bounds.
+
+    Attributes:
+        low: Lower bounds.
+        high: Upper bounds, as many.
+    """
+
+    low: list[float]
+    high: list[float]
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for bounds between which nothing can be drawn."""
+        vector(f"{path}.low", self.low, len(self.low))
+        vector(f"{path}.high", self.high, len(self.low))
+        if any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise ConfigError(f"{path}: low {self.low} is above high {self.high}")
+
+
+@dataclass
+class DrawConfig(RangeConfig):
+    """A drawn list of numbers, and where it goes.
+
+    Attributes:
+        keys: Dotted keys of the task that take the same drawn list, such as ``manipulators.pillar.position``.
+    """
+
+    keys: list[str]
+
+
+@dataclass
+class RandomConfig:
+    """What ``variant=random`` draws.
+
+    Attributes:
+        variant: Variant that gives what is not drawn; None where the task itself gives it.
+        shift: One displacement (x, y, z) for all bodies and all manipulators that move, except those with a
+            range of their own [domain units]. None leaves them where they are.
+        reach: Highest distance along an axis between a body and the target's body of the same name; what lies
+            farther is drawn again [domain units]. None sets no limit.
+        ranges: What else is drawn, by names of your choice.
+    """
+
+    variant: str | None = None
+    shift: RangeConfig | None = None
+    reach: float | None = None
+    ranges: dict[str, DrawConfig] | None = None
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        if self.shift is not None:
+            vector(f"{path}.shift.low", self.shift.low, 3)
+            self.shift.check(f"{path}.shift")
+        if self.reach is not None:
+            positive(f"{path}.reach", self.reach)
+        for name, draw in (self.ranges or {}).items():
+            draw.check(f"{path}.ranges.{name}")
+
+
+@dataclass
+class TaskConfig:
+    """What is in the scene, and what shape the plasticine is to take.
+
+    Attributes:
+        name: Name of the task in results and reports.
+        youngs_modulus: Young's modulus E; the density is 1.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress; ``inf`` never yields.
+        floor_friction: Friction of the floor: 0 slips, 10 and more sticks.
+        gravity: Acceleration (x, y, z).
+        bodies: Bodies of plasticine, by name.
+        manipulators: Manipulators, by name, in the order of the action vector.
+        target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
+        variants: By name: what each variant changes: a part of this very structure, merged over it.
+        random: What ``variant=random`` draws: the fields of :class:`RandomConfig`. Empty where there is
+            nothing to draw, and in a run's configuration.
+    """
+
+    name: str
+    youngs_modulus: float
+    poisson_ratio: float
+    yield_stress: float
+    floor_friction: float
+    gravity: list[float]
+    bodies: dict[str, BodyConfig]
+    manipulators: dict[str, ManipulatorConfig]
+    target: dict[str, Any]
+    variants: dict[str, Any]
+    random: dict[str, Any] = field(default_factory=dict)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        folder_name(f"{path}.name", self.name)
+        for variant in self.variants:
+            folder_name(f"{path}.variants", variant)
+        vector(f"{path}.gravity", self.gravity, 3)
+        positive(f"{path}.youngs_modulus", self.youngs_modulus)
+        at_least(f"{path}.yield_stress", self.yield_stress, 0)
+        at_least(f"{path}.floor_friction", self.floor_friction, 0)
+        for group in ("bodies", "manipulators"):
+            for name, item in getattr(self, group).items():
+                item.check(f"{path}.{group}.{name}")
+        try:
+            make_recipe(self.target)
+        except TargetError as error:
+            raise ConfigError(f"{path}.{error}") from None

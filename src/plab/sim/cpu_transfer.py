@@ -1,0 +1,310 @@
+"""Transfers on the CPU: what a tile's particles need of their stencils, computed by lanes, and sums over the
+nodes of one particle after the other.
+
+LLVM vectorises what ends in stores to a field, and what begins with loads from one. So each part of the work
+leaves its results in ``spread`` (lane vectors, one particle per lane) or in ``work`` (4-vectors of one
+particle), and the next part takes them from there.
+"""
+
+import taichi as ti
+
+from plab.sim.particle_phases import ParticlePhases
+from plab.sim.storage import BLOCK, BLOCK_BITS
+from plab.sim.transfer import column, gather, gather_adjoint, scatter, spline, spline_slope
+
+__all__ = ["TransferTiles"]
+
+# Entries of a tile in ``spread``: weights and their slopes by offset and axis, x / dx - base, and the values
+# at the base node of the two affine fields that are scattered, without their last entries.
+WEIGHTS = 0
+SLOPES = 9
+OFFSETS = 18
+MOMENTUM_FIELD = 21
+ADJOINT_FIELD = 24
+
+# Entries in ``places``: node in the environment's grid; block and crossing in one number.
+NODE = 0
+KEY = 1
+
+REACHING = tuple(
+    sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8)
+)
+"""For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
+
+
+class TransferTiles(ParticlePhases):
+    """Particle-to-grid and grid-to-particle transfers of tiles, and their adjoints."""
+
+    # -- by lanes -----------------------------------------------------------------------------------
+
+    @ti.func
+    def stencil_tile(self, state: ti.template(), source, at, places_at, slopes: ti.template()):
+        """Weights, offsets and base nodes of a tile's particles.
+
+        Args:
+            state: Particle state.
+            source: Entry of the tile.
+            at: First entry of the thread's share of ``spread``.
+            places_at: First entry of the thread's share of ``places``.
+            slopes: Whether the weights' slopes are needed.
+        """
+        node = ti.Vector.zero(ti.i32, self.lanes)
+        block = ti.Vector.zero(ti.i32, self.lanes)
+        crossing = ti.Vector.zero(ti.i32, self.lanes)
+        for axis in ti.static(range(3)):
+            base, f = self.stencil(state[source + axis])
+            w = spline(f)
+            self.spread[at + OFFSETS + axis] = f
+            for k in ti.static(range(3)):
+                self.spread[at + WEIGHTS + 3 * k + axis] = w[k]
+            if ti.static(slopes):
+                dw = spline_slope(f)
+                for k in ti.static(range(3)):
+                    self.spread[at + SLOPES + 3 * k + axis] = dw[k]
+            node = node * self.axis + base
+            block = block * self.blocks_per_axis + (base >> BLOCK_BITS)
+            # 1 where the stencil reaches into the next block.
+            crossing = crossing + ((((base & (BLOCK - 1)) + 2) >> BLOCK_BITS) << axis)
+        self.places[places_at + NODE] = node
+        self.places[places_at + KEY] = block * 8 + crossing
+
+    @ti.func
+    def momentum_tile(self, state: ti.template(), source, entry9, at):
+        """Value at the base node of the momentum that each particle of a tile scatters."""
+        f = [self.spread[at + OFFSETS + i] for i in range(3)]
+        for i in ti.static(range(3)):
+            a = [self.affine[entry9 + 3 * i + j] for j in range(3)]
+            self.spread[at + MOMENTUM_FIELD + i] = self.mass * state[source + 3 + i] - self.dx * (
+                f[0] * a[0] + f[1] * a[1] + f[2] * a[2]
+            )
+
+    @ti.func
+    def adjoint_tile(self, state: ti.template(), source, after, bar: ti.template(), target, at):
+        """Value at the base node of what each particle of a tile adds to the velocities' adjoint."""
+        f = [self.spread[at + OFFSETS + i] for i in range(3)]
+        for i in ti.static(range(3)):
+            c_bar = [bar[target + 6 + 3 * i + j] for j in range(3)]
+            x_bar = self.open_lanes(state[source + i], state[after + 3 + i]) * bar[target + i]
+            self.spread[at + ADJOINT_FIELD + i] = (
+                bar[target + 3 + i]
+                + self.dt * x_bar
+                - (4.0 * self.inv_dx) * (f[0] * c_bar[0] + f[1] * c_bar[1] + f[2] * c_bar[2])
+            )
+
+    @ti.func
+    def open_lanes(self, x, v):
+        """1 where advection by v stays inside the domain along this axis, else 0."""
+        y = x + self.dt * v
+        return ti.select((y < 0.0) | (y > self.x_max), 0.0 * x, 0.0 * x + 1.0)
+
+    # -- particle by particle -----------------------------------------------------------------------
+
+    @ti.func
+    def weights(self, at, lane):
+        """A particle's weights (or, from their first entry, slopes) as 3-vectors by offset."""
+        return [
+            ti.Vector(
+                [
+                    self.spread[at + 3 * k][lane],
+                    self.spread[at + 3 * k + 1][lane],
+                    self.spread[at + 3 * k + 2][lane],
+                ]
+            )
+            for k in range(3)
+        ]
+
+    @ti.func
+    def own(self, entry, node):
+        """An entry, the same, that LLVM takes for a particle's own: with one for the whole tile it would keep
+        an address for each of dozens of entries, more than there are registers."""
+        return self.bounded(entry + (node >> 31))
+
+    @ti.func
+    def base_value(self, at, lane, last):
+        """Value of an affine field at a particle's base node, as a 4-vector."""
+        return ti.Vector([self.spread[at][lane], self.spread[at + 1][lane], self.spread[at + 2][lane], last])
+
+    @ti.func
+    def scatter_momentum(self, entry9, lane, grid_node, at, work_at):
+        """Add a particle's momentum and mass to its nodes.
+
+        Args:
+            entry9: Entry of the tile in ``affine``.
+            lane: Particle of the tile.
+            grid_node: Index of the base node in ``momentum``.
+            at: First entry of the thread's share of ``spread``.
+            work_at: First entry of the thread's share of ``work``.
+        """
+        a = self.load(self.affine, entry9, lane, 9)
+        q0 = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
+        q = [q0, column(a, 0, self.dx), column(a, 1, self.dx), column(a, 2, self.dx)]
+        scatter(
+            self.momentum,
+            grid_node,
+            self.axis * self.axis,
+            self.axis,
+            self.weights(at, lane),
+            q,
+            self.work,
+            work_at,
+        )
+
+    @ti.func
+    def scatter_adjoint(self, bar: ti.template(), target, lane, grid_node, at, work_at):
+        """Add what a particle contributes to the adjoint of the grid's velocities."""
+        c_bar = self.load(bar, target + 6, lane, 9)
+        scale = 4.0 * self.inv_dx
+        h0 = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
+        h = [h0, column(c_bar, 0, scale), column(c_bar, 1, scale), column(c_bar, 2, scale)]
+        scatter(
+            self.velocity_bar,
+            grid_node,
+            self.axis * self.axis,
+            self.axis,
+            self.weights(at, lane),
+            h,
+            self.work,
+            work_at,
+        )
+
+    @ti.func
+    def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, work_at):
+        """Grid to particle: v, C and x after the substep.
+
+        Args:
+            state: Particle state.
+            source: Entry of the tile before the substep.
+            target: Entry of the tile after it.
+            lane: Particle of the tile.
+            node: Index of the base node in ``velocity``.
+            e: Environment.
+            time: Substep, noted where the speed is not sane.
+            at: First entry of the thread's share of ``spread``.
+            work_at: First entry of the thread's share of ``work``.
+        """
+        gather(
+            self.velocity, node, self.axis * self.axis, self.axis, self.weights(at, lane), self.work, work_at
+        )
+        scale = 4.0 * self.inv_dx
+        f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+        x = self.vector(state, source, lane)
+        v = self.work[work_at]
+        # Everything is read before the first store, after which LLVM has to look up where arrays are again.
+        c0 = scale * (self.work[work_at + 1] - f[0] * v)
+        c1 = scale * (self.work[work_at + 2] - f[1] * v)
+        c2 = scale * (self.work[work_at + 3] - f[2] * v)
+        speed = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        for i in ti.static(range(3)):
+            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v[i], 0.0), self.x_max)
+            state[target + 3 + i][lane] = v[i]
+            state[target + 6 + 3 * i][lane] = c0[i]
+            state[target + 7 + 3 * i][lane] = c1[i]
+            state[target + 8 + 3 * i][lane] = c2[i]
+        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
+        if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
+            self.fault[e] = time + 1
+
+    @ti.func
+    def gather_particle_adjoint(
+        self,
+        state: ti.template(),
+        source,
+        after,
+        bar: ti.template(),
+        target,
+        entry9_tile,
+        lane,
+        node,
+        at_tile,
+        work_at,
+    ):
+        """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
+        at = self.own(at_tile, node)
+        entry9 = self.own(entry9_tile, node)
+        a = self.load(self.affine, entry9, lane, 9)
+        c_bar = self.load(bar, target + 6, lane, 9)
+        self.work[work_at + 7] = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
+        self.work[work_at + 11] = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
+        for j in ti.static(range(3)):
+            self.work[work_at + 8 + j] = column(a, j, self.dx)
+            self.work[work_at + 12 + j] = column(c_bar, j, 4.0 * self.inv_dx)
+        w = self.weights(at + WEIGHTS, lane)
+        dw = self.weights(at + SLOPES, lane)
+        for i in ti.static(range(3)):
+            self.work[work_at + 15][i] = w[i][0]
+            self.work[work_at + 16][i] = dw[i][0]
+            self.work[work_at + 17][i] = float(i)
+        gather_adjoint(
+            self.velocity,
+            self.momentum_bar,
+            node,
+            self.axis * self.axis,
+            self.axis,
+            w,
+            dw,
+            self.work,
+            work_at,
+        )
+        scale = 4.0 * self.inv_dx * self.inv_dx
+        v_after = self.vector(state, after + 3, lane)
+        open_axes = self.unclamped(self.vector(state, source, lane), v_after)
+        m0 = ti.Vector([self.work[work_at][0], self.work[work_at][1], self.work[work_at][2]])
+        for i in ti.static(range(3)):
+            slope = self.work[work_at + 4 + i].sum()
+            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
+            # the scatter.
+            offsets = scale * (
+                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
+            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
+            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope - offsets
+            bar[target + 3 + i][lane] = self.mass * m0[i]
+            f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+            for j in ti.static(range(3)):
+                self.affine[entry9 + 3 * i + j][lane] = self.dx * (
+                    self.work[work_at + 1 + j][i] - f[j] * m0[i]
+                )
+
+    # -- which blocks hold mass ---------------------------------------------------------------------
+
+    @ti.func
+    def mark(self, grid_index, key, stamp):
+        """Note that a chunk's particle touches the blocks around its base node, whose ``key`` it is."""
+        block = key >> 3
+        entry = grid_index * self.blocks + block
+        if self.mark_stamp[entry] != stamp:
+            self.mark_stamp[entry] = stamp
+            self.mark_code[entry] = 0
+            count = self.mark_count[grid_index]
+            self.mark_list[grid_index * self.blocks + count] = block
+            self.mark_count[grid_index] = count + 1
+        self.mark_code[entry] = self.mark_code[entry] | (1 << (key & 7))
+
+    @ti.func
+    def collect_blocks(self, e, stamp):
+        """Join the chunks' marks into the environment's list of blocks, in an order that depends on nothing
+        else."""
+        count = 0
+        for c in range(self.chunks):
+            grid_index = e * self.chunks + c
+            self.block_first[e, c] = count
+            for r in range(self.mark_count[grid_index]):
+                block = self.mark_list[grid_index * self.blocks + r]
+                code = self.mark_code[grid_index * self.blocks + block]
+                for corner in ti.static(range(8)):
+                    if code & ti.static(REACHING[corner]):
+                        entry = e * self.blocks + self.neighbour(block, corner)
+                        if self.block_stamp[entry] != stamp:
+                            self.block_stamp[entry] = stamp
+                            self.block_chunks[entry] = 0
+                            self.block_list[e * self.blocks + count] = entry - e * self.blocks
+                            count += 1
+                        self.block_chunks[entry] = self.block_chunks[entry] | (1 << c)
+            self.mark_count[grid_index] = 0
+        if ti.static(not self.skips.empty_blocks):
+            for block in range(self.blocks):
+                if self.block_stamp[e * self.blocks + block] != stamp:
+                    self.block_chunks[e * self.blocks + block] = 0
+                    self.block_list[e * self.blocks + count] = block
+                    count += 1
+        self.block_first[e, self.chunks] = count
+        self.block_count[e] = count

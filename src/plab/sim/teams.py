@@ -1,0 +1,48 @@
+"""How many of the CPU's threads work on one environment."""
+
+import time
+from collections.abc import Callable, Sequence
+
+__all__ = ["TeamChoice"]
+
+PROBE = 50
+"""Every so many launches the team that is not the best so far is tried again."""
+
+
+class TeamChoice:
+    """Chooses between teams of threads for a kernel's launches, by what they take.
+
+    Threads that meet at barriers lose much where other programs keep the cores busy: whoever waits, spins.
+    Results do not depend on the choice.
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        """Start with the first team.
+
+        Args:
+            sizes: Threads that work on one environment, in the order in which they are tried.
+        """
+        self._sizes = tuple(dict.fromkeys(sizes))
+        self._seconds: dict[int, float] = {}
+        self._launches = 0
+
+    def run(self, kernel: Callable, args: tuple) -> None:
+        """Launch a kernel with a team's size before its other arguments."""
+        self._launches += 1
+        size = self._next()
+        start = time.perf_counter()
+        kernel(size, *args)
+        seconds = time.perf_counter() - start
+        # The first launch compiles.
+        if self._launches > 1:
+            old = self._seconds.get(size, seconds)
+            self._seconds[size] = 0.7 * old + 0.3 * seconds
+
+    def _next(self) -> int:
+        untried = [size for size in self._sizes if size not in self._seconds]
+        if untried:
+            return untried[0]
+        best = min(self._sizes, key=self._seconds.__getitem__)
+        if self._launches % PROBE == 0:
+            return next((size for size in self._sizes if size != best), best)
+        return best

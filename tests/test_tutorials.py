@@ -1,0 +1,157 @@
+"""What the tutorials show is what happens: their code is run, their excerpts and changes are the source's."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from plab.results import load
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+SRC = ROOT / "src"
+METHOD = ROOT / "examples" / "own_method"
+COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+
+# Run in a copy of plab that has the disc: the gradient must be what differences are.
+DISC = """
+import numpy as np
+from plab.render.shapes import manipulator_parts
+from plab.scene import Body, Manipulator, Scene
+from plab.sim import Simulator
+
+tool = Manipulator("Disc", (0.06, 0.03), (0.5, 0.235, 0.5), scale=(0.02,) * 3)
+body = Body("box", (0.5, 0.1, 0.5), (0.2, 0.2, 0.2), 200)
+scene = Scene("disc", (body,), (tool,), grid_size=16, substeps=5, dt=4e-4, horizon=4)
+simulator = Simulator([scene], precision="float64")
+simulator.set_target(np.zeros((1, 16, 16, 16)), np.zeros((1, 16, 16, 16)))
+actions = np.random.default_rng(0).uniform(-0.5, 0.5, (1, 4, 3)) - [0.0, 0.4, 0.0]
+direction = np.random.default_rng(1).normal(size=actions.shape)
+
+
+def loss(shift):
+    terms = simulator.rollout(actions + shift * direction, gradient=False).step_terms[0]
+    return terms.sum(axis=0) @ [10, 10, 1]
+
+
+slope = (simulator.rollout(actions).gradient * direction).sum()
+difference = (loss(1e-5) - loss(-1e-5)) / 2e-5
+assert abs(slope - difference) < 1e-5 * abs(difference), (slope, difference)
+(part,) = manipulator_parts(tool)
+assert np.abs(part.vertices[:, 1]).max() < 0.0301 and 0.089 < np.abs(part.vertices[:, 0]).max() < 0.0901
+print("as it should be")
+"""
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def run_page(page: str) -> dict[str, Any]:
+    names: dict[str, Any] = {}
+    exec("\n".join(blocks(page, "python")), names)
+    return names
+
+
+# -------------------------------------------------------------------------------------------- run as they are
+
+
+@pytest.mark.physics
+def test_quick_start():
+    assert run_page("index.md")["result"].gradient.shape == (4, 10, 6)
+
+
+@pytest.mark.physics
+def test_a_differentiable_policy_improves():
+    losses = run_page("policy.md")["losses"]
+    assert losses[-1] < losses[0] - 0.5
+
+
+@pytest.mark.slow
+def test_the_yield_stress_is_found_again():
+    names = run_page("identification.md")
+    assert abs(names["found"] - names["TRUTH"]) < 0.02 * names["TRUTH"]
+
+
+# -------------------------------------------------------------------------------------------- own method
+
+
+@pytest.mark.parametrize("excerpt", [*blocks("own_method.md", "python"), *blocks("own_method.md", "yaml")])
+def test_excerpts_are_from_the_method(excerpt):
+    files = (METHOD / "random_search.py", METHOD / "conf" / "method" / "random_search.yaml")
+    assert any(excerpt in file.read_text(encoding="utf-8") for file in files)
+
+
+@pytest.mark.physics
+def test_a_method_of_ones_own(tmp_path):
+    def search(*words: str) -> subprocess.CompletedProcess[str]:
+        script = [sys.executable, str(METHOD / "random_search.py"), "--config-dir", str(METHOD / "conf")]
+        command = [*script, "method=random_search", *COARSE, "method.iterations=4", *words]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    first = search()
+    assert (first.returncode, first.stderr) == (0, "")
+    table = load(tmp_path / "results")
+    assert table[["method", "status", "iterations"]].values.tolist() == [["random_search", "finished", 4]]
+    check = [sys.executable, "-m", "plab.results", "check", "results"]
+    assert subprocess.run(check, cwd=tmp_path, check=False, capture_output=True).returncode == 0
+    refused = search("method.spread=0")
+    assert refused.returncode == 2 and refused.stderr == "plab: method.spread must be positive, not 0\n"
+
+
+# -------------------------------------------------------------------------------------------- own manipulator
+
+
+def apply(page: str, root: Path) -> None:
+    """Make the changes of a page's diffs to a source tree."""
+    for block in blocks(page, "diff"):
+        name, *lines = block.removeprefix("--- ").splitlines()
+        old = "".join(f"{line[1:]}\n" for line in lines if line[0] in " -")
+        new = "".join(f"{line[1:]}\n" for line in lines if line[0] in " +")
+        path = root / name
+        text = path.read_text(encoding="utf-8")
+        assert text.count(old) == 1, f"{name} has not, or not just once:\n{old}"
+        path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def copy_with_the_disc(folder: Path) -> Path:
+    shutil.copytree(SRC, folder / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "conf", folder / "conf")
+    apply("own_manipulator.md", folder)
+    return folder / "src"
+
+
+def test_the_changes_for_a_manipulator_fit_the_source(tmp_path):
+    source = copy_with_the_disc(tmp_path)
+    code = "from plab.scene import MANIPULATOR_SHAPES; print(MANIPULATOR_SHAPES['Disc'].size_names)"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(source)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "('radius', 'r')\n"
+
+
+@pytest.mark.slow
+def test_a_manipulator_of_ones_own(tmp_path):
+    source = copy_with_the_disc(tmp_path)
+    script = tmp_path / "disc.py"
+    script.write_text(DISC, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        env=os.environ | {"PYTHONPATH": str(source)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("as it should be\n")

@@ -1,0 +1,161 @@
+"""Pages of the documentation that are made when it is built; run by mkdocs-gen-files.
+
+The reference of the configuration comes from the dataclasses and the YAML files, the reference of Python from
+docstrings, two pages from files of the repository's root.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import griffe
+import mkdocs_gen_files
+import yaml
+
+from plab import config_types
+from plab.suite import conf_folder
+from plab.targets import RECIPES
+
+ROOT = Path(__file__).parents[1]
+
+PYTHON = {
+    "python": (
+        "Python",
+        "Configurations, problems, scores, and PyTorch.",
+        ("plab.config", "plab.problem", "plab.objective", "plab.torch", "plab.scene", "plab.targets"),
+    ),
+    "simulator": ("Simulator", "Usable alone.", ("plab.sim.simulator", "plab.sim.state", "plab.sim.skips")),
+    "environments": (
+        "Environments",
+        "",
+        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs"),
+    ),
+    "results": (
+        "Results",
+        "",
+        ("plab.results.loading", "plab.results.files", "plab.results.schema", "plab.demonstrations"),
+    ),
+}
+"""Pages of the reference: title, first line, modules."""
+
+SECTIONS = (
+    ("A run", "", config_types.Config, "config.yaml"),
+    ("sim", "sim.", config_types.SimConfig, "sim/fast.yaml"),
+    ("targets", "targets.", config_types.TargetsConfig, "config.yaml:targets"),
+    ("method, all", "method.", config_types.MethodConfig, "method/adam.yaml"),
+    ("method=adam, gd, adam_h", "method.", config_types.TrajectoryConfig, "method/adam.yaml"),
+    ("method=apg", "method.", config_types.ApgConfig, "method/apg.yaml"),
+    ("method=sac, td3, ppo", "method.", config_types.RlConfig, "method/sac.yaml"),
+    ("method=sac, td3", "method.", config_types.OffPolicyConfig, "method/sac.yaml"),
+    ("method=td3", "method.", config_types.Td3Config, "method/td3.yaml"),
+    ("method=ppo", "method.", config_types.PpoConfig, "method/ppo.yaml"),
+    ("task", "task.", config_types.TaskConfig, "task/Rope.yaml"),
+    ("task.bodies.NAME", "task.bodies.NAME.", config_types.BodyConfig, None),
+    ("task.manipulators.NAME", "task.manipulators.NAME.", config_types.ManipulatorConfig, None),
+    ("task.random", "task.random.", config_types.RandomConfig, None),
+    ("task.random.ranges.NAME", "task.random.ranges.NAME.", config_types.DrawConfig, None),
+)
+"""Heading, prefix of the keys, type, and file with the defaults, of each table."""
+
+_SHOWN = (bool, int, float, str)
+
+
+def main() -> None:
+    """Write all pages."""
+    _write("reference/configuration.md", "\n".join(_configuration()))
+    for name, (title, line, modules) in PYTHON.items():
+        parts = [
+            f"# {title}",
+            line,
+            *(f"## {module}\n\n::: {module}\n    options: {{heading_level: 3}}" for module in modules),
+        ]
+        _write(f"reference/{name}.md", "\n\n".join(parts) + "\n")
+    for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
+        text = (ROOT / name).read_text(encoding="utf-8")
+        _write(name.lower(), re.sub(r"\]\(docs/", "](", text))
+
+
+def _write(path: str, text: str) -> None:
+    with mkdocs_gen_files.open(path, "w") as file:
+        file.write(text)
+
+
+def _configuration() -> Iterator[str]:
+    yield "# Configuration\n"
+    yield (
+        "Every key, from the dataclasses that check them. Defaults are those of `conf/`, of a task those of "
+        "Rope. "
+        "`python -m plab.run --help` prints the same with the comments of the files.\n"
+    )
+    for title, prefix, kind, source in SECTIONS:
+        yield f"## {title}\n"
+        yield _summary(kind) + "\n"
+        yield from _table(kind, prefix, _defaults(source))
+    yield "## task.target\n"
+    yield "`recipe` names one of these; its further keys are the recipe's.\n"
+    for name, kind in RECIPES.items():
+        yield f"### recipe: {name}\n"
+        yield _summary(kind) + "\n"
+        yield from _table(kind, "task.target.", {})
+
+
+def _table(kind: type, prefix: str, defaults: dict[str, Any]) -> Iterator[str]:
+    """Yield a table of the keys that a type adds to its bases that have tables of their own."""
+    described = _described(kind)
+    known = {field.name for base in kind.__bases__ if _has_table(base) for field in dataclasses.fields(base)}
+    yield "| key | type | default | meaning |"
+    yield "|---|---|---|---|"
+    for field in dataclasses.fields(kind):
+        if field.name not in known:
+            value = defaults.get(field.name)
+            plain = isinstance(value, _SHOWN) and "${" not in str(value)
+            default = f"`{str(value).lower() if isinstance(value, bool) else value}`" if plain else ""
+            if isinstance(value, list) and all(isinstance(entry, _SHOWN) for entry in value):
+                default = f"`{value}`"
+            shown = str(field.type).replace("|", "\\|")
+            yield f"| `{prefix}{field.name}` | `{shown}` | {default} | {described.get(field.name, '')} |"
+    yield ""
+
+
+def _has_table(kind: type) -> bool:
+    return any(kind is other for _, _, other, _ in SECTIONS)
+
+
+def _defaults(source: str | None) -> dict[str, Any]:
+    """Return the values of a file in ``conf/``, or of one of its sections (``file:section``)."""
+    if source is None:
+        return {}
+    name, _, section = source.partition(":")
+    content = yaml.safe_load((conf_folder() / name).read_text(encoding="utf-8"))
+    return content[section] if section else content
+
+
+def _described(kind: type) -> dict[str, str]:
+    """Return what the docstrings of a type and of its bases say about their attributes."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        for section in _sections(base):
+            if section.kind is griffe.DocstringSectionKind.attributes:
+                found |= {item.name: " ".join(item.description.split()) for item in section.value}
+    return found
+
+
+def _summary(kind: type) -> str:
+    return next(
+        section.value for section in _sections(kind) if section.kind is griffe.DocstringSectionKind.text
+    )
+
+
+def _sections(kind: type) -> list[griffe.DocstringSection]:
+    if not kind.__doc__ or kind.__module__ == "builtins":
+        return []
+    text = re.sub(r":\w+:`~?(?:[\w.]+\.)?([^`]+)`", r"`\1`", kind.__doc__)
+    text = text.replace("``", "`")
+    return griffe.Docstring(text, lineno=1).parse("google", warnings=False)
+
+
+main()
