@@ -205,6 +205,7 @@ def test_configuration_without_pictures_shows_curves_and_runs(browser, page: Pat
 
 @browsing
 @drawing
+@pytest.mark.physics
 def test_a_click_opens_a_configuration_and_its_pictures_load(browser, results: Path, tmp_path: Path) -> None:
     page = write(results, tmp_path / "page")
     browser.get(page.as_uri())
@@ -228,6 +229,7 @@ def test_a_click_opens_a_configuration_and_its_pictures_load(browser, results: P
 
 
 @drawing
+@pytest.mark.physics
 def test_pictures_are_drawn_once(results: Path, tmp_path: Path) -> None:
     out = write(results, tmp_path, "variant=2").parent
     (shown,) = best_runs(collect(results, select(["task=Rope", "variant=2"], NAMES)))
@@ -240,6 +242,7 @@ def test_pictures_are_drawn_once(results: Path, tmp_path: Path) -> None:
 
 
 @drawing
+@pytest.mark.physics
 def test_pictures_of_runs_that_are_no_longer_the_best_are_replaced(tmp_path: Path) -> None:
     coarse_run(tmp_path / "results", "1", "adam", 0, 0.3)
     out = write(tmp_path / "results", tmp_path / "page").parent
