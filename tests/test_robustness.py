@@ -401,7 +401,7 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
 # ------------------------------------------------------------------------------------------------ properties
 
 FEW = settings(
-    max_examples=60,
+    max_examples=25,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -88,7 +88,7 @@ def _configuration() -> Iterator[str]:
     yield "# Configuration\n"
     yield (
         "Every key, from the dataclasses that check them. Defaults are those of `conf/`, of a task those of "
-        "Rope. "
+        "Rope, of what a profile sets those of `release`. "
         "`python -m plab.run --help` prints the same with the comments of the files.\n"
     )
     for title, prefix, kind, source in SECTIONS:
@@ -112,11 +112,13 @@ def _table(kind: type, prefix: str, defaults: dict[str, Any]) -> Iterator[str]:
     for field in dataclasses.fields(kind):
         if field.name not in known:
             value = defaults.get(field.name)
+            if "${" in str(value) and "profiles" in defaults:
+                value = defaults["profiles"][defaults["profile"]].get(field.name)
             plain = isinstance(value, _SHOWN) and "${" not in str(value)
             default = f"`{str(value).lower() if isinstance(value, bool) else value}`" if plain else ""
             if isinstance(value, list) and all(isinstance(entry, _SHOWN) for entry in value):
                 default = f"`{value}`"
-            shown = str(field.type).replace("|", "\\|")
+            shown = str(field.type).replace(" | ", " or ")
             yield f"| `{prefix}{field.name}` | `{shown}` | {default} | {described.get(field.name, '')} |"
     yield ""
 

@@ -110,9 +110,9 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Refuse a folder that is missing, that has a file that is no text, or one with a name of plab's own.
+    """Refuse a folder that is missing, or that has a file that is no text, or one with a name of plab's own.
 
-    The last Hydra would ignore.
+    Hydra would ignore the latter.
 
     Args:
         config_dir: Folder with files of the user's own, in subfolders named like the groups.
