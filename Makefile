@@ -31,7 +31,7 @@ REPORTS ?= reports
 BIN := $(VENV)/bin
 
 # A file of tests per process and core at a time: kernels are compiled once per process.
-PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup
 
 .PHONY: run dev test test-unit test-slow lint typecheck coverage docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html
