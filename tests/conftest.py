@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterator
 
 import pytest
 
@@ -22,6 +24,19 @@ def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mon
     """Keep indices of the tests' results out of the user's cache folder."""
     folder = tmp_path_factory.getbasetemp() / "cache"
     monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
+
+
+@pytest.fixture(autouse=True)
+def _own_logging() -> Iterator[None]:
+    """Undo what Hydra configures for the whole process."""
+    root = logging.getLogger()
+    level, disabled = root.level, logging.root.manager.disable
+    yield
+    root.setLevel(level)
+    logging.disable(disabled)
+    for logger in logging.root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger):
+            logger.disabled = False
 
 
 @pytest.fixture

@@ -138,6 +138,7 @@ def usual(device: str) -> Simulator:
     return simulator(device=device)
 
 
+@pytest.mark.slow
 def test_skips_change_nothing(usual: Simulator, device: str) -> None:
     """In a scene that has something to skip for each of them."""
     nothing = Skips(**{field.name: False for field in fields(Skips)})
@@ -163,6 +164,7 @@ def resident_mb() -> float:
     return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) * 1024 / 1e6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads the resident memory from /proc")
 def test_memory_is_what_it_is_said_to_be() -> None:
     """A gradient needs no more than its budget, and what it allocates is what appears in the process: on the
