@@ -15,7 +15,6 @@ __all__ = ["PosePhases"]
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
 vec7 = ti.types.vector(7, ti.f64)
-vec8 = ti.types.vector(8, ti.f64)
 mat3 = ti.types.matrix(3, 3, ti.f64)
 
 
