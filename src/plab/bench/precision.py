@@ -24,7 +24,7 @@ from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own
 from plab.bench.table import report
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
-from plab.objective import scores, spread_mass, target_sdf
+from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
 from plab.scene import Scene, sample_particles
 from plab.sim import Simulator
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
@@ -55,6 +55,7 @@ class Start:
         task: Task.
         variant: Variant.
         scene: The common scene.
+        particles: Number of particles that the task has.
         components: Where the task's own action components are.
         actions: Demonstration and random actions, each [T, A'].
     """
@@ -62,6 +63,7 @@ class Start:
     task: str
     variant: str
     scene: Scene
+    particles: int
     components: list[int]
     actions: dict[str, np.ndarray]
 
@@ -99,7 +101,7 @@ def starts(tasks: Sequence[str], variants: Sequence[str], particles: int) -> lis
             drawn = rng.uniform(-1.0, 1.0, size=(EPISODE_STEPS, scene.action_dim))
             actions = {"demonstration": common_actions(scene, shown), "random": common_actions(scene, drawn)}
             common = common_scene(scene, particles)
-            out.append(Start(task, variant, common, own_components(scene), actions))
+            out.append(Start(task, variant, common, scene.particle_count, own_components(scene), actions))
     return out
 
 
@@ -124,7 +126,9 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
             hard = simulator.rollout(actions[None], gradient=False, strict=False)
             final[kind] = simulator.state().x[0], list(hard.failures.values())
         target = targets[number] if targets else spread(start.scene, final["demonstration"][0])
-        simulator.set_target(target[None], target_sdf(target)[None])
+        # As much less as there are fewer particles than the task has.
+        threshold = TARGET_MASS * start.scene.particle_count / start.particles
+        simulator.set_target(target[None], target_sdf(target, threshold)[None])
         outcomes = {}
         for kind, actions in start.actions.items():
             simulator.set_contact("soft")
