@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from plab.bench.common_scene import PLACES, common_actions, common_scene, own_components
-from plab.bench.stability import QUICK, main, run_cases, run_refusals
+from plab.bench.stability import QUICK, main, run_cases, run_refusals, write_norms
 from plab.bench.stress_cases import Plan, bang_bang_actions, refusals, stress_cases
 from plab.config import build_scene, load_config
 from plab.scene import SceneError
@@ -65,11 +68,18 @@ def test_the_quick_plan_has_every_family_and_every_task() -> None:
     assert len({(c.family, c.name) for c in cases}) == len(cases)
 
 
-def test_few_particles_survive() -> None:
+def test_few_particles_survive(tmp_path: Path) -> None:
     cases = [c for c in stress_cases(Plan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
     rows = list(run_cases(cases, "float32"))
     assert len(rows) == 4
     assert {row["outcome"] for row in rows} == {"survived"}
+    write_norms(rows, tmp_path / "norms.csv")
+    table = pd.read_csv(tmp_path / "norms.csv").set_index(["case", "back"])["norm"]
+    assert len(table) == 4 * 3 and np.isfinite(table).all()
+    for row in rows:
+        # The last step is none back.
+        assert table[row["case"], 0] == pytest.approx(row["norms"][2], rel=1e-5)
+    assert (tmp_path / "norms.png").stat().st_size > 1000
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-__all__ = ["draw"]
+__all__ = ["draw", "draw_norms"]
 
 PANELS = {
     "positions": "final positions, RMS",
@@ -96,3 +96,32 @@ def _panel(place: Axes, rows: pd.DataFrame, name: str, axis: str) -> None:
             )
     place.tick_params(labelsize=7)
     place.grid(True, which="major", alpha=0.3)
+
+
+def draw_norms(table: pd.DataFrame, path: Path) -> Path:
+    """Draw the norm of gradients with respect to each step's actions, against steps back from the end.
+
+    Args:
+        table: Columns ``precision``, ``case``, ``back`` and ``norm``.
+        path: PNG to write.
+
+    Returns:
+        The path.
+    """
+    figure, place = plt.subplots(figsize=(7.0, 3.6), layout="constrained")
+    styles = {"float32": "-", "float64": ":"}
+    colours: dict[str, str] = {}
+    for (precision, case), rows in table.groupby(["precision", "case"], sort=False):
+        colour = colours.setdefault(case, f"C{len(colours) % 10}")
+        # Steps that nothing depends on have no place on a log scale.
+        norms = rows["norm"].where(rows["norm"] > 0)
+        place.plot(
+            rows["back"], norms, styles[precision], color=colour, linewidth=1, label=f"{case}, {precision}"
+        )
+    place.set_yscale("log")
+    place.set_xlabel("environment steps back from the end")
+    place.set_ylabel("norm of the gradient with respect to a step's actions")
+    place.legend(fontsize=7, ncols=2)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path

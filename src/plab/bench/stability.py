@@ -3,11 +3,13 @@
     python -m plab.bench.stability                      # everything, in both precisions
     python -m plab.bench.stability --quick              # a few minutes on two cores
     python -m plab.bench.stability --precision float32 --particles 1000 --csv cases.csv
+    python -m plab.bench.stability --quick --family "1000 steps" --gradients norms.csv
 
 Every case is simulated forwards and backwards. It has survived if state, loss terms and gradient are finite,
 no particle ever moved by more than a cell in a substep, all particles are inside the domain, and the mass
 tensor holds all mass. What cannot be simulated must be refused with the reason; those cases come last. The
-exit code is 1 if any case failed.
+exit code is 1 if any case failed. With ``--gradients`` the norm of the gradient is written for each step back
+in time, and drawn into a PNG of the same name.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -30,7 +32,7 @@ from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
 from plab.suite import suite_tasks
 
-__all__ = ["main", "run_cases", "run_refusals"]
+__all__ = ["main", "run_cases", "run_refusals", "write_norms"]
 
 BATCH = 12
 """Environments simulated together."""
@@ -53,7 +55,8 @@ def run_cases(cases: Sequence[Case], precision: str) -> Iterator[dict[str, objec
 
     Yields:
         A row of :data:`COLUMNS` per case: outcome (``survived`` or why not), fastest particle [cells per
-        substep], largest gradient component, and the environment step of that component.
+        substep], largest gradient component, and the environment step of that component; beyond the columns
+        ``norms``, those of the gradient with respect to each step's actions, shape [T].
     """
     for group in _groups(cases).values():
         simulator = Simulator([group[0].scene] * min(BATCH, len(group)), precision=precision, skips=ANY_SCENE)
@@ -121,7 +124,8 @@ def _run_together(simulator: Simulator, cases: Sequence[Case]) -> list[dict[str,
     speeds = iter(_speeds(simulator, alive) if alive else [])
     rows = []
     for e, case in enumerate(cases):
-        sizes = np.abs(cast(np.ndarray, rollout.gradient)[e]).max(axis=1, initial=0.0)
+        gradient = cast(np.ndarray, rollout.gradient)[e]
+        sizes = np.abs(gradient).max(axis=1, initial=0.0)
         speed, outcome = math.nan, outcomes[e]
         if outcome == "survived":
             speed = next(speeds) * case.scene.dt / case.scene.dx
@@ -135,6 +139,7 @@ def _run_together(simulator: Simulator, cases: Sequence[Case]) -> list[dict[str,
                 "speed": f"{speed:.3f}",
                 "gradient": f"{sizes.max():.3g}",
                 "where": int(sizes.argmax()) + 1,
+                "norms": np.linalg.norm(gradient, axis=1),
             }
         )
     return rows
@@ -192,6 +197,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--horizon", type=int, help="environment steps of the long horizon (1000)")
     parser.add_argument("--family", nargs="+", help="only these families of cases")
     parser.add_argument("--csv", type=Path, help="file to write a row per case to")
+    parser.add_argument("--gradients", type=Path, help="file for the gradient's norm per step back in time")
     options = parser.parse_args(argv)
     plan = QUICK if options.quick else FULL
     plan = replace(plan, particles=options.particles or plan.particles)
@@ -199,7 +205,35 @@ def main(argv: Sequence[str] | None = None) -> int:
     cases = [c for c in stress_cases(plan) if not options.family or c.family in options.family]
     rows = (row for precision in options.precision for row in run_cases(cases, precision))
     table = list(report(COLUMNS, _chain(rows, options), options.csv))
+    if options.gradients is not None:
+        write_norms(table, options.gradients)
     return _summarise(pd.DataFrame(table))
+
+
+def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
+    """Write, and draw, the norm of the gradient for each step back in time.
+
+    Args:
+        rows: What :func:`run_cases` yields; others are left out.
+        path: CSV file; the drawing is a PNG of the same name.
+    """
+    parts = [
+        pd.DataFrame(
+            {name: row[name] for name in ("precision", "family", "case")}
+            | {"back": np.arange(len(norms)), "norm": norms[::-1]}
+        )
+        for row in rows
+        if (norms := cast("np.ndarray | None", row.get("norms"))) is not None
+    ]
+    if not parts:
+        print("no case has a gradient", file=sys.stderr)
+        return
+    table = pd.concat(parts, ignore_index=True)
+    table.to_csv(path, index=False, float_format="%.6g")
+    # Imported late: the numbers are there even where Matplotlib is not.
+    from plab.bench.diagrams import draw_norms
+
+    print(draw_norms(table, path.with_suffix(".png")))
 
 
 def _chain(rows: Iterator[dict[str, object]], options: argparse.Namespace) -> Iterator[dict[str, object]]:
