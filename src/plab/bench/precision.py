@@ -202,10 +202,14 @@ def markdown(table: pd.DataFrame, particles: int) -> str:
     for (task, kind), rows in numbers.groupby(["task", "actions"], sort=False):
         score, turn = rows["difference"].abs(), rows["angle_deg"]
         lines.append(
-            f"| {task} | {kind} | {score.max():.1e} | {score.median():.1e} | {turn.max():.2g}° "
-            f"| {turn.median():.2g}° |"
+            f"| {task} | {kind} | {score.max():.1e} | {score.median():.1e} | {_degrees(turn.max())} "
+            f"| {_degrees(turn.median())} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _degrees(value: float) -> str:
+    return "no gradient" if np.isnan(value) else f"{value:.2g}°"
 
 
 if __name__ == "__main__":
