@@ -209,6 +209,8 @@ def _gradients(configurations: Sequence[Start], choice: Choice) -> Mapping[str, 
 def _row(start: Start, kind: str, ours: np.ndarray, theirs: np.ndarray) -> dict[str, object]:
     """Compare final positions, or gradients."""
     row: dict[str, object] = {"actions": kind, **dict.fromkeys(COLUMNS[3:], "")}
+    if kind != "demonstration" and not np.any(ours):
+        return row | {"norm_ratio": "no gradient"}
     if kind != "demonstration":
         ratio = np.linalg.norm(theirs) / np.linalg.norm(ours)
         return row | {"norm_ratio": f"{ratio:.4f}", "angle_deg": f"{angle(theirs, ours):.3g}"}
