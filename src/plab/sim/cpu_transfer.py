@@ -136,36 +136,33 @@ class TransferTiles(ParticlePhases):
             work_at: First entry of the thread's share of ``work``.
         """
         a = self.load(self.affine, entry9, lane, 9)
-        q0 = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        q = [q0, column(a, 0, self.dx), column(a, 1, self.dx), column(a, 2, self.dx)]
-        scatter(
-            self.momentum,
-            grid_node,
-            self.axis * self.axis,
-            self.axis,
-            self.weights(at, lane),
-            q,
-            self.work,
-            work_at,
-        )
+        value = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
+        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, work_at)
 
     @ti.func
     def scatter_adjoint(self, bar: ti.template(), target, lane, grid_node, at, work_at):
-        """Add what a particle contributes to the adjoint of the grid's velocities."""
+        """Add what a particle contributes to the adjoint of the grid's velocities.
+
+        Args:
+            bar: Adjoint of the particle state after the substep.
+            target: Entry of the tile in it.
+            lane: Particle of the tile.
+            grid_node: Index of the base node in ``velocity_bar``.
+            at: First entry of the thread's share of ``spread``.
+            work_at: First entry of the thread's share of ``work``.
+        """
         c_bar = self.load(bar, target + 6, lane, 9)
-        scale = 4.0 * self.inv_dx
-        h0 = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
-        h = [h0, column(c_bar, 0, scale), column(c_bar, 1, scale), column(c_bar, 2, scale)]
-        scatter(
-            self.velocity_bar,
-            grid_node,
-            self.axis * self.axis,
-            self.axis,
-            self.weights(at, lane),
-            h,
-            self.work,
-            work_at,
-        )
+        value = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
+        self.scatter_field(self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, work_at)
+
+    @ti.func
+    def scatter_field(
+        self, grid: ti.template(), grid_node, value, a: ti.template(), scale, lane, at, work_at
+    ):
+        """Scatter the affine field with this value at the base node and increments scale times A's columns."""
+        q = [value, column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
+        w = self.weights(at + WEIGHTS, lane)
+        scatter(grid, grid_node, self.axis * self.axis, self.axis, w, q, self.work, work_at)
 
     @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, work_at):
@@ -268,7 +265,13 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def mark(self, grid_index, key, stamp):
-        """Note that a chunk's particle touches the blocks around its base node, whose ``key`` it is."""
+        """Note that a chunk's particle touches the blocks around its base node.
+
+        Args:
+            grid_index: Chunk among those of all environments.
+            key: Eight times the base node's block, and which axes the stencil crosses into the next (3 bits).
+            stamp: The substep's stamp.
+        """
         block = key >> 3
         entry = grid_index * self.blocks + block
         if self.mark_stamp[entry] != stamp:

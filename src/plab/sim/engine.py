@@ -93,7 +93,11 @@ class CpuEngine(Phases):
     def first_entry(self, e, c):
         """First entry of a chunk's share of the environment's block list: the blocks that no earlier chunk
         holds."""
-        return e * self.blocks + self.block_first[e, c]
+        first = self.block_first[e, c]
+        if ti.static(not self.skips.empty_blocks):
+            # Blocks that nobody holds are shared evenly.
+            first = c * self.block_count[e] // self.chunks
+        return e * self.blocks + first
 
     # -- phases of one chunk ------------------------------------------------------------------------
 
@@ -251,18 +255,17 @@ class CpuEngine(Phases):
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
         """Spread mass, and find the particle nearest to each manipulator."""
         grid_index = e * self.chunks + c
-        places_at = self.bounded(grid_index * PLACES)
         search = self.weighs(2)
         for m in ti.static(range(self.manipulators)):
             self.contact_part[e, c, m] = ti.select(search, 1e9, 0.0)
             self.contact_particle[e, c, m] = 0
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
-            self.stencil_tile(state, source, self.bounded(grid_index * SPREAD), places_at, False)
             for lane in range(self.lanes_of(tile)):
-                self.mark(grid_index, self.places[places_at + KEY][lane], stamp)
                 x = self.vector(state, source, lane)
                 base, fx = self.stencil(x)
+                block, crossing = self.block_of(base)
+                self.mark(grid_index, block * 8 + crossing, stamp)
                 self.scatter_mass(grid_index, base, fx)
                 if search:
                     self.find_nearest(e, c, tile * self.lanes + lane, x)
