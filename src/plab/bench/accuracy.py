@@ -3,13 +3,14 @@
     python -m plab.bench.accuracy --output accuracy           # a folder: CSV, and PNG and PDF per task
     python -m plab.bench.accuracy --quick --output accuracy   # minutes on two cores
     python -m plab.bench.accuracy --task Move,Rope --particles 3000
+    python -m plab.bench.accuracy --device cuda --output accuracy_cuda
 
 Settings differ in the number of substeps, from below the stability limit upwards, in precision, in how the
 material is computed (series or singular values), in contact model, and in the grid, with as many particles
 per cell. Each is compared with a reference of its contact model in float64 with many more substeps (for the
 grids: on the finest of them): root mean square of the final positions' distances [domain units], L1 distance
 of the mass tensors relative to the mass, score, and the gradient's relative norm and angle. Run times are
-those of an environment step with gradient, one environment on the CPU.
+those of an environment step with gradient, of one environment.
 
 The actions are 0.7 times a demonstration's, and the target is what the demonstration itself ends with in the
 hard contact model, so that scores are those of an attempt that half succeeds. The loss has no contact term,
@@ -36,7 +37,7 @@ from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, Simulator
+from plab.sim import CONTACT_MODELS, DEVICES, DeviceError, Simulator
 from plab.suite import task_list
 
 __all__ = ["Setting", "lattice", "main"]
@@ -119,6 +120,7 @@ class Plan:
     steps: int = 50
     particles: int = 10000
     repeats: int = 2
+    device: str = "cpu"
 
     def settings(self) -> list[Setting]:
         """All settings but the references."""
@@ -242,7 +244,7 @@ def _volume(body: Body) -> float:
     return float(np.prod(body.size)) if body.shape == "box" else 4.0 / 3.0 * np.pi * body.size[0] ** 3
 
 
-def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int) -> Iterator[tuple]:
+def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int, device: str) -> Iterator[tuple]:
     """Run all tasks and contact models in one setting.
 
     Args:
@@ -250,6 +252,7 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int) -> Ite
         attempts: The tasks. Where one has no target for the setting's axis yet, its demonstration is run
             first, and what that ends with becomes the target.
         repeats: Rollouts after the first, which compiles; the fastest of them is timed.
+        device: ``cpu`` or ``cuda``.
 
     Yields:
         Task, contact model and :class:`Result`.
@@ -261,7 +264,9 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int) -> Ite
         if simulator is None or simulator.particle_count != scene.particle_count:
             # Taichi's memory goes with the old simulator, before there is a new one.
             simulator = None
-            simulator = Simulator([scene], precision=setting.precision, particles=[x], skips=skips)
+            simulator = Simulator(
+                [scene], precision=setting.precision, device=device, particles=[x], skips=skips
+            )
         simulator.set_scenes([scene], particles=[x])
         simulator.set_loss_weights(10.0, 10.0, 0.0)
         if setting.axis not in attempt.targets:
@@ -326,11 +331,11 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
     attempts = [Attempt(task, plan) for task in tasks]
     exact: dict[tuple[str, str, str], Result] = {}
     for axis, setting in plan.references().items():
-        for attempt, contact, result in simulate(setting, attempts, 0):
+        for attempt, contact, result in simulate(setting, attempts, 0, plan.device):
             exact[axis, attempt.task, contact] = result
     grids = {"substeps": plan.grid, "grid": plan.grids[0]}
     for setting in plan.settings():
-        for attempt, contact, result in simulate(setting, attempts, plan.repeats):
+        for attempt, contact, result in simulate(setting, attempts, plan.repeats, plan.device):
             errors = judge(
                 setting, attempt, result, exact[setting.axis, attempt.task, contact], grids[setting.axis]
             )
@@ -355,14 +360,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
     parser.add_argument("--task", type=task_list, default=list(TASKS), help="tasks, with commas between")
     parser.add_argument("--particles", type=int, help="particles per environment (10000; 1000 with --quick)")
+    parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
     parser.add_argument("--output", type=Path, default=Path("accuracy"), help="folder of what is written")
     options = parser.parse_args(argv)
     if unknown := set(options.task) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
     plan = QUICK if options.quick else Plan()
-    plan = replace(plan, particles=options.particles or plan.particles)
+    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
     options.output.mkdir(parents=True, exist_ok=True)
-    table = report(COLUMNS, rows(options.task, plan), options.output / "accuracy.csv")
+    try:
+        table = report(COLUMNS, rows(options.task, plan), options.output / "accuracy.csv")
+    except DeviceError as error:
+        parser.error(str(error))
     # Imported late: the numbers are there even where Matplotlib is not.
     from plab.bench.diagrams import draw
 

@@ -26,7 +26,7 @@ from plab.bench.table import report
 from plab.config import Config, PpoConfig, load_config
 from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
-from plab.runners.common import torch_threads
+from plab.runners.common import torch_settings
 from plab.runners.rl_trainer import Trainer
 
 __all__ = ["main", "measure"]
@@ -46,7 +46,7 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
     """
     seconds: dict[str, float] = defaultdict(float)
     method, steps = cfg.method_as(RlConfig), batches * cfg.sim.horizon
-    with tempfile.TemporaryDirectory() as folder, torch_threads(method.torch_threads):
+    with tempfile.TemporaryDirectory() as folder, torch_settings(method.torch_threads):
         batch = EpisodeBatch([cfg] * method.num_envs, contact=method.contact)
         trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
         trainer.set_logger(Logger(folder=None, output_formats=[]))

@@ -21,7 +21,7 @@ import torch
 from plab.config_types import ApgConfig
 from plab.progress import show_progress
 from plab.results import RunFile
-from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_threads
+from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_settings
 from plab.runners.jobs import Job, title
 from plab.torch import rollout
 
@@ -45,7 +45,7 @@ def run_apg(jobs: Sequence[Job], note: str = "") -> None:
     """
     (job,) = jobs
     cfg, run, method = job.cfg, job.run, job.cfg.method_as(ApgConfig)
-    with torch_threads(method.torch_threads), simulation_errors():
+    with torch_settings(method.torch_threads), simulation_errors():
         with run.phase("build"):
             (episode,) = kept_batches(cfg, (1, method.contact))
             sizes = episode.observation_space.shape[0], episode.action_space.shape[0]

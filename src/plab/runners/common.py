@@ -28,7 +28,7 @@ __all__ = [
     "measures",
     "policy_episode",
     "simulation_errors",
-    "torch_threads",
+    "torch_settings",
 ]
 
 Kept = TypeVar("Kept")
@@ -145,14 +145,19 @@ def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
 
 
 @contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use ``count`` CPU threads inside the ``with`` block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+def torch_settings(threads: int) -> Iterator[None]:
+    """Let torch use some CPU threads, and not check distributions' arguments, inside the ``with`` block.
+
+    The checks cost a tenth of an update; states and losses are checked for NaN anyway.
+    """
+    before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
+    torch.set_num_threads(threads)
+    torch.distributions.Distribution.set_default_validate_args(False)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        torch.distributions.Distribution.set_default_validate_args(checks)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from plab.runners.common import (
     measures,
     policy_episode,
     simulation_errors,
-    torch_threads,
+    torch_settings,
 )
 from plab.runners.jobs import Job, title
 from plab.runners.rl_models import total_steps
@@ -58,7 +58,7 @@ def run_rl(jobs: Sequence[Job], note: str = "") -> None:
     cfg, run, method = job.cfg, job.run, job.cfg.method_as(RlConfig)
     _check_installed(method)
     replay_path, total = run.path.with_suffix(".replay"), total_steps(method, cfg.sim.horizon)
-    with torch_threads(method.torch_threads), simulation_errors():
+    with torch_settings(method.torch_threads), simulation_errors():
         with run.phase("build"):
             kinds = (method.num_envs, method.contact), (1, "hard")
             training, evaluation = kept_batches(cfg, *kinds)

@@ -88,7 +88,11 @@ def _off_policy(method: OffPolicyConfig) -> dict[str, Any]:
         "tau": method.tau,
         "train_freq": (1, "step"),
         "gradient_steps": method.gradient_steps,
-        "policy_kwargs": {"net_arch": list(method.hidden), "activation_fn": torch.nn.ReLU},
+        "policy_kwargs": {
+            "net_arch": list(method.hidden),
+            "activation_fn": torch.nn.ReLU,
+            "optimizer_kwargs": {"fused": True},
+        },
     }
 
 
@@ -123,7 +127,7 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
         "policy_kwargs": {
             "net_arch": list(method.hidden),
             "activation_fn": torch.nn.Tanh,
-            "optimizer_kwargs": {"eps": method.adam_eps},
+            "optimizer_kwargs": {"eps": method.adam_eps, "fused": True},
         },
     }
 
