@@ -159,7 +159,7 @@ class TransferTiles(ParticlePhases):
     def scatter_field(
         self, grid: ti.template(), grid_node, value, a: ti.template(), scale, lane, at, work_at
     ):
-        """Scatter the affine field of this value at the base node and of increments scale times A's columns."""
+        """Scatter an affine field: its value at the base node, its increments scale times A's columns."""
         q = [value, column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
         w = self.weights(at + WEIGHTS, lane)
         scatter(grid, grid_node, self.axis * self.axis, self.axis, w, q, self.work, work_at)
