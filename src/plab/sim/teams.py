@@ -1,12 +1,16 @@
 """How many of the CPU's threads work on one environment."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 __all__ = ["TeamChoice"]
 
-PROBE = 50
+PROBE = 100
 """Every so many launches the team that is not the best so far is tried again."""
+
+RECENT = 3
+"""A team is as fast as the fastest of so many of its launches: one that was interrupted says little."""
 
 
 class TeamChoice:
@@ -23,7 +27,7 @@ class TeamChoice:
             sizes: Threads that work on one environment, in the order in which they are tried.
         """
         self._sizes = tuple(dict.fromkeys(sizes))
-        self._seconds: dict[int, float] = {}
+        self._seconds: dict[int, deque[float]] = {}
         self._launches = 0
 
     def run(self, kernel: Callable, args: tuple) -> None:
@@ -35,14 +39,13 @@ class TeamChoice:
         seconds = time.perf_counter() - start
         # The first launch compiles.
         if self._launches > 1:
-            old = self._seconds.get(size, seconds)
-            self._seconds[size] = 0.7 * old + 0.3 * seconds
+            self._seconds.setdefault(size, deque(maxlen=RECENT)).append(seconds)
 
     def _next(self) -> int:
         untried = [size for size in self._sizes if size not in self._seconds]
         if untried:
             return untried[0]
-        best = min(self._sizes, key=self._seconds.__getitem__)
+        best = min(self._sizes, key=lambda size: min(self._seconds[size]))
         if self._launches % PROBE == 0:
             return next((size for size in self._sizes if size != best), best)
         return best

@@ -1,0 +1,66 @@
+"""Choice of a team of threads, with a clock that the launches themselves advance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from plab.sim import teams
+from plab.sim.teams import PROBE, RECENT, TeamChoice
+
+
+class Machine:
+    """Launches that take what ``cost`` says for a team's size, and a note of the sizes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        self.sizes: list[int] = []
+        self.cost: Callable[[int], float] = lambda size: 1.0 / size
+        monkeypatch.setattr(teams.time, "perf_counter", lambda: self.now)
+
+    def launch(self, size: int) -> None:
+        self.sizes.append(size)
+        self.now += self.cost(size)
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return Machine(monkeypatch)
+
+
+def run(choice: TeamChoice, machine: Machine, launches: int) -> list[int]:
+    """Launch, and return the sizes of these launches."""
+    before = len(machine.sizes)
+    for _ in range(launches):
+        choice.run(machine.launch, ())
+    return machine.sizes[before:]
+
+
+def test_the_faster_team_does_nearly_all_launches(machine: Machine) -> None:
+    choice = TeamChoice((2, 1))
+    run(choice, machine, 5)
+    assert run(choice, machine, 4 * PROBE).count(1) == 4
+
+
+def test_one_slow_launch_changes_nothing(machine: Machine) -> None:
+    choice = TeamChoice((2, 1))
+    run(choice, machine, RECENT + 3)
+    machine.cost = lambda size: 50.0
+    run(choice, machine, 1)
+    machine.cost = lambda size: 1.0 / size
+    assert set(run(choice, machine, 10)) == {2}
+
+
+def test_a_busy_machine_changes_the_choice_and_a_quiet_one_changes_it_back(machine: Machine) -> None:
+    choice = TeamChoice((2, 1))
+    run(choice, machine, 10)
+    machine.cost = lambda size: {1: 1.0, 2: 5.0}[size]
+    assert set(run(choice, machine, 20)[RECENT:]) == {1}
+    machine.cost = lambda size: 1.0 / size
+    assert set(run(choice, machine, 2 * PROBE)[PROBE:]) <= {1, 2}
+    assert set(run(choice, machine, 10)) == {2}
+
+
+def test_one_size_is_no_choice(machine: Machine) -> None:
+    assert set(run(TeamChoice((1, 1)), machine, 10)) == {1}
