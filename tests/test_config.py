@@ -304,6 +304,22 @@ def test_a_variant_may_have_any_name():
     assert cfg.variant == "tall" and cfg.task.manipulators["pillar"].position == [0.4, 0.1, 0.5]
 
 
+@pytest.mark.parametrize(
+    ("overrides", "lr"),
+    [
+        (["task=Move"], 0.1),
+        (["task=Chopsticks"], 0.01),
+        (["task=Chopsticks", "method=gd"], 0.1),
+        (["task=Chopsticks", "method=adam_h"], 0.1),
+        (["task=Chopsticks", "method.lr=0.3"], 0.3),
+        (["task=Move", "method.lr_by_task.default=0.2"], 0.2),
+    ],
+)
+def test_adam_has_a_learning_rate_by_task(overrides: list[str], lr: float):
+    method = load_config(overrides).method
+    assert method.lr == lr and method.lr_by_task == {}
+
+
 def test_load_config_leaves_a_surrounding_hydra_alone():
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         load_config(["seed=1"])

@@ -220,6 +220,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
         _choose_profile(composed.method)
+        _choose_learning_rate(composed.method)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
         cfg = cast(Config, OmegaConf.to_object(composed))
@@ -292,6 +293,13 @@ def _choose_profile(method: DictConfig) -> None:
         raise ConfigError(f"method.profile '{method.profile}' does not exist; {pick(method.profile, names)}")
     OmegaConf.resolve(method)
     method.profiles = {}
+
+
+def _choose_learning_rate(method: DictConfig) -> None:
+    """Put the task's learning rate where it is referred to, and forget those of the others."""
+    if "lr_by_task" in method:
+        OmegaConf.resolve(method)
+        method.lr_by_task = {}
 
 
 def _choose_variant(composed: DictConfig, overrides: Sequence[str]) -> None:

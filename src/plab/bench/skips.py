@@ -63,7 +63,7 @@ CASES = (
     Case("history", ("task=Move",), (REWARD,)),
     Case(
         "zero_weights",
-        ("task=TripleMove", "method.loss_weights.sdf=0", "method.loss_weights.contact=0"),
+        ("task=TripleMove", "method.loss_weights.contact=0"),
         (REWARD, GRADIENT),
     ),
     Case("still_manipulators", ("task=Rope",), (GRADIENT, REWARD)),

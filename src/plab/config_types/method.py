@@ -69,6 +69,7 @@ class TrajectoryConfig(MethodConfig):
     Attributes:
         optimizer: Update rule, ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
+        lr_by_task: Learning rates by task. Empty in a run's configuration: what was used is in ``lr``.
         betas: Decay rates of adam's two moment estimates.
         eps: Added to adam's denominator.
         momentum: gd's momentum, on (1 - momentum)-weighted gradients.
@@ -79,6 +80,7 @@ class TrajectoryConfig(MethodConfig):
 
     optimizer: str
     lr: float
+    lr_by_task: dict[str, float]
     betas: list[float]
     eps: float
     momentum: float

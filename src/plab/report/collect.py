@@ -44,6 +44,7 @@ _HARMLESS = (
     "sim.device",
     "sim.memory_mb",
     "method.tensorboard",
+    "method.lr_by_task",
     "method.torch_device",
     "method.torch_threads",
 )
@@ -288,9 +289,10 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         config: The run's configuration.
     """
-    expected = _usual(config["method"]["name"])
+    method, name = config["method"]["name"], config["task"]["name"]
+    expected = _usual(method) | _usual_rate(method, name)
     by_variant = _changed_by_variant(config)
-    task = {f"task.{k}": v for k, v in _usual_task(config["task"]["name"]).items() if k not in by_variant}
+    task = {f"task.{k}": v for k, v in _usual_task(name).items() if k not in by_variant}
     own = {key: (value, _present(config, key)) for key, value in (expected | task).items()}
     return {key: mine for key, (value, mine) in own.items() if key not in _HARMLESS and mine != value}
 
@@ -312,6 +314,15 @@ def _usual(method: str) -> dict[str, Any]:
     config = config_dict(load_config([f"method={method}"] if known else []))
     sections = ("sim", "method") if known else ("sim",)
     return dict(_leaves({name: config[name] for name in sections}))
+
+
+@functools.cache
+def _usual_rate(method: str, task: str) -> dict[str, float]:
+    """Return the learning rate of a method that has one of its own for the task."""
+    path = conf_folder() / "method" / f"{method}.yaml"
+    content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    rates = content.get("lr_by_task", {})
+    return {"method.lr": rates.get(task, rates["default"])} if rates else {}
 
 
 @functools.cache

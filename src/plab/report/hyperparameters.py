@@ -108,11 +108,17 @@ def _gradient_rows() -> Iterator[dict[str, str]]:
             yield {
                 "method": name,
                 "key": key,
-                "plab": _value(content[key]),
+                "plab": _value(_general(content, key)),
                 "paper": _value(theirs),
                 "remark": _comments(_text("adam"), None).get(key, ""),
                 "paper remark": "",
             }
+
+
+def _general(content: Mapping[str, Any], key: str) -> Any:
+    """Return a key's value for tasks that are not named."""
+    value = content[key]
+    return content["lr_by_task"]["default"] if key == "lr" and isinstance(value, str) else value
 
 
 @functools.cache
