@@ -49,9 +49,7 @@ def test_starting_imports_nothing_heavy(code, tmp_path):
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT / "src")))
 def test_modules_are_short_and_say_what_they_offer(path):
     text = path.read_text(encoding="utf-8")
-    # The simulator's phases are long as long as they are kernels of one step.
-    if "sim" not in path.parts:
-        assert text.count("\n") <= 500
+    assert text.count("\n") <= 500
     assert text.startswith('"""')
     public = re.search(r"^(?:def|class) [a-z_]*[A-Za-z]", text, re.MULTILINE)
     if public and path.name != "__main__.py":

@@ -19,6 +19,7 @@ import numpy as np
 
 from plab.sim import linalg, material, transfer
 from plab.sim.particle_phases import ParticlePhases
+from plab.sim.series import Series
 
 __all__ = ["particle_operations"]
 
@@ -131,7 +132,7 @@ def particle_operations(precision: str) -> dict[str, int]:
 
 def _stress(precision: str) -> None:
     """Trial gradient, strain, stress and A; as ParticlePhases.material_particle."""
-    series = material.Series.for_precision(precision)
+    series = Series.for_precision(precision)
     c = _numbers(9)
     g = plain(material.trial_gradient)(c, _numbers(9), Counting())
     j = plain(linalg.det)(g)
@@ -143,7 +144,7 @@ def _stress(precision: str) -> None:
 
 def _stress_adjoint(precision: str) -> None:
     """Adjoint of the same without plastic flow; as ParticlePhases.material_particle_adjoint."""
-    series = material.Series.for_precision(precision)
+    series = Series.for_precision(precision)
     c, f = _numbers(9), _numbers(9)
     dt, mu, lam, strain = _numbers(4)
     g = plain(material.trial_gradient)(c, f, dt)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError, sample_particles
+from plab.sim.batch import initial_poses, require_alike, with_material
 from plab.sim.engine import CpuEngine
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.memory import held_bytes
@@ -21,7 +21,7 @@ from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State, rest_state
 from plab.sim.storage import MEASURES
 from plab.sim.tape import Tape
-from plab.sim.tensors import on_device, tensor_from, write_numbers
+from plab.sim.tensors import action_array, numbers_of, on_device
 
 if TYPE_CHECKING:
     import torch
@@ -73,7 +73,7 @@ class Simulator:
             raise SceneError("a simulator needs at least one scene")
         for scene in scenes:
             scene.validate()
-        _require_alike(scenes)
+        require_alike(scenes)
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
@@ -183,7 +183,7 @@ class Simulator:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
         for scene in scenes:
             scene.validate()
-        _require_alike([self.scenes[0], *scenes])
+        require_alike([self.scenes[0], *scenes])
         self._require_compiled(scenes)
         self.scenes = tuple(scenes)
         self._engine.fill_parameters(scenes)
@@ -206,20 +206,7 @@ class Simulator:
         Raises:
             SceneError: If a scene could not be simulated with it; nothing is changed then.
         """
-        given = {
-            "youngs_modulus": youngs_modulus,
-            "poisson_ratio": poisson_ratio,
-            "yield_stress": yield_stress,
-        }
-        values = {
-            name: np.broadcast_to(np.asarray(value, float), self.batch).tolist()
-            for name, value in given.items()
-            if value is not None
-        }
-        scenes = tuple(
-            replace(scene, **{name: column[e] for name, column in values.items()})
-            for e, scene in enumerate(self.scenes)
-        )
+        scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
         for scene in scenes:
             scene.validate()
         self._require_compiled(scenes)
@@ -269,9 +256,7 @@ class Simulator:
             SimulationError: If the state stops being finite.
         """
         self._require_runtime()
-        array = self._action_array(
-            actions if on_device(actions) else np.asarray(actions, np.float64), steps=1
-        )
+        array = action_array(actions, self.batch, self.action_dim, self.device, steps=1)
         self._particles.step(self._pose, array)
         require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
 
@@ -295,7 +280,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         self.reset()
-        array = self._action_array(actions if on_device(actions) else np.asarray(actions, np.float64))
+        array = action_array(actions, self.batch, self.action_dim, self.device)
         steps = actions.shape[1] if on_device(actions) else np.shape(actions)[1]
         kept = gradient or not self._skips.history
         plan = self._tape.plan(steps, self.memory_mb) if kept else None
@@ -314,7 +299,7 @@ class Simulator:
         if gradient:
             contact_free = self._steps_before_contact(steps)
             bars = self._tape.backward(array, poses, steps, contact_free)
-            actions_bar = self._given(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
+            actions_bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
             failures = broken_gradients(actions_bar) | failures
             if strict:
                 require_none(failures)
@@ -355,7 +340,7 @@ class Simulator:
         """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type."""
         self._require_runtime()
         self._particles.losses(self._scratch_terms, 0)
-        return self._measures(self._given(self._scratch_terms, (self.batch, MEASURES), like))
+        return self._measures(numbers_of(self._scratch_terms, (self.batch, MEASURES), like))
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
@@ -395,13 +380,13 @@ class Simulator:
             self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
         out = self._observed[stride]
         self._engine.observe(self._particles.current, self._particles.order.numbers, stride, out)
-        return self._given(out, (self.batch, count, 6), like)
+        return numbers_of(out, (self.batch, count, 6), like)
 
     def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
         tensor if ``like`` is one, of its type."""
         self._require_runtime()
-        return self._given(self._pose, self._initial_poses.shape, like)
+        return numbers_of(self._pose, self._initial_poses.shape, like)
 
     def set_state(self, state: State) -> None:
         """Replace the current state.
@@ -435,12 +420,6 @@ class Simulator:
 
     # -- internals ----------------------------------------------------------------------------------
 
-    def _given(self, array: ti.Ndarray, shape: tuple[int, ...], like: object) -> np.ndarray | torch.Tensor:
-        """What an array on the device holds, as a tensor like a CUDA tensor or else as an array."""
-        if on_device(like):
-            return tensor_from(array, shape, like)
-        return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
-
     def _require_compiled(self, scenes: Sequence[Scene]) -> None:
         """Refuse scenes that need what was left out when the simulator was built."""
         for name in self._engine.left_out(scenes):
@@ -452,10 +431,7 @@ class Simulator:
         """Make the scenes' start the initial state."""
         positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
         self._particles.order.start_from(positions)
-        self._initial_poses = np.array(
-            [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in self.scenes],
-            dtype=np.float64,
-        ).reshape(self.batch, self.manipulator_count, 8)
+        self._initial_poses = initial_poses(self.scenes)
         start = rest_state(np.stack(positions), self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))
 
@@ -483,27 +459,6 @@ class Simulator:
             self._pose.from_numpy(np.ascontiguousarray(poses).reshape(-1))
             self._engine.place(self._pose, 0)
 
-    def _action_array(self, actions: np.ndarray | torch.Tensor, steps: int | None = None) -> ti.Ndarray:
-        """Actions for the kernels; shape [batch, T, action], or [batch, action] if ``steps`` is 1."""
-        expected = (self.batch, self.action_dim)
-        if steps is None:
-            expected = (self.batch, actions.shape[1] if actions.ndim == 3 else "T", self.action_dim)
-        if tuple(actions.shape) != expected:
-            named = " (batch, steps, components)" if steps is None else " (batch, components)"
-            raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected}{named}")
-        finite = actions.isfinite() if on_device(actions) else np.isfinite(actions)
-        if not finite.all():
-            raise ValueError("actions contain NaN or infinity")
-        flat = actions.swapaxes(0, 1).reshape(-1) if steps is None else actions.reshape(-1)
-        array = ti.ndarray(ti.f64, shape=max(1, flat.shape[0]))
-        if not flat.shape[0]:
-            return array
-        if on_device(actions) and self.device == "cuda":
-            write_numbers(flat.detach().contiguous(), array)
-        else:
-            array.from_numpy(np.ascontiguousarray(flat.cpu().double() if on_device(flat) else flat))
-        return array
-
     def _require_gradient(self) -> None:
         self._require_runtime()
         if not self._engine.full_gradient:
@@ -526,24 +481,3 @@ def _engine_class(device: str) -> type:
 
         return CudaEngine
     return CpuEngine
-
-
-def _unit(rotation: Sequence[float]) -> list[float]:
-    """A quaternion of length 1; YAML files round theirs."""
-    q = np.asarray(rotation, float)
-    return list(q / np.linalg.norm(q))
-
-
-def _require_alike(scenes: Sequence[Scene]) -> None:
-    first = scenes[0]
-    for number, scene in enumerate(scenes[1:], start=1):
-        for name in ("particle_count", "grid_size", "dt", "substeps"):
-            if getattr(scene, name) != getattr(first, name):
-                raise SceneError(
-                    f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
-                    f"scene {number} has {getattr(scene, name)}"
-                )
-        if [m.shape for m in scene.manipulators] != [m.shape for m in first.manipulators]:
-            raise SceneError(
-                f"scenes of one batch need the same manipulators; scene {number} differs from scene 0"
-            )

@@ -22,9 +22,9 @@ import numpy as np
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES, Scene
-from plab.sim.material import Series
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
+from plab.sim.series import Series
 from plab.sim.skips import Skips
 
 __all__ = [

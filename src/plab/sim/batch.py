@@ -1,0 +1,74 @@
+"""The scenes of one batch: what they must share, where they start, and the same scenes of other material."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plab.scene import Scene, SceneError
+
+__all__ = ["initial_poses", "require_alike", "with_material"]
+
+
+def require_alike(scenes: Sequence[Scene]) -> None:
+    """Raise SceneError if scenes do not fit together in one simulator."""
+    first = scenes[0]
+    for number, scene in enumerate(scenes[1:], start=1):
+        for name in ("particle_count", "grid_size", "dt", "substeps"):
+            if getattr(scene, name) != getattr(first, name):
+                raise SceneError(
+                    f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
+                    f"scene {number} has {getattr(scene, name)}"
+                )
+        if [m.shape for m in scene.manipulators] != [m.shape for m in first.manipulators]:
+            raise SceneError(
+                f"scenes of one batch need the same manipulators; scene {number} differs from scene 0"
+            )
+
+
+def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
+    """Poses in which the scenes' manipulators start, as in :class:`plab.sim.State`, shape [batch,
+    manipulator, 8]."""
+    return np.array(
+        [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
+        dtype=np.float64,
+    ).reshape(len(scenes), len(scenes[0].manipulators), 8)
+
+
+def _unit(rotation: Sequence[float]) -> list[float]:
+    """A quaternion of length 1; YAML files round theirs."""
+    q = np.asarray(rotation, float)
+    return list(q / np.linalg.norm(q))
+
+
+def with_material(
+    scenes: Sequence[Scene],
+    youngs_modulus: ArrayLike | None,
+    poisson_ratio: ArrayLike | None,
+    yield_stress: ArrayLike | None,
+) -> tuple[Scene, ...]:
+    """Return the scenes with other material, not validated.
+
+    Args:
+        scenes: One scene per environment.
+        youngs_modulus: Young's modulus, one for all scenes or shape [batch]; as it is if None.
+        poisson_ratio: Poisson ratio, likewise.
+        yield_stress: von Mises yield stress, likewise.
+    """
+    given = {
+        "youngs_modulus": youngs_modulus,
+        "poisson_ratio": poisson_ratio,
+        "yield_stress": yield_stress,
+    }
+    values = {
+        name: np.broadcast_to(np.asarray(value, float), len(scenes)).tolist()
+        for name, value in given.items()
+        if value is not None
+    }
+    return tuple(
+        replace(scene, **{name: column[e] for name, column in values.items()})
+        for e, scene in enumerate(scenes)
+    )

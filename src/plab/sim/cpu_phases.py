@@ -1,0 +1,278 @@
+"""Phases as the CPU runs them: what one thread does with its chunks of particles and its share of the blocks.
+
+Each chunk has a private grid, so that scattering needs no atomics. Which thread works on which chunks, and
+where threads wait for each other, is up to :mod:`plab.sim.engine`.
+"""
+
+import taichi as ti
+
+from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
+from plab.sim.grid_phases import GridPhases
+from plab.sim.loss_phases import LossPhases
+from plab.sim.pose_phases import PosePhases
+from plab.sim.storage import BLOCK, PLACES, SPREAD, STAGE, WORK
+
+__all__ = ["BLOCK_NODES", "CpuPhases"]
+
+BLOCK_NODES = BLOCK**3
+
+
+class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
+    """All phases, for one chunk at a time."""
+
+    # -- shares -------------------------------------------------------------------------------------
+
+    @ti.func
+    def first_tile(self, c):
+        """First tile of a chunk."""
+        return c * self.tiles // self.chunks
+
+    @ti.func
+    def lanes_of(self, tile):
+        """Particles in a tile."""
+        return ti.min(self.lanes, self.particles - tile * self.lanes)
+
+    @ti.func
+    def first_entry(self, e, c):
+        """First entry of a chunk's share of the environment's block list: the blocks that no earlier chunk
+        holds."""
+        first = self.block_first[e, c]
+        if ti.static(not self.skips.empty_blocks):
+            # Blocks that nobody holds are shared evenly.
+            first = c * self.block_count[e] // self.chunks
+        return e * self.blocks + first
+
+    # -- phases of one chunk ------------------------------------------------------------------------
+
+    @ti.func
+    def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
+        """Material update and scatter of momentum and mass."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        known = -1
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.material_tile(
+                state,
+                source,
+                self.tile_entry(after, e, tile),
+                entry9,
+                e,
+                self.bounded(grid_index * STAGE),
+                True,
+            )
+            self.stencil_tile(state, source, at, places_at, False)
+            self.momentum_tile(state, source, entry9, at)
+            for lane in range(self.lanes_of(tile)):
+                key = self.places[places_at + KEY][lane]
+                if key != known:
+                    self.mark(grid_index, key, stamp)
+                    known = key
+                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at, self.bounded(grid_index * WORK))
+
+    @ti.func
+    def grid_chunk(self, e, c, s):
+        """Grid update of a share of the environment's blocks; the private grids are cleared for the next
+        substep."""
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            near = self.near_manipulators(e, s, block)
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                total = self.take(self.momentum, e, node, holders)
+                v = self.update_node(e, s, i, near, total)
+                self.velocity[e * self.nodes + node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+
+    @ti.func
+    def take(self, grid: ti.template(), e, node, holders):
+        """Sum a node over the private grids of the chunks that hold it, and clear it there."""
+        total = ti.Vector.zero(self.real, 4)
+        for c in range(self.chunks):
+            held = holders & (1 << c) != 0
+            if ti.static(not self.skips.empty_grids):
+                held = True
+            if held:
+                at = (e * self.chunks + c) * self.nodes + node
+                total += grid[at]
+                grid[at] = ti.Vector.zero(self.real, 4)
+        return total
+
+    @ti.func
+    def gather_chunk(self, state: ti.template(), before, after, e, c, time):
+        """Velocities, affine matrices and positions after the substep."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            self.stencil_tile(state, source, at, places_at, False)
+            for lane in range(self.lanes_of(tile)):
+                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
+                self.gather_particle(
+                    state, source, target, lane, node, e, time, at, self.bounded(grid_index * WORK)
+                )
+
+    @ti.func
+    def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
+        """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        work_at = self.bounded(grid_index * WORK)
+        known = -1
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STAGE), False)
+            self.stencil_tile(state, source, at, places_at, False)
+            self.momentum_tile(state, source, entry9, at)
+            self.adjoint_tile(state, source, target, bar, entry, at)
+            for lane in range(self.lanes_of(tile)):
+                key = self.places[places_at + KEY][lane]
+                if key != known:
+                    self.mark(grid_index, key, stamp)
+                    known = key
+                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at, work_at)
+                self.scatter_adjoint(bar, entry, lane, node, at, work_at)
+
+    @ti.func
+    def grid_chunk_adjoint(self, e, c, s):
+        """Grid update and its adjoint for a share of the environment's blocks."""
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            near = self.near_manipulators(e, s, block)
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                total = self.take(self.momentum, e, node, holders)
+                bar4 = self.take(self.velocity_bar, e, node, holders)
+                v, total_bar = self.update_node_adjoint(
+                    e * self.chunks + c, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
+                )
+                self.velocity[e * self.nodes + node] = ti.Vector([v[0], v[1], v[2], 0.0 * v[0]])
+                self.momentum_bar[e * self.nodes + node] = total_bar
+
+    @ti.func
+    def gather_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c):
+        """Adjoints of the particles before the substep."""
+        grid_index = e * self.chunks + c
+        at = self.bounded(grid_index * SPREAD)
+        places_at = self.bounded(grid_index * PLACES)
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            entry9 = self.bounded((e * self.tiles + tile) * 9)
+            self.stencil_tile(state, source, at, places_at, True)
+            self.momentum_tile(state, source, entry9, at)
+            self.adjoint_tile(state, source, target, bar, entry, at)
+            for lane in range(self.lanes_of(tile)):
+                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
+                self.gather_particle_adjoint(
+                    state,
+                    source,
+                    target,
+                    bar,
+                    entry,
+                    entry9,
+                    lane,
+                    node,
+                    at,
+                    self.bounded(grid_index * WORK),
+                )
+            self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded(grid_index * STAGE))
+
+    # -- losses of one chunk ------------------------------------------------------------------------
+
+    @ti.func
+    def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
+        """Spread mass, and find the particle nearest to each manipulator."""
+        grid_index = e * self.chunks + c
+        search = self.weighs(2)
+        for m in ti.static(range(self.manipulators)):
+            self.contact_part[e, c, m] = ti.select(search, 1e9, 0.0)
+            self.contact_particle[e, c, m] = 0
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(slot, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                x = self.vector(state, source, lane)
+                base, fx = self.stencil(x)
+                block, crossing = self.block_of(base)
+                self.mark(grid_index, block * 8 + crossing, stamp)
+                self.scatter_mass(grid_index, base, fx)
+                if search:
+                    self.find_nearest(e, c, tile * self.lanes + lane, x)
+
+    @ti.func
+    def find_nearest(self, e, c, particle, x):
+        """Note a particle of a chunk where it is nearer to a manipulator than those before."""
+        for shape, start, stop in ti.static(self.runs):
+            if ti.static(self.moves(shape)):
+                for m in range(start, stop):
+                    d = self.end_distance(shape, e, m, x)
+                    if d < self.contact_part[e, c, m]:
+                        self.contact_part[e, c, m] = d
+                        self.contact_particle[e, c, m] = particle
+
+    @ti.func
+    def grid_loss_chunk(self, e, c):
+        """Loss terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
+        part = ti.Vector.zero(ti.f64, 4)
+        for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
+            block = self.block_list[entry]
+            holders = self.block_chunks[e * self.blocks + block]
+            for r in range(BLOCK_NODES):
+                i = self.node_of_block(block, r)
+                node = self.linear(i)
+                mass = self.take(self.momentum, e, node, holders)[3]
+                density, sdf, slope, overlap = self.node_loss(e, i, mass)
+                part[0] += density
+                part[1] += sdf
+                part[2] += overlap
+                part[3] = ti.max(part[3], ti.cast(mass, ti.f64))
+                self.velocity[e * self.nodes + node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
+        self.loss_part[e, c] = part
+
+    @ti.func
+    def join_losses(self, e, terms: ti.template(), at):
+        """Join the chunks' parts into the measures; the nearest particles go to chunk 0's entries."""
+        part = ti.Vector.zero(ti.f64, 4)
+        for c in range(self.chunks):
+            share = self.loss_part[e, c]
+            peak = ti.max(part[3], share[3])
+            part += share
+            part[3] = peak
+            for m in ti.static(range(self.manipulators)):
+                if self.contact_part[e, c, m] < self.contact_part[e, 0, m]:
+                    self.contact_part[e, 0, m] = self.contact_part[e, c, m]
+                    self.contact_particle[e, 0, m] = self.contact_particle[e, c, m]
+        for m in ti.static(range(self.manipulators)):
+            if ti.static(self.motions[m] == "static"):
+                self.contact_part[e, 0, m] = 0.0
+        terms[at] = self.target_sum[e] + part[0]
+        terms[at + 1] = part[1]
+        terms[at + 2] = self.contact_term(e)
+        terms[at + 3] = part[2]
+        terms[at + 4] = part[3]
+
+    @ti.func
+    def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
+        """Add the gradient of the density and SDF terms to the particles' position adjoints."""
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(slot, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                base, fx = self.stencil(self.vector(state, source, lane))
+                slope = self.mass_slope(self.velocity, e, base, fx)
+                for i in ti.static(range(3)):
+                    bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
