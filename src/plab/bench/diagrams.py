@@ -28,6 +28,9 @@ PANELS = {
 
 COLOURS = {"float32": "tab:orange", "float64": "tab:blue"}
 MARKERS = {"series": "o", "singular values": "s"}
+LABELLED = 12
+"""With more cases than this a figure of norms has no legend: colours repeat."""
+
 FLOOR = 1e-16
 """Errors are drawn no smaller than this: those of a reference with itself, say."""
 
@@ -108,20 +111,21 @@ def draw_norms(table: pd.DataFrame, path: Path) -> Path:
     Returns:
         The path.
     """
-    figure, place = plt.subplots(figsize=(7.0, 3.6), layout="constrained")
+    figure, place = plt.subplots(figsize=(7.0, 4.4), layout="constrained")
     styles = {"float32": "-", "float64": ":"}
     colours: dict[str, str] = {}
     for (precision, case), rows in table.groupby(["precision", "case"], sort=False):
+        label = None if case in colours else case
         colour = colours.setdefault(case, f"C{len(colours) % 10}")
         # Steps that nothing depends on have no place on a log scale.
         norms = rows["norm"].where(rows["norm"] > 0)
-        place.plot(
-            rows["back"], norms, styles[precision], color=colour, linewidth=1, label=f"{case}, {precision}"
-        )
+        place.plot(rows["back"], norms, styles[precision], color=colour, linewidth=1, label=label)
     place.set_yscale("log")
     place.set_xlabel("environment steps back from the end")
-    place.set_ylabel("norm of the gradient with respect to a step's actions")
-    place.legend(fontsize=7, ncols=2)
+    place.set_ylabel("norm of a step's gradient")
+    place.set_title("solid: float32, dotted: float64", fontsize=8, loc="right")
+    if len(colours) <= LABELLED:
+        figure.legend(fontsize=7, ncols=3, loc="outside lower center")
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
