@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from plab.bench.accuracy import COLUMNS, PLACES, QUICK, TASKS, Attempt, Plan, lattice, rows
+from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
 from plab.bench.diagrams import draw
 from plab.bench.precision import angle, compare, markdown, starts
 from plab.scene import Body
@@ -40,13 +40,13 @@ def test_lattices_fill_bodies_evenly() -> None:
 def test_every_setting_of_every_task_has_a_scene() -> None:
     plan = Plan()
     settings = [*plan.settings(), *plan.references().values()]
-    for task in TASKS:
-        attempt = Attempt(task, plan)
+    for attempt in attempts_at(TASKS, plan):
         for setting in settings:
             scene, x = attempt.start(setting)
             scene.validate()
             assert len(x) == scene.particle_count
-            assert tuple(m.shape for m in scene.manipulators) == PLACES
+            shapes = [m.shape for m in scene.manipulators]
+            assert shapes == ["Sphere", "Sphere", "RollingPin", "Chopsticks", "Cylinder"]
             assert scene.substeps * scene.dt == pytest.approx(19e-4)
         # As many particles per cell on every grid, but for whole numbers of them across a thin body.
         per_cell = [len(attempt.start(s)[1]) / s.grid**3 for s in settings if s.axis == "grid"]

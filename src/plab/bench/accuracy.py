@@ -1,7 +1,7 @@
 """Work-precision diagrams: what a run costs against how far it is from a fine reference.
 
     python -m plab.bench.accuracy --output accuracy           # a folder: CSV, and PNG and PDF per task
-    python -m plab.bench.accuracy --quick --output accuracy   # minutes on two cores
+    python -m plab.bench.accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
     python -m plab.bench.accuracy --task Move,Rope --particles 3000
     python -m plab.bench.accuracy --device cuda --output accuracy_cuda
 
@@ -30,20 +30,20 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
+from plab.bench.common_scene import ANY_SCENE, common_actions, common_places, common_scene, own_components
 from plab.bench.precision import angle
 from plab.bench.table import report
-from plab.config import build_scene, load_config
+from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, DEVICES, DeviceError, Simulator
 from plab.suite import task_list
 
-__all__ = ["Setting", "lattice", "main"]
+__all__ = ["Setting", "attempts_at", "lattice", "main"]
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
-PLACES = ("Sphere", "Sphere", "RollingPin", "Chopsticks", "Cylinder")
+QUICK_TASKS = ("Move", "Rope")
 STEP_TIME = 19e-4
 """Simulated time of an environment step of the suite [s]."""
 
@@ -194,25 +194,33 @@ def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
     return out
 
 
+def attempts_at(tasks: Sequence[str], plan: Plan) -> list[Attempt]:
+    """Return the first variants of tasks, in a common kind of scene."""
+    cfgs = [load_config([f"task={task}", "variant=1"]) for task in tasks]
+    places = common_places([build_scene(cfg) for cfg in cfgs])
+    return [Attempt(cfg, plan, places) for cfg in cfgs]
+
+
 class Attempt:
     """A task with the actions that are tried and the targets that they half reach."""
 
-    def __init__(self, task: str, plan: Plan) -> None:
-        """Load the task's first variant.
+    def __init__(self, cfg: Config, plan: Plan, places: Sequence[str]) -> None:
+        """Build the task's scene.
 
         Args:
-            task: Name of the task, one whose manipulators are among :data:`PLACES`.
+            cfg: Configuration of the task.
             plan: Numbers of environment steps and particles.
+            places: Shapes of the manipulators of the common scene.
         """
-        cfg = load_config([f"task={task}", "variant=1"])
-        self.task = task
+        self.task = cfg.task.name
         self.scene = build_scene(cfg)
-        self.components = own_components(self.scene, PLACES)
+        self.components = own_components(self.scene, places)
         self.demonstration = common_actions(
-            self.scene, cast(np.ndarray, known_actions(cfg))[: plan.steps], PLACES
+            self.scene, cast(np.ndarray, known_actions(cfg))[: plan.steps], places
         )
         self.targets: dict[str, np.ndarray] = {}
         self._plan = plan
+        self._places = places
 
     def start(self, setting: Setting) -> tuple[Scene, np.ndarray]:
         """Return the common scene of a setting and its particles.
@@ -226,10 +234,10 @@ class Attempt:
             parts = lattice(scene.bodies, np.cbrt(volume / plan.particles) * plan.grid / setting.grid)
             counted = zip(scene.bodies, parts, strict=True)
             scene = replace(scene, bodies=tuple(replace(b, particles=len(x)) for b, x in counted))
-            scene = common_scene(scene, scene.particle_count, PLACES)
+            scene = common_scene(scene, scene.particle_count, self._places)
             x = np.concatenate(parts)
         else:
-            scene = common_scene(scene, plan.particles, PLACES)
+            scene = common_scene(scene, plan.particles, self._places)
             x = sample_particles(scene)
         values = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         values |= {
@@ -328,7 +336,7 @@ def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, gri
 
 def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
     """Run a plan; yields a row of :data:`COLUMNS` per setting, task and contact model."""
-    attempts = [Attempt(task, plan) for task in tasks]
+    attempts = attempts_at(tasks, plan)
     exact: dict[tuple[str, str, str], Result] = {}
     for axis, setting in plan.references().items():
         for attempt, contact, result in simulate(setting, attempts, 0, plan.device):
@@ -358,18 +366,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write the table and the diagrams; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.accuracy", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
-    parser.add_argument("--task", type=task_list, default=list(TASKS), help="tasks, with commas between")
+    parser.add_argument(
+        "--task",
+        type=task_list,
+        help=f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)",
+    )
     parser.add_argument("--particles", type=int, help="particles per environment (10000; 1000 with --quick)")
     parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
     parser.add_argument("--output", type=Path, default=Path("accuracy"), help="folder of what is written")
     options = parser.parse_args(argv)
-    if unknown := set(options.task) - set(TASKS):
+    tasks = options.task or (QUICK_TASKS if options.quick else TASKS)
+    if unknown := set(tasks) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
     plan = QUICK if options.quick else Plan()
     plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
     options.output.mkdir(parents=True, exist_ok=True)
     try:
-        table = report(COLUMNS, rows(options.task, plan), options.output / "accuracy.csv")
+        table = report(COLUMNS, rows(tasks, plan), options.output / "accuracy.csv")
     except DeviceError as error:
         parser.error(str(error))
     # Imported late: the numbers are there even where Matplotlib is not.

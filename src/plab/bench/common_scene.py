@@ -8,6 +8,7 @@ term of the loss is not, because the parked manipulators are far from everything
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ import numpy as np
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
 from plab.sim.skips import Skips
 
-__all__ = ["ANY_SCENE", "PLACES", "common_actions", "common_scene", "own_components"]
+__all__ = ["ANY_SCENE", "PLACES", "common_actions", "common_places", "common_scene", "own_components"]
 
 ANY_SCENE = Skips(plasticity=False, friction=False)
 """For simulators that are given other scenes later, which may yield or rub where the first do not."""
@@ -33,6 +34,12 @@ PARKED_SIZES = {
     "Cylinder": (0.1, 0.2),
     "Box": (0.05, 0.05, 0.05),
 }
+
+
+def common_places(scenes: Sequence[Scene]) -> tuple[str, ...]:
+    """Shapes of the manipulators that some scenes need together: as many of each as the one with most."""
+    counts = [Counter(manipulator.shape for manipulator in scene.manipulators) for scene in scenes]
+    return tuple(shape for shape in MANIPULATOR_SHAPES for _ in range(max(c[shape] for c in counts)))
 
 
 def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -> Scene:
