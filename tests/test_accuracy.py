@@ -37,8 +37,8 @@ def test_lattices_fill_bodies_evenly() -> None:
     assert np.linalg.norm(round_ - ball.center, axis=1).max() <= 0.1
 
 
-def test_every_setting_of_every_task_has_a_scene() -> None:
-    plan = Plan()
+@pytest.mark.parametrize(("plan", "spread"), [(Plan(), 1.5), (QUICK, 1.6)], ids=["all", "quick"])
+def test_every_setting_of_every_task_has_a_scene(plan: Plan, spread: float) -> None:
     settings = [*plan.settings(), *plan.references().values()]
     for attempt in attempts_at(TASKS, plan):
         for setting in settings:
@@ -50,7 +50,7 @@ def test_every_setting_of_every_task_has_a_scene() -> None:
             assert scene.substeps * scene.dt == pytest.approx(19e-4)
         # As many particles per cell on every grid, but for whole numbers of them across a thin body.
         per_cell = [len(attempt.start(s)[1]) / s.grid**3 for s in settings if s.axis == "grid"]
-        assert max(per_cell) < 1.5 * min(per_cell)
+        assert max(per_cell) < spread * min(per_cell)
 
 
 def test_diagrams_show_what_diverges(tmp_path: Path) -> None:

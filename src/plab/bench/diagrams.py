@@ -11,9 +11,12 @@ matplotlib.use("Agg")
 
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter
 
 __all__ = ["draw", "draw_norms"]
 
@@ -55,10 +58,13 @@ def draw(table: pd.DataFrame, folder: Path) -> Iterator[Path]:
             for place, name in zip(line, names, strict=True):
                 _panel(place, some, name, axis)
                 place.set_ylabel(PANELS[name])
-            line[0].set_title(f"{task}, {contact} contact", loc="left", fontsize=10)
+            line[0].set_title(f"{task}, {contact} contact", loc="left", fontsize=10, pad=16)
             for place in line:
                 place.set_xlabel("ms per step with gradient", fontsize=8)
-        axes[0][-1].legend(fontsize=7)
+        handles, labels = axes[0][0].get_legend_handles_labels()
+        what = "substeps" if axis == "substeps" else "grid nodes per axis"
+        figure.legend(handles, labels, fontsize=8, ncols=4, loc="outside lower center")
+        figure.suptitle(f"numbers: {what}; x above: broke off", fontsize=8, x=0.99, ha="right")
         for suffix in ("png", "pdf"):
             path = folder / f"{task}_{axis}.{suffix}"
             figure.savefig(path, dpi=110)
@@ -84,21 +90,40 @@ def _panel(place: Axes, rows: pd.DataFrame, name: str, axis: str) -> None:
         for _, row in stable.iterrows():
             spot = (row["ms_per_step"], max(row[name], FLOOR))
             place.annotate(str(row[label]), spot, fontsize=6, xytext=(2, 2), textcoords="offset points")
-        for _, row in line[line["outcome"] != "stable"].iterrows():
+        diverged = line[line["outcome"] != "stable"]
+        for _, row in diverged.iterrows():
             # At the upper edge, whatever the scale: there is no error to show.
-            place.plot(
-                row["ms_per_step"], 0.97, "x", color=COLOURS[precision], transform=place.get_xaxis_transform()
-            )
+            spot = (row["ms_per_step"], 1.0)
+            above = place.get_xaxis_transform()
+            place.plot(*spot, "x", color=COLOURS[precision], transform=above, clip_on=False, markersize=5)
             place.annotate(
-                f"{row[label]} diverges",
-                (row["ms_per_step"], 0.97),
-                xycoords=place.get_xaxis_transform(),
+                str(row[label]),
+                spot,
+                xycoords=above,
                 fontsize=6,
-                xytext=(4, -3),
+                ha="center",
+                xytext=(0, 4),
                 textcoords="offset points",
             )
+    place.margins(0.12)
+    for axis_, limits in ((place.xaxis, place.get_xlim()), (place.yaxis, place.get_ylim())):
+        _few_ticks(axis_, *limits)
     place.tick_params(labelsize=7)
     place.grid(True, which="major", alpha=0.3)
+
+
+def _few_ticks(axis: Axis, low: float, high: float) -> None:
+    """Put plain numbers on a logarithmic axis, as many as have room."""
+    decades = np.log10(high / low)
+    if decades > 2.0:
+        locator: Locator = LogLocator(numticks=6)
+    elif decades > 0.7:
+        locator = LogLocator(subs=(1.0, 2.0, 5.0), numticks=8)
+    else:
+        locator = MaxNLocator(4)
+    axis.set_major_locator(locator)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_norms(table: pd.DataFrame, path: Path) -> Path:
