@@ -328,9 +328,11 @@ def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, gri
         errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
     errors["mass"] = float(np.abs(tensors[1] - tensors[2]).sum())
     errors["score"] = abs(judged[0] - judged[1])
-    length = np.linalg.norm(exact.gradient)
-    errors["gradient"] = float(abs(np.linalg.norm(result.gradient) / length - 1.0))
-    errors["angle_deg"] = angle(result.gradient, exact.gradient)
+    lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
+    if all(lengths):
+        # Without contact there is no gradient, hence no direction.
+        errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
+        errors["angle_deg"] = angle(result.gradient, exact.gradient)
     return errors
 
 
