@@ -58,7 +58,7 @@ def test_a_busy_machine_changes_the_choice_and_a_quiet_one_changes_it_back(machi
     machine.cost = lambda size: {1: 1.0, 2: 5.0}[size]
     assert set(run(choice, machine, 20)[RECENT:]) == {1}
     machine.cost = lambda size: 1.0 / size
-    assert set(run(choice, machine, 2 * PROBE)[PROBE:]) <= {1, 2}
+    assert run(choice, machine, 2 * PROBE).count(2) >= PROBE
     assert set(run(choice, machine, 10)) == {2}
 
 
