@@ -317,6 +317,9 @@ def test_hyperparameters_are_read_from_the_files() -> None:
     assert both.loc[("Adam-H", "eps")].to_list() == ["1e-8", "1e-8"]
     remarks = tables["paper"].cells.set_index(["method", "key"])["remark"]
     assert remarks[("SAC", "tau")].startswith("printed; perhaps a slip")
+    assert both.loc[("Adam", "lr")].to_list() == ["0.1", "0.1"]
+    remarks = tables["ours"].cells.set_index(["method", "key"])["remark"]
+    assert "0.01 on Chopsticks" in remarks[("Adam", "lr")] and "0.01" not in remarks[("GD", "lr")]
     bold = pd.DataFrame(tables["comparison"].bold, index=both.index)
     assert bold.loc[("SAC", "tau")].any() and not bold.loc[("SAC", "gamma")].any()
 

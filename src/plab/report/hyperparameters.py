@@ -110,15 +110,25 @@ def _gradient_rows() -> Iterator[dict[str, str]]:
                 "key": key,
                 "plab": _value(_general(content, key)),
                 "paper": _value(theirs),
-                "remark": _comments(_text("adam"), None).get(key, ""),
+                "remark": _comments(_text("adam"), None).get(key, "") + _exceptions(content, key),
                 "paper remark": "",
             }
 
 
 def _general(content: Mapping[str, Any], key: str) -> Any:
     """Return a key's value for tasks that are not named."""
-    value = content[key]
-    return content["lr_by_task"]["default"] if key == "lr" and isinstance(value, str) else value
+    return content["lr_by_task"]["default"] if _by_task(content, key) else content[key]
+
+
+def _exceptions(content: Mapping[str, Any], key: str) -> str:
+    """Return what the remark on a key has to say of the tasks that are named."""
+    rates = content["lr_by_task"] if _by_task(content, key) else {}
+    return "".join(f"; {_value(rate)} on {task}" for task, rate in rates.items() if task != "default")
+
+
+def _by_task(content: Mapping[str, Any], key: str) -> bool:
+    """Whether a key refers to the values by task, as ``lr`` does unless a method sets it."""
+    return key == "lr" and isinstance(content[key], str)
 
 
 @functools.cache
