@@ -10,6 +10,10 @@ from plab.sim import teams
 from plab.sim.teams import PROBE, RECENT, TeamChoice
 
 
+FIRST = 1 + 2 * RECENT
+"""Launches before the choice is made: one that compiles, and as many of each of two teams."""
+
+
 class Machine:
     """Launches that take what ``cost`` says for a team's size, and a note of the sizes."""
 
@@ -39,16 +43,27 @@ def run(choice: TeamChoice, machine: Machine, launches: int) -> list[int]:
 
 def test_the_faster_team_does_nearly_all_launches(machine: Machine) -> None:
     choice = TeamChoice((2, 1))
-    run(choice, machine, 5)
+    run(choice, machine, FIRST)
     assert run(choice, machine, 4 * PROBE).count(1) == 4
 
 
 def test_one_slow_launch_changes_nothing(machine: Machine) -> None:
     choice = TeamChoice((2, 1))
-    run(choice, machine, RECENT + 3)
+    run(choice, machine, FIRST)
     machine.cost = lambda size: 50.0
     run(choice, machine, 1)
     machine.cost = lambda size: 1.0 / size
+    assert set(run(choice, machine, 10)) == {2}
+
+
+@pytest.mark.parametrize("launch", range(1, FIRST))
+def test_one_slow_launch_at_the_start_changes_nothing(machine: Machine, launch: int) -> None:
+    choice = TeamChoice((2, 1))
+    run(choice, machine, launch)
+    machine.cost = lambda size: 50.0
+    run(choice, machine, 1)
+    machine.cost = lambda size: 1.0 / size
+    run(choice, machine, FIRST - 1 - launch)
     assert set(run(choice, machine, 10)) == {2}
 
 

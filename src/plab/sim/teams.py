@@ -42,9 +42,10 @@ class TeamChoice:
             self._seconds.setdefault(size, deque(maxlen=RECENT)).append(seconds)
 
     def _next(self) -> int:
-        untried = [size for size in self._sizes if size not in self._seconds]
-        if untried:
-            return untried[0]
+        # As many launches of each at first: the first ones of a process are often interrupted.
+        tried = {size: len(self._seconds.get(size, ())) for size in self._sizes}
+        if min(tried.values()) < RECENT:
+            return min(self._sizes, key=lambda size: tried[size])
         best = min(self._sizes, key=lambda size: min(self._seconds[size]))
         if self._launches % PROBE == 0:
             return next((size for size in self._sizes if size != best), best)
