@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator
 
 import pytest
@@ -11,12 +10,13 @@ import pytest
 from plab.checks import cuda_is_usable
 from plab.config import Config
 from plab.tally import Outcome
+from suite import DEVICE
 
 
 @pytest.fixture(scope="session")
 def device() -> str:
     """Device on which the simulator's tests run: ``PLAB_TEST_DEVICE``, cpu unless set."""
-    return os.environ.get("PLAB_TEST_DEVICE", "cpu")
+    return DEVICE
 
 
 @pytest.fixture(autouse=True)

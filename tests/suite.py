@@ -6,10 +6,14 @@ All environments of a batch share one compiled simulator, so that one compilatio
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+
+DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
+"""Device on which the simulator's tests run."""
 
 KINDS = tuple(MANIPULATOR_SHAPES)
 CENTER = np.array([0.5, 0.3, 0.5])

@@ -9,7 +9,6 @@ import pytest
 from plab.sim import teams
 from plab.sim.teams import PROBE, RECENT, TeamChoice
 
-
 FIRST = 1 + 2 * RECENT
 """Launches before the choice is made: one that compiles, and as many of each of two teams."""
 

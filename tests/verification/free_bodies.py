@@ -13,6 +13,7 @@ import numpy as np
 
 from plab.scene import Body, Scene
 from plab.sim import Simulator, State
+from suite import DEVICE
 
 GRID = 16
 DT = 2e-4
@@ -107,7 +108,7 @@ def index(name: str) -> int:
 
 def build() -> Simulator:
     """The simulator of all environments, float64 on the CPU."""
-    return Simulator(list(SCENES.values()), precision="float64", particles=list(START))
+    return Simulator(list(SCENES.values()), precision="float64", device=DEVICE, particles=list(START))
 
 
 def at_rest() -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ import pytest
 
 from free_bodies import BAR_LENGTH, GRID, bar, index
 from plab.sim import Simulator, State
+from suite import DEVICE
 
 pytestmark = pytest.mark.physics
 
@@ -38,7 +39,7 @@ def frequency_error(sim: Simulator, e: int) -> float:
 
 def refined_error(grid: int) -> float:
     scene, x = bar(grid)
-    return frequency_error(Simulator([scene], precision="float64", particles=[x]), 0)
+    return frequency_error(Simulator([scene], precision="float64", device=DEVICE, particles=[x]), 0)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import pytest
 
 import touched_bodies as tb
 from plab.sim import Simulator
+from suite import DEVICE
 from touched_bodies import ACTIONS, MATERIAL, TOUCHING, Point, X, components, differences, put, start
 
 pytestmark = pytest.mark.physics
@@ -240,7 +241,7 @@ def test_one_sided_slopes_bracket_the_gradient_at_the_onset_of_contact(touched: 
 
 
 def test_gradients_that_are_not_there_are_named() -> None:
-    sim = Simulator([tb.SCENE], precision="float64")
+    sim = Simulator([tb.SCENE], precision="float64", device=DEVICE)
     with pytest.raises(RuntimeError, match="full_gradient=True"):
         sim.material_gradient()
     with pytest.raises(RuntimeError, match="full_gradient=True"):

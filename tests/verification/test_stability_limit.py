@@ -11,6 +11,7 @@ import pytest
 from plab.bench.accuracy import UncheckedScene
 from plab.scene import Body
 from plab.sim import Simulator, State
+from suite import DEVICE
 
 pytestmark = pytest.mark.physics
 
@@ -45,7 +46,8 @@ def scene(ratio: float, nu: float, place: tuple[float, float, float]) -> Uncheck
 def swelling() -> np.ndarray:
     """Largest |J - 1| of each case over the run, relative to the start's."""
     scenes = [scene(*case) for case in CASES]
-    sim = Simulator(scenes, precision="float64", particles=[np.array([case[2]]) for case in CASES])
+    starts = [np.array([case[2]]) for case in CASES]
+    sim = Simulator(scenes, precision="float64", device=DEVICE, particles=starts)
     start = sim.state()
     sim.set_state(State(start.x, start.v, start.C, start.F * (1.0 + AMPLITUDE / 3.0), start.poses))
     most = np.zeros(len(CASES))

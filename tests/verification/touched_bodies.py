@@ -15,7 +15,7 @@ import numpy as np
 
 from plab.scene import sample_particles
 from plab.sim import Simulator, State
-from suite import FAR, KINDS, NEAR, batch, scene
+from suite import DEVICE, FAR, KINDS, NEAR, batch, scene
 
 SCENES = batch()
 BATCH = len(SCENES)
@@ -43,7 +43,7 @@ def components(kind: str) -> list[int]:
 
 def build() -> Simulator:
     """The simulator, float64 on the CPU, with an empty target: |mass - target| has no kink then."""
-    sim = Simulator(SCENES, precision="float64", full_gradient=True)
+    sim = Simulator(SCENES, precision="float64", device=DEVICE, full_gradient=True)
     n = sim.grid_size
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(nodes - (0.6, 0.35, 0.42), axis=-1)

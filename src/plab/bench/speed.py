@@ -24,7 +24,7 @@ from plab.bench import paper, scaling, skips
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
 from plab.bench.table import progress, report
-from plab.bench.workload import KINDS, build, peak_rss_mb, restart_peak_rss, time_calls
+from plab.bench.workload import KINDS, TENSORS, build, peak_rss_mb, restart_peak_rss, time_calls
 from plab.config import Config, ConfigError, load_config
 from plab.config_errors import COMPOSE_ERRORS, explain
 from plab.scene import SceneError
@@ -41,7 +41,13 @@ COLUMNS = (
 
 LIMIT_COLUMNS = ("device", "precision", "limit", "value", "unit")
 
-LAUNCHES = {"forward": 1, "forward + reward": 2, "forward + reward + observation": 3, "forward + backward": 3}
+LAUNCHES = {
+    "forward": 1,
+    "forward + reward": 2,
+    "forward + reward + observation": 3,
+    TENSORS: 3,
+    "forward + backward": 3,
+}
 """Launches per environment step that cannot be fewer: one for a step, for its loss, for its observation, and
 for its adjoint."""
 
@@ -71,6 +77,8 @@ def rows(
     load = build(cfg, batch, steps)
     simulator = load.simulator
     for kind in kinds:
+        if kind == TENSORS and simulator.device == "cpu":
+            continue
         progress(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
         timing = time_calls(load.call(kind), repeats)
         median, least, most = timing.ms(steps)

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import taichi as ti
+import torch
 
 from plab.config import Config, build_scene
 from plab.demonstrations import known_actions
 from plab.objective import OBSERVED_PARTICLES, target_sdf
 from plab.sim import Simulator, Skips, State
 
-__all__ = ["KINDS", "Timing", "Workload", "build", "peak_rss_mb", "restart_peak_rss", "time_calls"]
+__all__ = ["KINDS", "TENSORS", "Timing", "Workload", "build", "peak_rss_mb", "restart_peak_rss", "time_calls"]
 
 NOISE = 0.02
 """Actions of the environments of a batch differ by this much, so that no two do the same."""
@@ -122,17 +123,21 @@ def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:
     return np.clip(known + rng.uniform(-NOISE, NOISE, size=(batch, *known.shape)), -1.0, 1.0)
 
 
-def _forward(load: Workload, *, reward: bool = False, observation: bool = False) -> None:
+def _forward(
+    load: Workload, *, reward: bool = False, observation: bool = False, tensors: bool = False
+) -> None:
     simulator = load.simulator
     simulator.reset()
     stride = max(simulator.particle_count // OBSERVED_PARTICLES, 1)
+    actions = torch.as_tensor(load.actions, device="cuda") if tensors else load.actions
+    like = actions if tensors else None
     for t in range(load.steps):
-        simulator.step(load.actions[:, t])
+        simulator.step(actions[:, t], check=not reward)
         if reward:
-            simulator.measure()
+            simulator.measure(like)
         if observation:
-            simulator.observe(stride)
-            simulator.poses()
+            simulator.observe(stride, like)
+            simulator.poses(like)
     ti.sync()
 
 
@@ -141,14 +146,18 @@ def _forward_backward(load: Workload) -> None:
     ti.sync()
 
 
+TENSORS = "forward + reward + observation, tensors"
+
 KINDS: dict[str, Callable[[Workload], None]] = {
     "forward": _forward,
     "forward + reward": lambda load: _forward(load, reward=True),
     "forward + reward + observation": lambda load: _forward(load, reward=True, observation=True),
+    TENSORS: lambda load: _forward(load, reward=True, observation=True, tensors=True),
     "forward + backward": _forward_backward,
 }
 """What can be timed. The reward is what every step's is made of, loss terms and IoU, on the host; the
-observation is what the environments return; the backward pass includes the losses."""
+observation is what the environments return; the backward pass includes the losses. With tensors, actions,
+rewards and observations are on the device, as in training there; on the CPU there is no such row."""
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
 from plab.config import PpoConfig, SacConfig, Td3Config
 from plab.config_types import OffPolicyConfig, RlConfig
+from plab.runners.captured import CapturedPPO, CapturedSAC, CapturedTD3
 
 __all__ = ["ALGORITHMS", "LinearDecay", "ModelKind", "cycle_steps", "total_steps"]
 
@@ -132,5 +132,9 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
     }
 
 
-ALGORITHMS = {"sac": ModelKind(SAC, _sac), "td3": ModelKind(TD3, _td3), "ppo": ModelKind(PPO, _ppo)}
+ALGORITHMS = {
+    "sac": ModelKind(CapturedSAC, _sac),
+    "td3": ModelKind(CapturedTD3, _td3),
+    "ppo": ModelKind(CapturedPPO, _ppo),
+}
 """Learning algorithms by the name that ``method.algorithm`` gives."""

@@ -264,6 +264,7 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
         terms[at + 2] = self.contact_term(e)
         terms[at + 3] = part[2]
         terms[at + 4] = part[3]
+        terms[at + 5] = ti.cast(self.fault[e], ti.f64)
 
     @ti.func
     def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):

@@ -394,3 +394,4 @@ class CudaPhases(OrderPhases, PosePhases):
         terms[at + 2] = self.contact_term(e)
         terms[at + 3] = self.loss_part[e, 0][2]
         terms[at + 4] = self.loss_part[e, 0][3]
+        terms[at + 5] = ti.cast(self.fault[e], ti.f64)

@@ -16,13 +16,18 @@ if TYPE_CHECKING:
 __all__ = ["broken_gradients", "broken_states", "broken_terms", "require_none"]
 
 
-def broken_states(faults: np.ndarray, substeps: int) -> dict[int, str]:
+def broken_states(faults: np.ndarray | torch.Tensor, substeps: int) -> dict[int, str]:
     """Environments whose state is broken, and since when.
 
     Args:
-        faults: Number of the substep in which it broke, from 1 on, or 0, shape [batch].
+        faults: Number of the substep in which it broke, from 1 on, or 0, shape [batch]; a CUDA tensor is
+            fetched only if there is one.
         substeps: Substeps of an environment step.
     """
+    if not faults.any():
+        return {}
+    if on_device(faults):
+        faults = faults.cpu().numpy()
     what = "the state is not finite or a particle crosses the domain"
     failures = {}
     for e in np.flatnonzero(faults):
@@ -33,7 +38,7 @@ def broken_states(faults: np.ndarray, substeps: int) -> dict[int, str]:
 
 def broken_terms(values: np.ndarray) -> dict[int, str]:
     """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
-    5]."""
+    6]."""
     broken = ~np.isfinite(values).all(axis=2)
     first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
     when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}

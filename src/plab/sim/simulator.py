@@ -21,7 +21,7 @@ from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State, rest_state
 from plab.sim.storage import MEASURES
 from plab.sim.tape import Tape
-from plab.sim.tensors import action_array, numbers_of, on_device
+from plab.sim.tensors import action_array, numbers_of, on_device, step_actions
 
 if TYPE_CHECKING:
     import torch
@@ -243,22 +243,26 @@ class Simulator:
         self._particles.order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
+        self._checked = True
         self._engine.touched.fill(0)
 
-    def step(self, actions: np.ndarray | torch.Tensor) -> None:
+    def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
         """Advance all environments by one environment step, without keeping history.
 
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. A CUDA tensor is taken as it is.
+            check: Whether to wait for the step and look for faults. If not, the next :meth:`measure` does.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
-            SimulationError: If the state stops being finite.
+            SimulationError: If the state stops being finite and ``check`` is set.
         """
         self._require_runtime()
-        array = action_array(actions, self.batch, self.action_dim, self.device, steps=1)
+        array = step_actions(actions, self.batch, self.action_dim, self.device)
         self._particles.step(self._pose, array)
-        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
+        self._checked = check
+        if check:
+            require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
 
     def rollout(
         self, actions: np.ndarray | torch.Tensor, gradient: bool = True, *, strict: bool = True
@@ -292,7 +296,7 @@ class Simulator:
         self._particles.losses(terms, 0)
         self._tape.forward(array, poses, terms, steps, plan)
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
-        failures = broken_terms(values) | broken_states(self._engine.fault.to_numpy(), self.substeps)
+        failures = broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
             require_none(failures)
         actions_bar = None
@@ -337,10 +341,18 @@ class Simulator:
         return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
 
     def measure(self, like: torch.Tensor | None = None) -> Measures:
-        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type."""
+        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type.
+
+        Raises:
+            SimulationError: If the last step, which was not to look for faults, broke the state.
+        """
         self._require_runtime()
         self._particles.losses(self._scratch_terms, 0)
-        return self._measures(numbers_of(self._scratch_terms, (self.batch, MEASURES), like))
+        values = numbers_of(self._scratch_terms, (self.batch, MEASURES), like)
+        checked, self._checked = self._checked, True
+        if not checked:
+            require_none(broken_states(values[:, -1], self.substeps))
+        return self._measures(values)
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
@@ -436,7 +448,7 @@ class Simulator:
         self._initial.from_numpy(self._particles.pack(start))
 
     def _measures(self, values: np.ndarray | torch.Tensor) -> Measures:
-        """Loss terms and IoU from the kernels' measures, shape [..., batch, 5]."""
+        """Loss terms and IoU from the kernels' measures, shape [..., batch, 6]."""
         overlap, peak = values[..., 3], values[..., 4]
         scale = values.new_tensor(self._target_scale) if on_device(values) else self._target_scale
         target_sum, target_peak = scale

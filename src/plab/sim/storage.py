@@ -46,8 +46,9 @@ __all__ = [
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9)."""
 
-MEASURES = 5
-"""Entries per environment of what a state is judged by: density, SDF and contact term, overlap, peak."""
+MEASURES = 6
+"""Entries per environment of what a state is judged by: density, SDF and contact term, overlap, peak, and the
+fault: the number of the substep in which the state broke, from 1 on, or 0."""
 
 BLOCK_BITS = 2
 BLOCK = 1 << BLOCK_BITS

@@ -4,6 +4,7 @@ Taichi and PyTorch work in the same context and in the default stream; a kernel 
 takes an array's.
 """
 
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ import taichi as ti
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["action_array", "numbers_of", "on_device", "tensor_from", "write_numbers"]
+__all__ = ["action_array", "numbers_of", "on_device", "step_actions", "tensor_from", "write_numbers"]
 
 
 def on_device(array: object) -> bool:
@@ -38,8 +39,8 @@ def tensor_from(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> obje
     out = like.new_empty(int(np.prod(shape)))
     if out.numel():
         write_numbers(array, out)
-        # The caller may go on in a stream of its own.
-        ti.sync()
+        if not _in_default_stream():
+            ti.sync()
     return out.reshape(shape)
 
 
@@ -56,17 +57,43 @@ def numbers_of(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> "np.n
     return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
 
 
-def action_array(
-    actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str, steps: int | None = None
-) -> ti.Ndarray:
-    """Actions for the kernels.
+def step_actions(
+    actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
+) -> "np.ndarray | torch.Tensor | ti.Ndarray":
+    """Actions of one environment step for the kernels, which take them from where they are.
 
     Args:
-        actions: Shape [batch, T, action], or [batch, action] if ``steps`` is 1.
+        actions: Shape [batch, action].
+        batch: Number of environments.
+        components: Action components.
+        device: Device of the simulation, ``cpu`` or ``cuda``.
+
+    Returns:
+        Actions of all environments, float64.
+
+    Raises:
+        ValueError: If the shape is wrong or an action is not finite.
+    """
+    numbers = _numbers(_of_shape(actions, (batch, components), "(batch, components)"))
+    if on_device(numbers) and device == "cuda" and numbers.shape[0]:
+        # Another stream may use their memory again before the kernels have read it.
+        return numbers if _in_default_stream() else _array_of(numbers, device)
+    # A copy: kernels take arrays as something that they might write to.
+    array = np.zeros(max(1, numbers.shape[0]))
+    array[: numbers.shape[0]] = numbers.cpu() if on_device(numbers) else numbers
+    return array
+
+
+def action_array(
+    actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
+) -> ti.Ndarray:
+    """Actions of a rollout for the kernels.
+
+    Args:
+        actions: Shape [batch, T, action].
         batch: Number of environments.
         components: Action components per environment step.
         device: Device of the simulation, ``cpu`` or ``cuda``.
-        steps: 1 for the actions of one step without an axis of steps, or None.
 
     Returns:
         Actions of all environments, step by step, float64.
@@ -74,22 +101,61 @@ def action_array(
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
+    shape = np.shape(actions)
+    expected = (batch, shape[1] if len(shape) == 3 else "T", components)
+    actions = _of_shape(actions, expected, "(batch, steps, components)")
+    return _array_of(_numbers(actions.swapaxes(0, 1)), device)
+
+
+def _of_shape(
+    actions: "np.ndarray | torch.Tensor", expected: tuple[object, ...], named: str
+) -> "np.ndarray | torch.Tensor":
+    """Actions as a CUDA tensor if they are one, else as an array of float64.
+
+    Raises:
+        ValueError: If they have another shape.
+    """
     actions = actions if on_device(actions) else np.asarray(actions, np.float64)
-    expected = (batch, components)
-    if steps is None:
-        expected = (batch, actions.shape[1] if actions.ndim == 3 else "T", components)
     if tuple(actions.shape) != expected:
-        named = " (batch, steps, components)" if steps is None else " (batch, components)"
-        raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected}{named}")
-    finite = actions.isfinite() if on_device(actions) else np.isfinite(actions)
-    if not finite.all():
-        raise ValueError("actions contain NaN or infinity")
-    flat = actions.swapaxes(0, 1).reshape(-1) if steps is None else actions.reshape(-1)
-    array = ti.ndarray(ti.f64, shape=max(1, flat.shape[0]))
-    if not flat.shape[0]:
-        return array
-    if on_device(actions) and device == "cuda":
-        write_numbers(flat.detach().contiguous(), array)
+        raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected} {named}")
+    return actions
+
+
+def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor":
+    """Actions one after the other, float64; a CUDA tensor is complete when this returns.
+
+    Raises:
+        ValueError: If one of them is not finite.
+    """
+    if on_device(actions):
+        flat = actions.detach().reshape(-1).double().contiguous()
+        finite = bool(flat.isfinite().all())
     else:
-        array.from_numpy(np.ascontiguousarray(flat.cpu().double() if on_device(flat) else flat))
+        flat = np.ascontiguousarray(actions).reshape(-1)
+        finite = bool(np.isfinite(flat).all())
+    if not finite:
+        raise ValueError("actions contain NaN or infinity")
+    return flat
+
+
+def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
+    """Copy numbers to an array of Taichi's, of one entry at least."""
+    array = ti.ndarray(ti.f64, shape=max(1, numbers.shape[0]))
+    if not numbers.shape[0]:
+        return array
+    if on_device(numbers) and device == "cuda":
+        write_numbers(numbers, array)
+        if not _in_default_stream():
+            ti.sync()
+    else:
+        array.from_numpy(numbers.cpu().numpy() if on_device(numbers) else numbers)
     return array
+
+
+def _in_default_stream() -> bool:
+    """Whether PyTorch works in the stream in which Taichi's kernels run, so that neither waits for the other.
+
+    Whoever has a CUDA tensor has imported PyTorch.
+    """
+    cuda = sys.modules["torch"].cuda
+    return bool(cuda.current_stream() == cuda.default_stream())
