@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from plab.scene import Body, Scene
-from plab.sim import Simulator, State
+from plab.sim import Simulator, Skips, State
 from suite import DEVICE
 
 GRID = 16
@@ -107,8 +107,10 @@ def index(name: str) -> int:
 
 
 def build() -> Simulator:
-    """The simulator of all environments, float64 on the CPU."""
-    return Simulator(list(SCENES.values()), precision="float64", device=DEVICE, particles=list(START))
+    """The simulator of all environments, float64; on CUDA :func:`kirchhoff_stress` needs all adjoints."""
+    skips = Skips(adjoints=DEVICE == "cpu")
+    scenes = list(SCENES.values())
+    return Simulator(scenes, precision="float64", device=DEVICE, particles=list(START), skips=skips)
 
 
 def at_rest() -> dict[str, np.ndarray]:
@@ -160,6 +162,9 @@ def angular_momentum(state: State) -> np.ndarray:
 def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mapping and stress of given deformations, computed by the simulator's own substep.
 
+    On CUDA stress stays in registers in the forward pass; the backward pass, which computes it again, keeps
+    it.
+
     Args:
         sim: The simulator of :func:`build`.
         trial: Trial deformation gradients, shape [batch, particle, 3, 3].
@@ -167,13 +172,22 @@ def kirchhoff_stress(sim: Simulator, trial: np.ndarray) -> tuple[np.ndarray, np.
     Returns:
         New deformation gradients and Kirchhoff stresses, both of the shape of ``trial``.
     """
-    put(sim, {**at_rest(), "F": trial})
-    state = advance(sim, 1)
+    fields = {**at_rest(), "F": trial}
+    if sim.device == "cuda":
+        sim.set_initial_state(State(**fields, poses=sim.poses()))
+        sim.rollout(np.zeros((sim.batch, 1, 0)))
+        state = sim.state()
+        order = sim._particles.order.current()
+        sim.set_initial_state(State(**at_rest(), poses=sim.poses()))
+    else:
+        put(sim, fields)
+        state = advance(sim, 1)
+        order = sim._particles.order.current()
     engine = sim._engine
     b, n = trial.shape[:2]
     # With C = 0 what the particles hand to the grid is the stress alone.
     tiles = engine.affine.to_numpy().reshape(b, engine.tiles, 9, engine.lanes)
     flat = tiles.transpose(0, 1, 3, 2).reshape(b, -1, 9)[:, :n] / engine.stress_scale
     tau = np.empty((b, n, 9))
-    np.put_along_axis(tau, sim._particles.order.current()[:, :, None], flat, axis=1)
+    np.put_along_axis(tau, order[:, :, None], flat, axis=1)
     return state.F, tau.reshape(b, n, 3, 3)

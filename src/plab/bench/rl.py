@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import taichi as ti
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
@@ -97,6 +98,9 @@ def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Ca
     def timed(*args: Any, **kwargs: Any) -> Any:
         start = time.perf_counter()
         result = call(*args, **kwargs)
+        if part == "simulate":
+            # A step on CUDA is only queued.
+            ti.sync()
         seconds[part] += time.perf_counter() - start
         return result
 

@@ -129,15 +129,15 @@ def _forward(
     simulator = load.simulator
     simulator.reset()
     stride = max(simulator.particle_count // OBSERVED_PARTICLES, 1)
-    actions = torch.as_tensor(load.actions, device="cuda") if tensors else load.actions
-    like = actions if tensors else None
+    like = torch.as_tensor(load.actions, device="cuda") if tensors else None
+    actions = load.actions if like is None else like
     for t in range(load.steps):
         simulator.step(actions[:, t], check=not reward)
-        if reward:
-            simulator.measure(like)
         if observation:
             simulator.observe(stride, like)
             simulator.poses(like)
+        if reward:
+            simulator.measure(like)
     ti.sync()
 
 

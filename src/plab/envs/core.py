@@ -245,11 +245,13 @@ class EpisodeBatch:
             raise ResetNeeded(f"{what}: call reset() before step()")
         # Faults are found with the measures: one wait for the device less.
         simulator.step(actions, check=False)
+        # Queued before the wait for the measures.
+        observation = self._observe(actions)
         info = self._info(actions)
         self._step += 1
         start = self._initial_info["loss"]
         reward = (actions.new_tensor(start) if on_device(actions) else start) - info["loss"]
-        return Transition(self._observe(actions), reward, self._step == self.horizon, info)
+        return Transition(observation, reward, self._step == self.horizon, info)
 
     def frames(self) -> tuple[np.ndarray, ...]:
         """Draw the current states.

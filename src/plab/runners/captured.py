@@ -8,11 +8,12 @@ launch. Nothing else differs from the classes they are made from; on the CPU the
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.utils import explained_variance, polyak_update
 from torch import Tensor
 from torch.nn import functional
@@ -183,11 +184,11 @@ class CapturedPPO(_Captured, PPO):
         if self.normalize_advantage and len(advantages) > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         ratio = torch.exp(log_prob - old_log_prob)
-        clip = self.clip_range(1.0)
+        clip = _limit(self.clip_range)
         clipped = advantages * torch.clamp(ratio, 1 - clip, 1 + clip)
         policy_loss = -torch.min(advantages * ratio, clipped).mean()
         if self.clip_range_vf is not None:
-            reach = self.clip_range_vf(1.0)
+            reach = _limit(self.clip_range_vf)
             values = old_values + torch.clamp(values - old_values, -reach, reach)
         value_loss = functional.mse_loss(returns, values)
         entropy_loss = -torch.mean(-log_prob if entropy is None else entropy)
@@ -216,10 +217,10 @@ class CapturedPPO(_Captured, PPO):
             "loss": rows[-1, 5],
             "explained_variance": explained,
             "std": torch.exp(self.policy.log_std).mean().item(),
-            "clip_range": self.clip_range(1.0),
+            "clip_range": _limit(self.clip_range),
         }
         if self.clip_range_vf is not None:
-            values["clip_range_vf"] = self.clip_range_vf(1.0)
+            values["clip_range_vf"] = _limit(self.clip_range_vf)
         for name, value in values.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -238,10 +239,11 @@ class CapturedSAC(_Captured, SAC):
     def train_captured(self, gradient_steps: int, batch_size: int) -> None:
         """Do what :meth:`train` of Stable-Baselines3 does with recorded updates."""
         self.policy.set_training_mode(True)
-        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer, self.ent_coef_optimizer])
+        optimizers = [self.actor.optimizer, self.critic.optimizer, cast(Optimizer, self.ent_coef_optimizer)]
+        self._update_learning_rate(optimizers)
         update, rows = self._captured(self._one_update), []
         for _ in range(gradient_steps):
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            data = cast(ReplayBuffer, self.replay_buffer).sample(batch_size, env=self._vec_normalize_env)
             rows.append(update(*data[:5]).clone())
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -255,11 +257,15 @@ class CapturedSAC(_Captured, SAC):
         Returns:
             Entropy coefficient, its loss, and those of critics and actor, shape [4].
         """
+        log_ent_coef, ent_coef_optimizer = (
+            cast(Tensor, self.log_ent_coef),
+            cast(Optimizer, self.ent_coef_optimizer),
+        )
         own_actions, log_prob = self.actor.action_log_prob(observations)
         log_prob = log_prob.reshape(-1, 1)
-        ent_coef = torch.exp(self.log_ent_coef.detach())
-        ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
-        _descend(self.ent_coef_optimizer, ent_coef_loss)
+        ent_coef = torch.exp(log_ent_coef.detach())
+        ent_coef_loss = -(log_ent_coef * (log_prob + float(self.target_entropy)).detach()).mean()
+        _descend(ent_coef_optimizer, ent_coef_loss)
         with torch.no_grad():
             next_actions, next_log_prob = self.actor.action_log_prob(next_observations)
             next_values = torch.cat(self.critic_target(next_observations, next_actions), dim=1)
@@ -267,7 +273,7 @@ class CapturedSAC(_Captured, SAC):
             next_values = next_values - ent_coef * next_log_prob.reshape(-1, 1)
             targets = rewards + (1 - dones) * self.gamma * next_values
         judged = self.critic(observations, actions)
-        critic_loss = 0.5 * sum(functional.mse_loss(values, targets) for values in judged)
+        critic_loss = 0.5 * torch.stack([functional.mse_loss(values, targets) for values in judged]).sum()
         _descend(self.critic.optimizer, critic_loss)
         least, _ = torch.min(torch.cat(self.critic(observations, own_actions), dim=1), dim=1, keepdim=True)
         actor_loss = (ent_coef * log_prob - least).mean()
@@ -294,7 +300,7 @@ class CapturedTD3(_Captured, TD3):
         critic_losses, actor_losses = [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            data = cast(ReplayBuffer, self.replay_buffer).sample(batch_size, env=self._vec_normalize_env)
             delayed = self._n_updates % self.policy_delay != 0
             losses = (critics if delayed else both)(*data[:5]).clone()
             critic_losses.append(losses[:1])
@@ -316,7 +322,7 @@ class CapturedTD3(_Captured, TD3):
             next_values, _ = torch.min(next_values, dim=1, keepdim=True)
             targets = rewards + (1 - dones) * self.gamma * next_values
         judged = self.critic(observations, actions)
-        critic_loss = sum(functional.mse_loss(values, targets) for values in judged)
+        critic_loss = torch.stack([functional.mse_loss(values, targets) for values in judged]).sum()
         _descend(self.critic.optimizer, critic_loss)
         return critic_loss.detach().reshape(1)
 
@@ -330,6 +336,11 @@ class CapturedTD3(_Captured, TD3):
         polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
         polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
         return torch.cat([critic_loss, actor_loss.detach().reshape(1)])
+
+
+def _limit(schedule: Any) -> float:
+    """Return the value of a schedule that is constant, as clip ranges are here."""
+    return float(schedule(1.0))
 
 
 def _descend(optimizer: Optimizer, loss: Tensor) -> None:

@@ -124,7 +124,11 @@ class EpisodeReplay(ReplayBuffer):
         self.actions[place] = action
         self.rewards[place] = reward
         if self._copies is not None:
-            changed = {"observations": slice(first, first + 2), "actions": place, "rewards": place}
+            changed: dict[str, Any] = {
+                "observations": slice(first, first + 2),
+                "actions": place,
+                "rewards": place,
+            }
             for name, rows in changed.items():
                 self._copies[name][rows] = torch.from_numpy(getattr(self, name)[rows]).to(self.device)
         self.added += 1
@@ -147,7 +151,7 @@ class EpisodeReplay(ReplayBuffer):
         envs = np.random.randint(0, self.n_envs, size=len(batch_inds))  # noqa: NPY002
         first = batch_inds + batch_inds // self._horizon
         if self._copies is not None and env is None:
-            return self._samples_on_device(batch_inds, first, envs)
+            return self._samples_on_device(self._copies, batch_inds, first, envs)
         data = (
             self._normalize_obs(self.observations[first, envs], env),
             self.actions[batch_inds, envs],
@@ -159,18 +163,18 @@ class EpisodeReplay(ReplayBuffer):
         return ReplayBufferSamples(*(self.to_torch(cast(np.ndarray, array)) for array in data))
 
     def _samples_on_device(
-        self, places: np.ndarray, first: np.ndarray, envs: np.ndarray
+        self, copies: dict[str, torch.Tensor], places: np.ndarray, first: np.ndarray, envs: np.ndarray
     ) -> ReplayBufferSamples:
         """Take samples from the copies; see :meth:`_get_samples`."""
         numbers = torch.from_numpy(np.stack([places, first, envs])).to(self.device)
         place, row, env = numbers
-        observations = self._copies["observations"]
+        observations = copies["observations"]
         return ReplayBufferSamples(
             observations[row, env],
-            self._copies["actions"][place, env],
+            copies["actions"][place, env],
             observations[row + 1, env],
             torch.zeros((len(places), 1), device=self.device),
-            self._copies["rewards"][place, env].reshape(-1, 1),
+            copies["rewards"][place, env].reshape(-1, 1),
         )
 
     def flush(self) -> None:

@@ -224,12 +224,14 @@ class CudaEngine(CudaPhases):
         actions: ti.Ndarray,
         actions_bar: ti.Ndarray,
         terms: ti.Ndarray,
+        at: int,
         slot: int,
         t: int,
         stamp: int,
         contact: int,
     ) -> None:
-        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and its loss.
+        """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and of its
+        loss, with the measures that it is made of written to ``terms`` from entry ``at``.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it, ``pose_bar``
         likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does not matter and
@@ -237,7 +239,7 @@ class CudaEngine(CudaPhases):
         """
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
-        self.losses_kernel(state, end, terms, 0, stamp)
+        self.losses_kernel(state, end, terms, at, stamp)
         self.loss_gradient_kernel(state, end, bar)
         for back in range(self.substeps if contact else 0):
             s = self.substeps - 1 - back
@@ -452,6 +454,12 @@ class CudaEngine(CudaPhases):
         self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1), t: ti.i32
     ):
         """Adjoint of all manipulators' motion in environment step t, from its frames' adjoints."""
+        for q in range(self.pose_threads * self.substeps):
+            s = q // self.pose_threads
+            r = q % self.pose_threads
+            for m in ti.static(range(self.manipulators)):
+                if r // self.batch == m:
+                    self.share_frame(r % self.batch, m, s)
         for q in range(self.pose_threads):
             for m in ti.static(range(self.manipulators)):
                 if q // self.batch == m:

@@ -58,15 +58,23 @@ class OrderPhases(WarpPhases):
         self.cell_count[node] = begin + upto - count
 
     @ti.kernel
-    def find_order(
+    def sort(
         self,
         state: ti.types.ndarray(ndim=1),
         slot: ti.i32,
+        target: ti.types.ndarray(ndim=1),
+        target_slot: ti.i32,
+        numbers: ti.types.ndarray(ndim=1),
+        after: ti.types.ndarray(ndim=1),
         moves: ti.types.ndarray(ndim=1),
         t: ti.i32,
         stamp: ti.i32,
     ):
-        """Write the move that puts the particles of a time slot into the order of their cells."""
+        """Put the particles of a time slot into the order of their cells, in another slot or array.
+
+        The move is written as that of step t, and which given particle is where after it to ``after``, from
+        which was where before it, ``numbers``.
+        """
         self.block_count[0] = 0
         for e in range(self.batch):
             self.placed[e] = 0
@@ -93,6 +101,29 @@ class OrderPhases(WarpPhases):
             for turn in range(self.turns_of(w, self.active_nodes())):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.cell_count[e * self.nodes + self.linear_in_block(block, r)] = 0
+        for q in range(self.particle_threads):
+            _e, place = self.particle_of(q)
+            after[q] = numbers[q - place + moves[t * self.particle_threads + q]]
+            self.move_particle(state, slot, target, target_slot, moves, t, q)
+
+    @ti.func
+    def move_particle(
+        self,
+        source: ti.template(),
+        source_slot,
+        target: ti.template(),
+        target_slot,
+        moves: ti.template(),
+        t,
+        q,
+    ):
+        """Fetch the state that step t's order has at thread q's place."""
+        e, place = self.particle_of(q)
+        origin = moves[t * self.particle_threads + q]
+        read = self.tile_entry(source_slot, e, origin // self.lanes)
+        write = self.tile_entry(target_slot, e, place // self.lanes)
+        for i in ti.static(range(STATE)):
+            target[write + i][place % self.lanes] = source[read + i][origin % self.lanes]
 
     @ti.kernel
     def move(
@@ -106,12 +137,7 @@ class OrderPhases(WarpPhases):
     ):
         """Put the states of a time slot into the order of step t, in another slot or array."""
         for q in range(self.particle_threads):
-            e, place = self.particle_of(q)
-            origin = moves[t * self.particle_threads + q]
-            read = self.tile_entry(source_slot, e, origin // self.lanes)
-            write = self.tile_entry(target_slot, e, place // self.lanes)
-            for i in ti.static(range(STATE)):
-                target[write + i][place % self.lanes] = source[read + i][origin % self.lanes]
+            self.move_particle(source, source_slot, target, target_slot, moves, t, q)
 
     @ti.kernel
     def move_back(
@@ -129,16 +155,3 @@ class OrderPhases(WarpPhases):
             write = self.tile_entry(0, e, origin // self.lanes)
             for i in ti.static(range(STATE)):
                 target[write + i][origin % self.lanes] = source[read + i][place % self.lanes]
-
-    @ti.kernel
-    def follow(
-        self,
-        before: ti.types.ndarray(ndim=1),
-        after: ti.types.ndarray(ndim=1),
-        moves: ti.types.ndarray(ndim=1),
-        t: ti.i32,
-    ):
-        """Write which given particle is at each place after a move, from which was where before it."""
-        for q in range(self.particle_threads):
-            _e, place = self.particle_of(q)
-            after[q] = before[q - place + moves[t * self.particle_threads + q]]

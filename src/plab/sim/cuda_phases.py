@@ -22,8 +22,8 @@ from plab.sim.material import (
     trial_gradient,
     yield_factor,
 )
-from plab.sim.motion import advance_pose
-from plab.sim.pose_phases import PosePhases
+from plab.sim.motion import advance_pose, advance_pose_adjoint
+from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
 from plab.sim.transfer import spline, spline_slope
@@ -55,6 +55,10 @@ class CudaPhases(OrderPhases, PosePhases):
         if hasattr(self, "velocity_bar"):
             return
         super().allocate_adjoint()
+        # What the frames' adjoints add to those of the poses at each substep's end and start.
+        shares = (self.batch, self.substeps, max(1, self.manipulators))
+        self.end_share = ti.Vector.field(8, ti.f64, shape=shares)
+        self.start_share = ti.Vector.field(8, ti.f64, shape=shares)
         self.frame_part = ti.field(
             ti.f64, shape=(self.batch * self.substeps, max(1, self.manipulators), FRAME_ADJOINT)
         )
@@ -329,13 +333,35 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def retreat_through(self, e, m: ti.template(), actions: ti.template(), actions_bar: ti.template(), t):
-        """Adjoint of one manipulator's motion in all substeps of environment step t."""
+        """Adjoint of one manipulator's motion in all substeps of environment step t, from what
+        :meth:`share_frame` has left."""
+        bar = self.pose_bar[e, m]
+        u = self.substep_motion(e, m, actions, t)
+        total = vec7(0.0)
         for back in range(self.substeps):
             s = self.substeps - 1 - back
-            for i in range(FRAME_ADJOINT):
-                self.frame_bar[e, m, i] = self.frame_part[e * self.substeps + s, m, i]
-                self.frame_part[e * self.substeps + s, m, i] = 0.0
-            self.retreat_manipulator(e, m, s, actions, actions_bar, t)
+            pose_bar, u_bar = advance_pose_adjoint(
+                self.motions[m],
+                self.pose[e, s, m],
+                u,
+                self.low[e, m],
+                self.high[e, m],
+                self.minimal_gap[e, m],
+                bar + self.end_share[e, s, m],
+            )
+            bar = pose_bar + self.start_share[e, s, m]
+            total += u_bar
+        self.pose_bar[e, m] = bar
+        self.add_to_action_adjoint(e, m, actions, actions_bar, t, total)
+
+    @ti.func
+    def share_frame(self, e, m: ti.template(), s):
+        """Share the adjoint of a substep's frame out to the poses around it, and clear it."""
+        frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
+        for i in ti.static(range(FRAME_ADJOINT)):
+            frame[i] = self.frame_part[e * self.substeps + s, m, i]
+            self.frame_part[e * self.substeps + s, m, i] = 0.0
+        self.end_share[e, s, m], self.start_share[e, s, m] = self.frame_shares(e, m, s, frame)
 
     # -- losses -------------------------------------------------------------------------------------
 

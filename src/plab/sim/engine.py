@@ -165,13 +165,14 @@ class CpuEngine(CpuPhases):
         actions: ti.types.ndarray(ndim=1),
         actions_bar: ti.types.ndarray(ndim=1),
         terms: ti.types.ndarray(ndim=1),
+        at: ti.i32,
         slot: ti.i32,
         t: ti.i32,
         stamp: ti.i32,
         contact: ti.i32,
     ):
         """Adjoint of one environment step whose states are in slots ``slot`` to ``slot + substeps``, and of
-        its loss.
+        its loss, with the measures that it is made of written to ``terms`` from entry ``at``.
 
         ``bar`` goes from the adjoint of the state after the step to that of the state before it,
         ``pose_bar`` likewise. Where there was no ``contact`` in this step and those before it, ``bar`` does
@@ -190,7 +191,7 @@ class CpuEngine(CpuPhases):
                     if rank == 0:
                         self.advance_manipulators(e, actions, poses, t, t, t + 1)
                     self.barrier(team, size)
-                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, MEASURES * e)
+                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, at + MEASURES * e)
                     if contact:
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
                             self.loss_gradient_chunk(state, end, bar, e, c)

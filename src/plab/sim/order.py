@@ -118,7 +118,7 @@ class ParticleOrder:
         return ti.ndarray(ti.i32, shape=steps * self.places)
 
     def allocate(self, steps: int) -> ti.Ndarray:
-        """Allocate the moves of several environment steps, for :meth:`find`."""
+        """Allocate the moves of several environment steps, for :meth:`sort`."""
         return self._array(steps)
 
     def reset(self) -> None:
@@ -132,24 +132,28 @@ class ParticleOrder:
         batch, particles = self.initial.shape
         return self.numbers.to_numpy().reshape(batch, -1)[:, :particles].astype(np.int64)
 
-    def find(
-        self, state: ti.Ndarray, slot: int, t: int, stamp: int, moves: ti.Ndarray | None = None
-    ) -> ti.Ndarray:
-        """Find the order of the cells for a state and take it as the current one.
+    def sort(
+        self,
+        state: ti.Ndarray,
+        slot: int,
+        target: ti.Ndarray,
+        target_slot: int,
+        t: int,
+        stamp: int,
+        moves: ti.Ndarray | None = None,
+    ) -> None:
+        """Put a state into the order of its cells and take that as the current order.
 
         Args:
             state: Particle states.
             slot: Time slot of the state.
+            target: Where the state goes, another array or slot.
+            target_slot: Time slot there.
             t: Environment step, the entry of ``moves`` that is written.
             stamp: A fresh stamp.
             moves: From :meth:`allocate`; the order's own, with room for step 0, if None.
-
-        Returns:
-            The array that holds the move; the caller moves the state.
         """
         moves = self._moves if moves is None else moves
-        self._engine.find_order(state, slot, moves, t, stamp)
-        self._engine.follow(self.numbers, self._spare, moves, t)
+        self._engine.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
         self.numbers, self._spare = self._spare, self.numbers
         self._changed = True
-        return moves

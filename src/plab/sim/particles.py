@@ -90,8 +90,7 @@ class Particles:
         """
         if self.engine.sorts:
             entry = 0 if moves is None else t
-            moves = self.order.find(self.current, 0, entry, self.take_stamps(1), moves)
-            self.engine.move(self.current, 0, self._spare, 0, moves, entry)
+            self.order.sort(self.current, 0, self._spare, 0, entry, self.take_stamps(1), moves)
             self.current, self._spare = self._spare, self.current
         self.advance(self.current, 0, 0, poses, actions, t, entries)
 

@@ -10,11 +10,12 @@ from plab.sim.motion import (
 )
 from plab.sim.storage import FRAME_ADJOINT, Storage
 
-__all__ = ["PosePhases"]
+__all__ = ["PosePhases", "vec7"]
 
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
 vec7 = ti.types.vector(7, ti.f64)
+vec8 = ti.types.vector(8, ti.f64)
 mat3 = ti.types.matrix(3, 3, ti.f64)
 
 
@@ -107,34 +108,49 @@ class PosePhases(Storage):
         self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t
     ):
         """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
-        frame = self.collect_frame_adjoint(e, m)
+        end_bar, start_bar = self.frame_shares(e, m, s, self.collect_frame_adjoint(e, m))
+        u = self.substep_motion(e, m, actions, t)
+        pose_bar, u_bar = advance_pose_adjoint(
+            self.motions[m],
+            self.pose[e, s, m],
+            u,
+            self.low[e, m],
+            self.high[e, m],
+            self.minimal_gap[e, m],
+            self.pose_bar[e, m] + end_bar,
+        )
+        self.pose_bar[e, m] = pose_bar + start_bar
+        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
+
+    @ti.func
+    def frame_shares(self, e, m: ti.template(), s, frame):
+        """What a frame's adjoint adds to the adjoints of the poses at the end and at the start of substep
+        s."""
         inv_dt = ti.cast(1.0, ti.f64) / self.dt
-        bar = self.pose_bar[e, m]
-        start = self.pose[e, s, m]
+        end_bar = vec8(0.0)
+        start_bar = vec8(0.0)
         rotation_bar = mat3(0.0)
         spin_bar = mat3(0.0)
         for i in ti.static(range(3)):
-            bar[i] += frame[3 + i] * inv_dt
+            end_bar[i] = frame[3 + i] * inv_dt
+            start_bar[i] = frame[i] - frame[3 + i] * inv_dt
             for j in ti.static(range(3)):
                 rotation_bar[i, j] = frame[6 + 3 * i + j]
                 spin_bar[i, j] = frame[15 + 3 * i + j] * inv_dt
-        turning = ti.static(self.motions[m] in ("roll", "grip", "rigid"))
-        if ti.static(turning):
-            q_bar = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
+        start_bar[7] = frame[24]
+        if ti.static(self.motions[m] in ("roll", "grip", "rigid")):
+            end_q = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
+            start_q = rotation_matrix_adjoint(quaternion(self.pose[e, s, m]), rotation_bar - spin_bar)
             for i in ti.static(range(4)):
-                bar[3 + i] += q_bar[i]
-        u = self.substep_motion(e, m, actions, t)
-        pose_bar, u_bar = advance_pose_adjoint(
-            self.motions[m], start, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m], bar
-        )
-        for i in ti.static(range(3)):
-            pose_bar[i] += frame[i] - frame[3 + i] * inv_dt
-        if ti.static(turning):
-            q_bar = rotation_matrix_adjoint(quaternion(start), rotation_bar - spin_bar)
-            for i in ti.static(range(4)):
-                pose_bar[3 + i] += q_bar[i]
-        pose_bar[7] += frame[24]
-        self.pose_bar[e, m] = pose_bar
+                end_bar[3 + i] = end_q[i]
+                start_bar[3 + i] = start_q[i]
+        return end_bar, start_bar
+
+    @ti.func
+    def add_to_action_adjoint(
+        self, e, m: ti.template(), actions: ti.template(), actions_bar: ti.template(), t, u_bar
+    ):
+        """Add the adjoint of :meth:`substep_motion` to that of the action."""
         for i in ti.static(range(self.action_dims[m])):
             entry = (t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)
             if ti.abs(actions[entry]) <= 1.0:

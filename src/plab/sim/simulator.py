@@ -13,6 +13,7 @@ from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, require_alike, with_material
 from plab.sim.engine import CpuEngine
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
+from plab.sim.judging import Judge
 from plab.sim.memory import held_bytes
 from plab.sim.parameters import parameter_gradient
 from plab.sim.particles import Particles
@@ -21,7 +22,7 @@ from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State, rest_state
 from plab.sim.storage import MEASURES
 from plab.sim.tape import Tape
-from plab.sim.tensors import action_array, numbers_of, on_device, step_actions
+from plab.sim.tensors import action_array, numbers_of, on_device, output_for, step_actions
 
 if TYPE_CHECKING:
     import torch
@@ -83,7 +84,7 @@ class Simulator:
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self.batch)
         self._observed: dict[int, ti.Ndarray] = {}
-        self._target_scale = np.full((2, self.batch), np.nan)
+        self._judge = Judge(self.scenes)
         self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
         self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
@@ -229,10 +230,8 @@ class Simulator:
                 raise ValueError(f"target {name} has shape {np.shape(value)}, not {expected}")
         self._engine.target.from_numpy(np.asarray(mass, self._numpy_real).reshape(-1))
         self._engine.target_sdf.from_numpy(np.asarray(sdf, self._numpy_real).reshape(-1))
-        sums = np.asarray(mass, self._numpy_real).astype(np.float64).sum(axis=(1, 2, 3))
-        self._engine.target_sum.from_numpy(sums)
-        peaks = np.asarray(mass, self._numpy_real).astype(np.float64).max(axis=(1, 2, 3))
-        self._target_scale = np.stack([sums, peaks])
+        self._judge.set_target(np.asarray(mass, self._numpy_real).astype(np.float64))
+        self._engine.target_sum.from_numpy(self._judge.target_sum)
 
     # -- forward ------------------------------------------------------------------------------------
 
@@ -294,21 +293,22 @@ class Simulator:
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * MEASURES)
         self._particles.losses(terms, 0)
-        self._tape.forward(array, poses, terms, steps, plan)
+        self._tape.forward(array, poses, None if gradient else terms, steps, plan)
+        bars = None
+        if gradient:
+            bars = self._tape.backward(array, poses, terms, steps, self._steps_before_contact(steps))
         values = terms.to_numpy().reshape(steps + 1, self.batch, MEASURES)
         failures = broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
             require_none(failures)
         actions_bar = None
-        if gradient:
-            contact_free = self._steps_before_contact(steps)
-            bars = self._tape.backward(array, poses, steps, contact_free)
+        if bars is not None:
             actions_bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
             failures = broken_gradients(actions_bar) | failures
             if strict:
                 require_none(failures)
         self._place(poses.to_numpy()[: whole.size].reshape(whole.shape)[-1])
-        judged = self._measures(values)
+        judged = self._judge.measures(values)
         step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
@@ -347,12 +347,16 @@ class Simulator:
             SimulationError: If the last step, which was not to look for faults, broke the state.
         """
         self._require_runtime()
-        self._particles.losses(self._scratch_terms, 0)
-        values = numbers_of(self._scratch_terms, (self.batch, MEASURES), like)
+        if on_device(like):
+            values = output_for(lambda out: self._particles.losses(out, 0), self.batch * MEASURES, True, like)
+            values = values.reshape(self.batch, MEASURES)
+        else:
+            self._particles.losses(self._scratch_terms, 0)
+            values = self._scratch_terms.to_numpy().reshape(self.batch, MEASURES)
         checked, self._checked = self._checked, True
         if not checked:
             require_none(broken_states(values[:, -1], self.substeps))
-        return self._measures(values)
+        return self._judge.measures(values)
 
     def losses(self) -> np.ndarray:
         """Unweighted loss terms (density, SDF, contact) of the current state, shape [batch, 3]."""
@@ -388,11 +392,17 @@ class Simulator:
         """
         self._require_runtime()
         count = -(-self.particle_count // stride)
+        size = self.batch * count * 6
+
+        def fill(out: ti.Ndarray | torch.Tensor) -> None:
+            self._engine.observe(self._particles.current, self._particles.order.numbers, stride, out)
+
+        if on_device(like):
+            return output_for(fill, size, self.precision == "float64", like).reshape(self.batch, count, 6)
         if stride not in self._observed:
-            self._observed[stride] = ti.ndarray(self._runtime.real, shape=self.batch * count * 6)
-        out = self._observed[stride]
-        self._engine.observe(self._particles.current, self._particles.order.numbers, stride, out)
-        return numbers_of(out, (self.batch, count, 6), like)
+            self._observed[stride] = ti.ndarray(self._runtime.real, shape=size)
+        fill(self._observed[stride])
+        return self._observed[stride].to_numpy().reshape(self.batch, count, 6)
 
     def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
@@ -446,18 +456,6 @@ class Simulator:
         self._initial_poses = initial_poses(self.scenes)
         start = rest_state(np.stack(positions), self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))
-
-    def _measures(self, values: np.ndarray | torch.Tensor) -> Measures:
-        """Loss terms and IoU from the kernels' measures, shape [..., batch, 6]."""
-        overlap, peak = values[..., 3], values[..., 4]
-        scale = values.new_tensor(self._target_scale) if on_device(values) else self._target_scale
-        target_sum, target_peak = scale
-        total = self.scenes[0].particle_mass * self.particle_count
-        # Without a target there is no IoU: NaN.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            both = overlap / (peak * target_peak)
-            iou = both / (total / peak + target_sum / target_peak - both)
-        return Measures(values[..., :3], iou)
 
     def _steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done before a manipulator touches any environment's body."""

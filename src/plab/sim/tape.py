@@ -37,7 +37,6 @@ class Tape:
         self._length = 0
         self.bar: ti.Ndarray | None = None
         self._spare_bar: ti.Ndarray | None = None
-        self._scratch_terms = ti.ndarray(ti.f64, shape=MEASURES * self._engine.batch)
 
     # -- memory -------------------------------------------------------------------------------------
 
@@ -112,14 +111,20 @@ class Tape:
     # -- forward and back ---------------------------------------------------------------------------
 
     def forward(
-        self, actions: ti.Ndarray, poses: ti.Ndarray, terms: ti.Ndarray, steps: int, length: int | None
+        self,
+        actions: ti.Ndarray,
+        poses: ti.Ndarray,
+        terms: ti.Ndarray | None,
+        steps: int,
+        length: int | None,
     ) -> None:
         """Run all steps from the current state and leave the last one there.
 
         Args:
             actions: Actions of all steps.
             poses: History of the manipulators' poses; entry 0 is set.
-            terms: Measures after each step are written to it, from the second entry.
+            terms: Measures after each step are written to it, from the second entry; None if
+                :meth:`backward`, which computes them anyway, is to do that.
             steps: Environment steps T.
             length: What :meth:`plan` has returned, or None to keep nothing.
         """
@@ -132,17 +137,19 @@ class Tape:
             k, begins = t // self._length, t % self._length == 0
             if begins and length is not None and steps > length:
                 self._engine.copy_slot(particles.current, 0, self._checkpoints, k)
-            after = (t + 1) * self._engine.batch * MEASURES
+            after = self._entry(t)
             if k == last:
                 if begins:
                     self._engine.copy_slot(particles.current, 0, self._history, 0)
                 self._keep_step(t, actions, poses, known=False)
-                end = self._first_slot(t) + self._engine.substeps
-                particles.losses(terms, after, self._history, end)
+                if terms is not None:
+                    end = self._first_slot(t) + self._engine.substeps
+                    particles.losses(terms, after, self._history, end)
             else:
                 moves = self._moves if length is not None else None
                 particles.step(poses, actions, t, entries=(t, t + 1), moves=moves)
-                particles.losses(terms, after)
+                if terms is not None:
+                    particles.losses(terms, after)
         if length is not None:
             end = self._first_slot(steps - 1) + self._engine.substeps
             self._engine.copy_slot(self._history, end, particles.current, 0)
@@ -153,16 +160,26 @@ class Tape:
         if self._engine.sorts:
             if not known:
                 stamp = self._particles.take_stamps(1)
-                self._particles.order.find(self._history, slot - 1, t, stamp, self._moves)
-            self._engine.move(self._history, slot - 1, self._history, slot, self._moves, t)
+                self._particles.order.sort(
+                    self._history, slot - 1, self._history, slot, t, stamp, self._moves
+                )
+            else:
+                self._engine.move(self._history, slot - 1, self._history, slot, self._moves, t)
         self._particles.advance(self._history, slot, 1, poses, actions, t, (t, t + 1))
 
-    def backward(self, actions: ti.Ndarray, poses: ti.Ndarray, steps: int, contact_free: int) -> ti.Ndarray:
+    def _entry(self, t: int) -> int:
+        """First entry of the measures after step t."""
+        return (t + 1) * self._engine.batch * MEASURES
+
+    def backward(
+        self, actions: ti.Ndarray, poses: ti.Ndarray, terms: ti.Ndarray, steps: int, contact_free: int
+    ) -> ti.Ndarray:
         """Go back through the steps that :meth:`forward` has run with a length.
 
         Args:
             actions: The same actions.
             poses: The same history.
+            terms: Measures after each step are written to it, from the second entry.
             steps: Environment steps T.
             contact_free: Steps at the start through which particles' adjoints need not be followed.
 
@@ -184,7 +201,8 @@ class Tape:
                 poses,
                 actions,
                 actions_bar,
-                self._scratch_terms,
+                terms,
+                self._entry(t),
                 self._first_slot(t),
                 t,
                 self._particles.take_stamps(engine.substeps + 1),

@@ -5,7 +5,8 @@ takes an array's.
 """
 
 import sys
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import taichi as ti
@@ -13,7 +14,7 @@ import taichi as ti
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["action_array", "numbers_of", "on_device", "step_actions", "tensor_from", "write_numbers"]
+__all__ = ["action_array", "numbers_of", "on_device", "output_for", "step_actions", "write_numbers"]
 
 
 def on_device(array: object) -> bool:
@@ -28,20 +29,22 @@ def write_numbers(source: ti.types.ndarray(ndim=1), target: ti.types.ndarray(ndi
         target[i] = source[i]
 
 
-def tensor_from(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> object:
-    """Copy an array of scalars to a new tensor.
+def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
+    """Let a kernel fill a new tensor.
 
     Args:
-        array: Array on the CUDA device.
-        shape: Shape of the tensor; what the array holds beyond it is left out.
-        like: A CUDA tensor, whose device and type the new one takes.
+        fill: Launches the kernel, given the tensor, of shape [count].
+        count: Numbers.
+        double: Whether they are float64, else float32.
+        like: A CUDA tensor, whose device and type the result takes.
     """
-    out = like.new_empty(int(np.prod(shape)))
-    if out.numel():
-        write_numbers(array, out)
+    torch = sys.modules["torch"]
+    out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
+    if count:
+        fill(out)
         if not _in_default_stream():
             ti.sync()
-    return out.reshape(shape)
+    return out.to(like.dtype)
 
 
 def numbers_of(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> "np.ndarray | torch.Tensor":
@@ -50,10 +53,11 @@ def numbers_of(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> "np.n
     Args:
         array: Array on the device of the simulation.
         shape: Shape of the result; what the array holds beyond it is left out.
-        like: Given a CUDA tensor, the result is one too, as :func:`tensor_from` makes it.
+        like: Given a CUDA tensor, the result is one too, of its type.
     """
     if on_device(like):
-        return tensor_from(array, shape, like)
+        count = int(np.prod(shape))
+        return output_for(lambda out: write_numbers(array, out), count, True, like).reshape(shape)
     return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
 
 
