@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.bench import opcount, paper, skips, speed
+from plab.bench import everyday, opcount, paper, skips, speed
 from plab.bench.table import report
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
@@ -180,3 +180,25 @@ def test_memory_is_what_it_is_said_to_be() -> None:
     assert 150.0 < more[1] <= 400.0
     assert more[2] - fewer[2] == pytest.approx(more[1] - fewer[1] + replaced, rel=0.05)
     np.testing.assert_array_equal(fewer[0].gradient, more[0].gradient)
+
+
+def test_everyday_things_are_timed_in_turns_with_another_source_tree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(everyday, "SETTLE", 0.0)
+    other, path = Path(everyday.plab.__file__).parents[1], tmp_path / "everyday.csv"
+    things = ["import plab", "load, first time"]
+    everyday.main(
+        ["--runs", "2", "--repeats", "2", "--against", str(other), "--only", *things, "--csv", str(path)]
+    )
+    rows = read(path)
+    assert [row["what"] for row in rows] == [things[0], things[0], things[1], things[1]]
+    assert all(0 < float(row["cpu_s"]) <= float(row["cpu_max_s"]) for row in rows)
+    # Loading imports pandas, on top.
+    assert float(rows[2]["cpu_s"]) > float(rows[0]["cpu_s"])
+
+
+def test_an_everyday_thing_that_fails_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(everyday, "THINGS", {"fails": ("-c", "raise SystemExit('broken')")})
+    with pytest.raises(RuntimeError, match="broken"):
+        list(everyday.measure(tmp_path, [tmp_path], 1, ["fails"]))

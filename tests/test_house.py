@@ -46,6 +46,19 @@ def test_starting_imports_nothing_heavy(code, tmp_path):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_tables_are_made_without_what_draws_or_simulates(tmp_path):
+    heavy = HEAVY - {"pandas"} | {"scipy.stats"}
+    code = "import sys; from plab.report.__main__ import main; main(['tables', '--results', 'example'])"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}; print(sorted({heavy} & set(sys.modules)))"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT / "src")))
 def test_modules_are_short_and_say_what_they_offer(path):
     text = path.read_text(encoding="utf-8")

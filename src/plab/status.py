@@ -22,7 +22,8 @@ from typing import Any, TypeAlias
 
 from plab.locks import held
 from plab.results import ResultsError, Row, lookup, rows
-from plab.results.files import attributes, opened, split_archive
+from plab.results.files import opened, split_archive
+from plab.results.hdf5 import attributes
 from plab.results.schema import parse_member
 from plab.selection import Selection, SelectionError, select
 from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
@@ -242,8 +243,8 @@ def _measure(run: Run) -> None:
             in_episodes = "train_reward" in table
             done = table["episodes"][()] if in_episodes else range(1, len(seconds) + 1)
             written = Path(run.path).stat().st_mtime
-            run.seconds = float(sum(attributes(file["wall_time"]).values()))
-            run.together = _together(attributes(file["provenance"]), written, run.seconds)
+            run.seconds = float(sum(attributes(file, "wall_time").values()))
+            run.together = _together(attributes(file, "provenance"), written, run.seconds)
     except (ResultsError, OSError, KeyError):
         # It may just have ended, and its partial file be gone.
         return

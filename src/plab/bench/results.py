@@ -32,7 +32,7 @@ from plab.selection import Selection
 from plab.status import survey
 from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 
-__all__ = ["main", "synthetic_run", "template"]
+__all__ = ["SETTLE", "main", "synthetic_run", "template", "write_runs"]
 
 SETTLE = 2.5
 """Seconds to wait after writing: the index leaves out files that have changed just now."""
@@ -116,13 +116,24 @@ def _configs(runs: int, rows: int, folder: Path) -> Iterator[dict[str, Any]]:
         yield config
 
 
-def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str, object]]:
-    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
-    results = folder / "results"
-    for config in _configs(runs, rows, results):
+def write_runs(runs: int, rows: int, folder: Path) -> None:
+    """Write result files of the whole suite, of seed after seed.
+
+    Args:
+        runs: How many.
+        rows: Iterations of each.
+        folder: Folder of results.
+    """
+    for config in _configs(runs, rows, folder):
         path = result_path(config)
         path.parent.mkdir(parents=True, exist_ok=True)
         write(synthetic_run(config, rows=rows), path, compress=False)
+
+
+def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str, object]]:
+    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
+    results = folder / "results"
+    write_runs(runs, rows, results)
     time.sleep(SETTLE)
 
     def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:

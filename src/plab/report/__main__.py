@@ -14,7 +14,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
@@ -23,20 +23,19 @@ from plab.examples import resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
-from plab.report.costs import work_precision
-from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
-from plab.report.figures import Drawing, save, style
 from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import write_overview, write_page
-from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
 from plab.selection import SelectionError, select
+
+if TYPE_CHECKING:
+    from plab.report.figures import Drawing
 
 __all__ = ["main", "write_curves", "write_tables"]
 
@@ -190,6 +189,12 @@ def write_curves(
     Returns:
         The figures.
     """
+    # Imported here: tables and the page need neither Matplotlib nor SciPy's statistics.
+    from plab.report.costs import work_precision
+    from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
+    from plab.report.figures import save, style
+    from plab.report.series import load_rows, load_series
+
     drawings: list[Drawing] = []
     with style():
         if len(runs.table):

@@ -135,7 +135,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
-    finished = _prefer_usual(complete)
+    finished, unusual = _prefer_usual(complete)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
     table = pd.DataFrame(
@@ -150,7 +150,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         unfinished=len(inside) - len(complete),
         others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
         set_aside=len(complete) - len(finished),
-        unusual=_unusual(finished),
+        unusual=unusual,
         unreadable=[str(error) for error in unreadable],
     )
 
@@ -261,26 +261,28 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield f"{path}{key}", value
 
 
-def _prefer_usual(found: Sequence[Row]) -> list[Row]:
-    """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes."""
-    changes = [len(changed_settings(row.config)) for row in found]
+def _prefer_usual(found: Sequence[Row]) -> tuple[list[Row], dict[str, list[Any]]]:
+    """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes.
+
+    Returns:
+        These runs, and their settings that are not those of plab's own files: key to the values that occur.
+    """
+    changes = [changed_settings(row.config) for row in found]
     fewest: dict[tuple[str, str], int] = {}
-    for row, count in zip(found, changes, strict=True):
-        fewest[_pair(row)] = min(count, fewest.get(_pair(row), count))
-    return [row for row, count in zip(found, changes, strict=True) if count == fewest[_pair(row)]]
+    for row, changed in zip(found, changes, strict=True):
+        fewest[_pair(row)] = min(len(changed), fewest.get(_pair(row), len(changed)))
+    kept = []
+    unusual: dict[str, set[str]] = defaultdict(set)
+    for row, changed in zip(found, changes, strict=True):
+        if len(changed) == fewest[_pair(row)]:
+            kept.append(row)
+            for key, value in changed.items():
+                unusual[key].add(json.dumps(value))
+    return kept, {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
 
 
 def _pair(row: Row) -> tuple[str, str]:
     return row.values["task"], row.values["method"]
-
-
-def _unusual(found: Sequence[Row]) -> dict[str, list[Any]]:
-    """Return the settings that are not those of plab's own files: key to the values that occur."""
-    unusual: dict[str, set[str]] = defaultdict(set)
-    for row in found:
-        for key, value in changed_settings(row.config).items():
-            unusual[key].add(json.dumps(value))
-    return {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
 
 
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -289,12 +291,18 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         config: The run's configuration.
     """
-    method, name = config["method"]["name"], config["task"]["name"]
-    expected = _usual(method) | _usual_rate(method, name)
-    by_variant = _changed_by_variant(config)
-    task = {f"task.{k}": v for k, v in _usual_task(name).items() if k not in by_variant}
-    own = {key: (value, _present(config, key)) for key, value in (expected | task).items()}
-    return {key: mine for key, (value, mine) in own.items() if key not in _HARMLESS and mine != value}
+    by_variant = {f"task.{key}" for key in _changed_by_variant(config)}
+    expected = _expected(config["method"]["name"], config["task"]["name"])
+    own = {key: (value, _present(config, key)) for key, value in expected.items() if key not in by_variant}
+    return {key: mine for key, (value, mine) in own.items() if mine != value}
+
+
+@functools.cache
+def _expected(method: str, task: str) -> dict[str, Any]:
+    """Return what a method and a task have in plab's files, by dotted key, but for what does not matter."""
+    usual = _usual(method) | _usual_rate(method, task)
+    usual |= {f"task.{key}": value for key, value in _usual_task(task).items()}
+    return {key: value for key, value in usual.items() if key not in _HARMLESS}
 
 
 def _present(config: Mapping[str, Any], key: str) -> Any:
@@ -316,21 +324,22 @@ def _usual(method: str) -> dict[str, Any]:
     return dict(_leaves({name: config[name] for name in sections}))
 
 
-@functools.cache
 def _usual_rate(method: str, task: str) -> dict[str, float]:
     """Return the learning rate of a method that has one of its own for the task."""
-    path = conf_folder() / "method" / f"{method}.yaml"
-    content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    rates = content.get("lr_by_task", {})
+    rates = _own_file("method", method).get("lr_by_task", {})
     return {"method.lr": rates.get(task, rates["default"])} if rates else {}
 
 
-@functools.cache
 def _usual_task(task: str) -> dict[str, Any]:
     """Return the numbers of a task that are no part of bodies, manipulators, target or variants."""
-    path = conf_folder() / "task" / f"{task}.yaml"
-    content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return {key: value for key, value in content.items() if not isinstance(value, dict)}
+    return {key: value for key, value in _own_file("task", task).items() if not isinstance(value, dict)}
+
+
+@functools.cache
+def _own_file(group: str, name: str) -> Mapping[str, Any]:
+    """Return what one of plab's own files says, nothing where plab has no such file."""
+    path = conf_folder() / group / f"{name}.yaml"
+    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _changed_by_variant(config: Mapping[str, Any]) -> Mapping[str, Any]:

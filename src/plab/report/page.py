@@ -25,7 +25,7 @@ from plab.report.methods import Method, method
 from plab.report.series import AXES, Band, band, rows_on_axes
 from plab.report.statistics import stratified_difference
 from plab.report.tables import Cell, Cells, ordered_tasks, settings_note
-from plab.results import RunResult, read
+from plab.results import read_iterations
 
 __all__ = ["write_overview", "write_page"]
 
@@ -135,11 +135,11 @@ def _details(shown: Shown, runs: Runs) -> dict[str, Any]:
     found = {}
     for name in shown.runs:
         rows = own[own["method"] == name].sort_values("seed").to_dict("records")
-        loaded = [read(row["path"]) for row in rows]
-        series = [rows_on_axes(run) for run in loaded]
+        loaded = [read_iterations(row["path"]) for row in rows]
+        series = [rows_on_axes(config, iterations) for config, iterations in loaded]
         found[name] = {
             "best": shown.runs[name]["config_hash"],
-            "runs": [_run(row, run) for row, run in zip(rows, loaded, strict=True)],
+            "runs": [_run(row, config) for row, (config, _) in zip(rows, loaded, strict=True)],
             "curves": {
                 column: {axis: _curve(band(series, axis, column, floor=floor)) for axis in AXES}
                 for column, floor in _COLUMNS.items()
@@ -148,7 +148,7 @@ def _details(shown: Shown, runs: Runs) -> dict[str, Any]:
     return found
 
 
-def _run(row: Mapping[str, Any], run: RunResult) -> dict[str, Any]:
+def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
     batch = row["batch"]
     return {
         "seed": row["seed"],
@@ -163,7 +163,7 @@ def _run(row: Mapping[str, Any], run: RunResult) -> dict[str, Any]:
         "started": row["started"],
         "hash": row["config_hash"],
         "path": row["path"],
-        "command": _command(run.config),
+        "command": _command(config),
     }
 
 

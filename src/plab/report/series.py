@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs
-from plab.results import RunResult, read
+from plab.results import read_iterations
 
 __all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
 
@@ -60,12 +61,12 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
 
 def load_rows(path: str | Path) -> pd.DataFrame:
     """Return the iterations of one run as :func:`load_series` does."""
-    return rows_on_axes(read(path))
+    return rows_on_axes(*read_iterations(path))
 
 
-def rows_on_axes(run: RunResult) -> pd.DataFrame:
+def rows_on_axes(config: Mapping[str, Any], iterations: pd.DataFrame) -> pd.DataFrame:
     """Return the iterations of a run that has been read as :func:`load_series` does."""
-    table, sim = run.iterations.copy(), run.config["sim"]
+    table, sim = iterations.copy(), config["sim"]
     table["seconds"] = table["seconds"].cumsum()
     table["substeps"] = (table["steps"] + sim["horizon"]) * sim["substeps"]
     table["episodes"] += 1

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 __all__ = ["CONFIDENCE", "Interval", "Summary", "stratified_difference", "summarise"]
 
@@ -73,5 +73,6 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
     if not shares.any():
         return Interval(value, value, value)
     degrees = shares.sum() ** 2 / (shares**2 / freedom).sum()
-    reach = float(stats.t.ppf(0.5 + CONFIDENCE / 2, degrees) * np.sqrt(shares.sum()))
+    # SciPy's statistics would take half of the time of all tables to import.
+    reach = float(special.stdtrit(degrees, 0.5 + CONFIDENCE / 2) * np.sqrt(shares.sum()))
     return Interval(value, value - reach, value + reach)

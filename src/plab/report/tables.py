@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -82,15 +83,13 @@ class Cells:
         if source == "ours":
             for key, own in runs.table.groupby(["task", "variant", "method"]):
                 self._scores[key] = own["score"].to_numpy(float)
-        self._configurations = paper_table("iou_per_configuration").set_index(["task", "variant", "method"])
-        self._tasks = paper_table("iou_per_task").set_index(["task", "method"])
 
     def configuration(self, task: str, variant: str, name: str) -> Cell:
         """Return the cell of a task, variant and method."""
         key = (task, variant, name)
         if self.source == "ours":
             return Cell(summarise(self._scores.get(key, [])), len(self._runs.seeds))
-        return Cell(_printed(self._configurations, key, PAPER_SEED_COUNT), 0)
+        return Cell(_printed("iou_per_configuration", key, PAPER_SEED_COUNT), 0)
 
     def task(self, task: str, name: str) -> Cell:
         """Return the cell of a task and method, over all variants."""
@@ -99,13 +98,20 @@ class Cells:
                 self._scores.get((task, variant, name), []) for variant in self._runs.variants
             ]
             return Cell(summarise(np.concatenate(scores)), len(self._runs.variants) * len(self._runs.seeds))
-        return Cell(_printed(self._tasks, (task, name), 5 * PAPER_SEED_COUNT), 0)
+        return Cell(_printed("iou_per_task", (task, name), 5 * PAPER_SEED_COUNT), 0)
 
 
-def _printed(table: pd.DataFrame, key: tuple[str, ...], count: int) -> Summary:
-    if key not in table.index:
-        return summarise([])
-    return Summary(float(table.loc[key, "iou_mean"]), float(table.loc[key, "iou_std"]), count)
+def _printed(name: str, key: tuple[str, ...], count: int) -> Summary:
+    printed = _numbers_of_paper(name).get(key)
+    return summarise([]) if printed is None else Summary(*printed, count)
+
+
+@functools.cache
+def _numbers_of_paper(name: str) -> Mapping[tuple[str, ...], tuple[float, float]]:
+    """Return mean and standard deviation by task, variant (if the table has variants) and method."""
+    rows = paper_table(name).drop(columns=["iou_mean", "iou_std"]).itertuples(index=False, name=None)
+    means = paper_table(name)[["iou_mean", "iou_std"]].to_numpy(float).tolist()
+    return {key: (mean, std) for key, (mean, std) in zip(rows, means, strict=True)}
 
 
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:
@@ -277,8 +283,9 @@ def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
     return best
 
 
+@functools.cache
 def _in_paper(name: str) -> bool:
-    return name in set(paper_table("iou_per_task")["method"])
+    return any(key[-1] == name for key in _numbers_of_paper("iou_per_task"))
 
 
 def settings_note(runs: Runs) -> list[str]:

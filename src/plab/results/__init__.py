@@ -9,7 +9,7 @@ reading results is quick.
 
 from plab.results.archive import pack, unpack
 from plab.results.checking import Problem, check
-from plab.results.files import read, write
+from plab.results.files import read, read_iterations, write
 from plab.results.loading import Row, load, rows
 from plab.results.running import RunFile
 from plab.results.schema import (
@@ -42,6 +42,7 @@ __all__ = [
     "lookup",
     "pack",
     "read",
+    "read_iterations",
     "result_path",
     "rows",
     "unpack",

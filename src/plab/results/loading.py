@@ -17,7 +17,8 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.results.files import attributes, opened, opened_image, split_archive
+from plab.results.files import opened, opened_image, split_archive
+from plab.results.hdf5 import attributes
 from plab.results.index import Index
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
 from plab.selection import lookup
@@ -57,6 +58,8 @@ _ORIGIN = {
     "git_commit": "git_commit",
 }
 """Column to attribute of the group ``provenance``."""
+
+_NAMES = frozenset(_ORIGIN.values())
 
 
 @dataclass(frozen=True)
@@ -205,6 +208,9 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
         by_hash[row.values["config_hash"]].append(row)
     kept = []
     for same in by_hash.values():
+        if len(same) == 1:
+            kept += same
+            continue
         best = [row for row in same if row.values["status"] == "finished"] or same
         loose = [row for row in best if split_archive(row.path) is None]
         kept += loose or best[:1]
@@ -223,29 +229,24 @@ def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | Result
 
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, from its attributes alone."""
-    config = json.loads(file.attrs["config"])
-    evaluation, phases = attributes(file["evaluation"]), attributes(file["wall_time"])
-    table, best, origin = file["iterations"], file["best"].attrs, file["provenance"].attrs
+    own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
+    config, table = json.loads(own["config"]), file["iterations"]
+    evaluation, phases = attributes(file, "evaluation"), attributes(file, "wall_time")
     columns = [str(name) for name in table.attrs["columns"]]
     known = {
         "task": config["task"]["name"],
         "variant": str(config["variant"]),
         "method": config["method"]["name"],
         "seed": config["seed"],
-        "status": file.attrs["status"],
-        "message": file.attrs["message"],
+        "status": own["status"],
+        "message": own["message"],
         "iterations": table[columns[0]].shape[0] if columns else 0,
         "best_iteration": int(best["iteration"]),
         "best_loss": float(best["loss"]),
         "seconds": float(sum(phases.values())),
-        "config_hash": file.attrs["config_hash"],
+        "config_hash": own["config_hash"],
         "path": str(path),
-    } | {name: _plain(origin.get(attribute, np.nan)) for name, attribute in _ORIGIN.items()}
+    } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)
-
-
-def _plain(value: Any) -> Any:
-    """Return a scalar as JSON, hence the index, can hold it."""
-    return value.item() if isinstance(value, np.generic) else value
