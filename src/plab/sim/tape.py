@@ -154,7 +154,7 @@ class Tape:
             if not known:
                 stamp = self._particles.take_stamps(1)
                 self._particles.order.find(self._history, slot - 1, t, stamp, self._moves)
-            self._engine.move(self._history, slot - 1, self._history, slot, self._moves, t)
+            self._particles.order.move(self._history, slot - 1, self._history, slot, self._moves, t)
         self._particles.advance(self._history, slot, 1, poses, actions, t, (t, t + 1))
 
     def backward(self, actions: ti.Ndarray, poses: ti.Ndarray, steps: int, contact_free: int) -> ti.Ndarray:
@@ -171,6 +171,8 @@ class Tape:
         """
         engine = self._engine
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+        # Allocated on the way forward.
+        assert self.bar is not None
         for array in (actions_bar, self.bar, engine.pose_bar, engine.frame_bar, engine.material_bar):
             array.fill(0)
         last = (steps - 1) // self._length
@@ -191,7 +193,7 @@ class Tape:
                 int(t >= contact_free),
             )
             if engine.sorts:
-                engine.move_back(self.bar, self._spare_bar, self._moves, t)
+                self._particles.order.move_back(self.bar, self._spare_bar, self._moves, t)
                 self.bar, self._spare_bar = self._spare_bar, self.bar
         return actions_bar
 
