@@ -11,6 +11,7 @@ import pytest
 from plab.checks import cuda_is_usable
 from plab.config import Config
 from plab.tally import Outcome
+from scheduling import pytest_xdist_make_scheduler  # noqa: F401
 
 
 @pytest.fixture(scope="session")
@@ -59,10 +60,6 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        # What shares a simulator runs in one process, where make test has several.
-        folder = item.path.parent.name
-        item.add_marker(pytest.mark.xdist_group(folder if folder == "verification" else item.path.stem))
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_is_usable():
         for item in needing:
