@@ -8,6 +8,7 @@
 # make lint        style, spelling, imports, unused code and dependencies
 # make typecheck   types of src/
 # make coverage    which lines of src/ the tests run, kernels left out
+# make benchmark   what everyday use waits for, beside what was measured the last time
 # make docs        the documentation as a site, in site/; make docs-serve shows it while it is written
 # make build       wheel and sdist in dist/, and a run of the wheel in an environment and a folder of its own
 #
@@ -30,10 +31,10 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-# A file of tests per process and core at a time: kernels are compiled once per process.
-PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup
+# A file of tests per process and core at a time (tests/scheduling.py): kernels are compiled once per process.
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark
 
-.PHONY: run dev test test-unit test-slow lint typecheck coverage docs docs-serve build clean system-packages \
+.PHONY: run dev test test-unit test-slow lint typecheck coverage benchmark docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
@@ -63,7 +64,10 @@ typecheck: $(VENV)/.dev.stamp
 	$(BIN)/python -m mypy
 
 coverage: $(VENV)/.dev.stamp
-	$(BIN)/python -m pytest -m "not slow" --cov --cov-report=term --cov-report=html
+	$(PARALLEL) -m "not slow" --cov --cov-report=term --cov-report=html
+
+benchmark: $(VENV)/.dev.stamp
+	$(BIN)/python -m pytest benchmarks --benchmark-autosave --benchmark-compare --benchmark-columns=min,median,rounds
 
 docs: $(VENV)/.docs.stamp
 	$(BIN)/python -m properdocs build --strict -f mkdocs.yml
@@ -98,7 +102,7 @@ html: $(VENV)/.report.stamp
 
 clean:
 	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov
-	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks .import_linter_cache
 	find src tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Installed again only when what is to be installed has changed. The dev set-up includes that of runs.

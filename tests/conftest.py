@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 
 import pytest
 
 from plab.checks import cuda_is_usable
 from plab.config import Config
 from plab.tally import Outcome
+from refusals import ending, refusal, snapshot
+from scheduling import pytest_xdist_make_scheduler  # noqa: F401
 from suite import DEVICE
 
 
@@ -58,11 +62,39 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     return configs
 
 
+@pytest.fixture
+def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Call a command line that has to refuse, see that it leaves the folder alone, return what it says."""
+    from plab.run import main
+
+    def call(
+        argv: Sequence[str],
+        entry: Callable[[Sequence[str]], int | None] = main,
+        within: AbstractContextManager[None] | None = None,
+    ) -> str:
+        before = snapshot(tmp_path)
+        with within or nullcontext():
+            code = ending(entry, argv)
+        line = refusal(code, *capsys.readouterr(), argv)
+        assert snapshot(tmp_path) == before
+        return line
+
+    return call
+
+
+@pytest.fixture
+def refused(seen: list[Config], told: Callable[..., str]) -> Callable[..., str]:
+    """The same, and nothing is to have reached the runners."""
+
+    def call(*args: object, **kwargs: object) -> str:
+        line = told(*args, **kwargs)
+        assert seen == []
+        return line
+
+    return call
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        # What shares a simulator runs in one process, where make test has several.
-        folder = item.path.parent.name
-        item.add_marker(pytest.mark.xdist_group(folder if folder == "verification" else item.path.stem))
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_is_usable():
         for item in needing:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +14,7 @@ import yaml
 from importlinter import cli
 
 import plab
+from scheduling import group
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "src").rglob("*.py"))
@@ -69,6 +72,18 @@ def test_modules_are_short_and_say_what_they_offer(path):
         assert "__all__" in text
 
 
+def is_kernel(function: ast.FunctionDef) -> bool:
+    return any(ast.unparse(decorator).startswith("ti.") for decorator in function.decorator_list)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT / "src")))
+def test_functions_need_no_scrolling(path):
+    """Kernels are left out: Taichi's adjoints are written out by hand, term by term."""
+    functions = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.FunctionDef)]
+    lengths = {f.name: f.end_lineno - f.lineno + 1 for f in functions if not is_kernel(f)}
+    assert {name: length for name, length in lengths.items() if length > 60} == {}
+
+
 def test_the_version_is_semantic_and_in_one_place():
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
     assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
@@ -92,3 +107,29 @@ def test_every_dependency_has_its_reason_and_its_pin():
     pins = {line.partition("==")[0].lower().replace("_", "-") for line in open(ROOT / "constraints.txt")}
     # Not together with joblib, and optional: docs/sweeps.md, docs/rl.md.
     assert wanted - pins == {"hydra-ray-launcher", "tensorboard"}
+
+
+TESTS = """
+import os
+
+import pytest
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_it(number):
+    with open("workers", "a") as file:
+        print(__name__, os.environ["PYTEST_XDIST_WORKER"], file=file)
+"""
+
+
+def test_a_file_of_tests_runs_in_one_process(tmp_path):
+    (tmp_path / "conftest.py").write_text("from scheduling import pytest_xdist_make_scheduler\n")
+    for name in ("test_one", "test_two", "test_three"):
+        (tmp_path / f"{name}.py").write_text(TESTS)
+    paths = os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider"]
+    subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, check=True)
+    lines = (tmp_path / "workers").read_text().splitlines()
+    assert len(lines) == 12 and len(set(lines)) == 3
+    assert {line.split()[1] for line in lines} == {"gw0", "gw1"}
+    assert group("tests/verification/test_floor.py::test_it[a::b]") == "tests/verification/"

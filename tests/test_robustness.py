@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,60 +14,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
-from plab import status
 from plab.config import Config, ConfigError, choices, load_config
 from plab.config_types import PpoConfig, SacConfig, SimConfig, Td3Config, TrajectoryConfig
-from plab.report import __main__ as report
 from plab.results import __main__ as results
 from plab.results import read, write
-from plab.run import main
 from plab.scene import SceneError
 from plab.targets import TargetError
+from refusals import snapshot
 
 ROOT = Path(__file__).resolve().parents[1]
 DUMBBELL = (ROOT / "examples" / "own_task" / "conf" / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
-
-Snapshot = dict[str, bytes | None]
-
-
-def snapshot(folder: Path) -> Snapshot:
-    """Everything in a folder: folders, and files with what they hold."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in folder.rglob("*")
-    }
 
 
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def refused(seen, capsys, tmp_path) -> Callable[..., str]:
-    """Call a command line that has to fail, see that it leaves the folder alone, return its last line."""
-
-    def call(argv: Sequence[str], entry: Callable[[Sequence[str]], int] = main) -> str:
-        before = snapshot(tmp_path)
-        try:
-            code = entry(argv)
-        except SystemExit as stop:
-            # How argparse ends.
-            code = stop.code
-        out, err = capsys.readouterr()
-        assert code not in (0, None), f"accepted: {argv}"
-        assert seen == []
-        assert "Traceback" not in out + err
-        lines = err.splitlines()
-        assert lines, f"no message: {argv}"
-        assert lines[-1].startswith("plab") and ": " in lines[-1]
-        # argparse prints the usage, too, which goes over several lines.
-        assert len(lines) == 1 or lines[0].startswith("usage: ")
-        assert len(lines[-1]) > 15
-        assert snapshot(tmp_path) == before
-        return lines[-1]
-
-    return call
 
 
 # ------------------------------------------------------------------------------------------------ overrides
@@ -329,73 +288,6 @@ def test_damaged_results_are_named(refused, tmp_path, how):
     with pytest.raises(Exception, match=path.name) as caught:
         read(path)
     assert type(caught.value).__name__ == "ResultsError" and "\n" not in str(caught.value)
-
-
-TOOLS = [
-    (results.main, []),
-    (results.main, ["mend"]),
-    (results.main, ["check", "nowhere"]),
-    (results.main, ["check", "--all"]),
-    (results.main, ["pack", "nowhere", "--output", "a.plab.zip"]),
-    (results.main, ["pack", ".", "colour=red", "--output", "a.plab.zip"]),
-    (results.main, ["pack", "."]),
-    (results.main, ["pack", ".", "--output", "a.txt"]),
-    (results.main, ["unpack", "nowhere.plab.zip", "--output", "b"]),
-    (results.main, ["unpack"]),
-    (status.main, ["nowhere"]),
-    (status.main, ["one", "two"]),
-    (status.main, [".", "colour=red"]),
-    (status.main, [".", "seed=range(3"]),
-    (status.main, [".", "--json", "--csv"]),
-    (status.main, [".", "--yaml"]),
-    (report.main, []),
-    (report.main, ["graphs"]),
-    (report.main, ["tables", "--results", "nowhere"]),
-    (report.main, ["tables", "colour=red"]),
-    (report.main, ["curves", "--results", "nowhere"]),
-    (report.main, ["tables", "--results", "nowhere", "--speed", "nowhere.csv"]),
-    (report.main, ["tables", "--out"]),
-]
-
-
-@pytest.mark.parametrize(
-    ("entry", "argv"), TOOLS, ids=lambda x: " ".join(x) if isinstance(x, list) else x.__module__
-)
-def test_bad_invocations_of_the_tools(refused, entry, argv):
-    refused(argv, entry)
-
-
-def test_results_where_none_can_be_written(refused, tmp_path):
-    (tmp_path / "file").write_text("in the way\n", encoding="utf-8")
-    write_to = tmp_path / "results"
-    synthetic.save(synthetic.run(write_to))
-    assert "file" in refused(["pack", "results", "--output", "file/a.plab.zip"], results.main)
-    assert "file" in refused(["tables", "--results", "results", "--out", "file/tables"], report.main)
-
-
-@pytest.mark.parametrize(
-    ("module", "argv"),
-    [
-        ("plab.run", ["task=Ropee"]),
-        ("plab.run", ["--mutlirun"]),
-        ("plab.run", ["-m", "variant=1,2", "task=Nope"]),
-        ("plab.render", ["nowhere.h5"]),
-        ("plab.render", ["task=Rope", "--output", "film.avi"]),
-        ("plab.targets", ["--task", "Nope"]),
-        ("plab.status", ["nowhere"]),
-        ("plab.results", ["check", "nowhere"]),
-        ("plab.report", ["tables", "--results", "nowhere"]),
-    ],
-)
-def test_bad_invocations_as_processes(tmp_path, module, argv):
-    done = subprocess.run(
-        [sys.executable, "-m", module, *argv], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert done.returncode != 0
-    assert "Traceback" not in done.stderr and done.stderr.splitlines()[-1].startswith(
-        ("plab", "python -m plab")
-    )
-    assert list(tmp_path.iterdir()) == []
 
 
 # ------------------------------------------------------------------------------------------------ properties

@@ -55,7 +55,7 @@ class BatchLauncher(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run all jobs; see :meth:`hydra.plugins.launcher.Launcher.launch`."""
-        from plab.checks import check_device
+        from plab.checks import check_device, check_packages
         from plab.config import ConfigError
         from plab.results import result_path
         from plab.sweep.carry import carry_here, run_sweep
@@ -77,6 +77,7 @@ class BatchLauncher(Launcher):
         else:
             for cfg in cfgs.values():
                 check_device(cfg)
+                check_packages(cfg)
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]

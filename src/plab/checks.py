@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from importlib.util import find_spec
 
 from plab.config import Config, ConfigError, build_scene
 from plab.targets import check_target, load_release_target
 
-__all__ = ["check_device", "check_sources", "cuda_is_usable"]
+__all__ = ["check_device", "check_packages", "check_sources", "cuda_is_usable"]
 
 
 def check_sources(cfg: Config) -> None:
@@ -34,6 +35,16 @@ def check_device(cfg: Config) -> None:
     """
     if cfg.sim.device == "cuda" and not cuda_is_usable():
         raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
+
+
+def check_packages(cfg: Config) -> None:
+    """Find out whether the optional packages that a run uses are installed.
+
+    Raises:
+        plab.config.ConfigError: If not.
+    """
+    if getattr(cfg.method, "tensorboard", False) and find_spec("tensorboard") is None:
+        raise ConfigError("method.tensorboard=true needs TensorBoard: pip install 'plab[tensorboard]'")
 
 
 def cuda_is_usable() -> bool:

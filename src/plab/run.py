@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.checks import check_device, check_sources
+from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
@@ -110,6 +110,7 @@ def _run(composed: DictConfig) -> float:
         cfg = finish(composed, HydraConfig.get().overrides.task)
         check_sources(cfg)
         check_device(cfg)
+        check_packages(cfg)
         from plab.runners import run_config
         from plab.runners.jobs import USER_ERRORS, RunBusyError, RunError
     except _CONFIG_ERRORS as error:

@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from plab.locks import held
-from plab.results import ResultsError, Row, lookup, rows
+from plab.results import ResultsError, Row, lookup
 from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes
+from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
 from plab.selection import Selection, SelectionError, select
 from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
@@ -149,7 +150,7 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    found, unreadable = rows(source)
+    found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
     runs = {key: Run(*key) for key in _expected(fitting, chosen)}
     others = 0

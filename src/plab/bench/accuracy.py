@@ -30,6 +30,8 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
+from plab.arguments import positive
+from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_places, common_scene, own_components
 from plab.bench.precision import angle
 from plab.bench.table import report
@@ -37,7 +39,7 @@ from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, DEVICES, DeviceError, Simulator
+from plab.sim import CONTACT_MODELS, DEVICES, Simulator
 from plab.suite import task_list
 
 __all__ = ["Setting", "attempts_at", "lattice", "main"]
@@ -373,7 +375,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         type=task_list,
         help=f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)",
     )
-    parser.add_argument("--particles", type=int, help="particles per environment (10000; 1000 with --quick)")
+    what = "particles per environment (10000; 1000 with --quick)"
+    parser.add_argument("--particles", type=positive, help=what)
     parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
     parser.add_argument("--output", type=Path, default=Path("accuracy"), help="folder of what is written")
     options = parser.parse_args(argv)
@@ -382,15 +385,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
     plan = QUICK if options.quick else Plan()
     plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
-    options.output.mkdir(parents=True, exist_ok=True)
-    try:
-        table = report(COLUMNS, rows(tasks, plan), options.output / "accuracy.csv")
-    except DeviceError as error:
-        parser.error(str(error))
+    return answered(lambda: _run(tasks, plan, options.output))
+
+
+def _run(tasks: Sequence[str], plan: Plan, output: Path) -> int:
+    output.mkdir(parents=True, exist_ok=True)
+    table = report(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
     # Imported late: the numbers are there even where Matplotlib is not.
     from plab.bench.diagrams import draw
 
-    for path in draw(pd.DataFrame(table), options.output):
+    for path in draw(pd.DataFrame(table), output):
         print(path)
     return 0
 

@@ -14,12 +14,13 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pandas as pd
 
+from plab.arguments import positive, to_write
+from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
 from plab.bench.table import report
 from plab.config import build_scene, load_config
@@ -178,12 +179,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="plab.bench.precision", description=__doc__.splitlines()[0])
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
     parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
-    parser.add_argument("--particles", type=int, default=1000, help="particles per environment")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
-    parser.add_argument("--markdown", type=Path, help="file to write a table to, a row per task")
+    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
     options = parser.parse_args(argv)
+    return answered(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
     if options.markdown is not None:
+        options.markdown.parent.mkdir(parents=True, exist_ok=True)
         options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles))
     return 0
 

@@ -21,12 +21,13 @@ import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import taichi as ti
 
+from plab.arguments import positive, to_write
+from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
@@ -227,12 +228,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.release", description=__doc__.splitlines()[0])
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
-    parser.add_argument("--particles", type=int, default=1000, help="particles per environment")
+    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
     parser.add_argument("--choice", nargs="+", choices=CHOICES, default=list(CHOICES), help="only these")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
-    report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
-    return 0
+
+    def run() -> int:
+        report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
+        return 0
+
+    return answered(run)
 
 
 if __name__ == "__main__":

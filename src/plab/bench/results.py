@@ -13,6 +13,7 @@ import argparse
 import copy
 import itertools
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sized
@@ -22,6 +23,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.arguments import positive, to_write
+from plab.bench.command import answered
 from plab.bench.table import report
 from plab.config import load_config
 from plab.objective import scores_from_iou
@@ -162,19 +165,24 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
     yield timed("archive again", lambda: load(archive))
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Parse the command line, measure, print, and write a CSV file if asked to."""
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.results", description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=5000, help="number of result files")
-    parser.add_argument("--rows", type=int, default=5, help="iterations of each")
+    parser.add_argument("--runs", type=positive, default=5000, help="number of result files")
+    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
     parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
+    return answered(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
         table = _rows(options.runs, options.rows, Path(folder), options.archive)
         report(("what", "runs", "seconds", "times_faster"), table, options.csv)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -11,6 +11,7 @@ episodes for ppo, in minibatches of the profile's size.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -23,6 +24,8 @@ import taichi as ti
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
+from plab.arguments import positive, to_write
+from plab.bench.command import answered
 from plab.bench.table import report
 from plab.config import Config, PpoConfig, load_config
 from plab.config_types import OffPolicyConfig, RlConfig
@@ -31,6 +34,8 @@ from plab.runners.common import torch_settings
 from plab.runners.rl_trainer import Trainer
 
 __all__ = ["main", "measure"]
+
+METHODS = ("sac", "td3", "ppo")
 
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
 """Simulator's step; loss and IoU; observations and their copy from the device; actions; learning."""
@@ -122,24 +127,29 @@ def _config(overrides: list[str], method: str, num_envs: int, batches: int) -> C
     return cfg
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Parse the command line, measure, print, and write a CSV file if asked to."""
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.rl", description=__doc__.splitlines()[0])
     parser.add_argument(
         "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
     )
-    parser.add_argument("--methods", nargs="+", default=["ppo", "sac"], help="methods")
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], help="numbers of environments")
-    parser.add_argument("--batches", type=int, default=2, help="batches of episodes to time")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["ppo", "sac"], help="methods")
+    parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
+    parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
+    return answered(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     table = (
         measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
         for num_envs in options.envs
         for method in options.methods
     )
     report(COLUMNS, table, options.csv)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

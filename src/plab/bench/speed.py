@@ -18,19 +18,16 @@ import argparse
 import gc
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
+from plab.arguments import positive, to_write
 from plab.bench import paper, scaling, skips
+from plab.bench.command import answered
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
 from plab.bench.table import progress, report
 from plab.bench.workload import KINDS, TENSORS, build, peak_rss_mb, restart_peak_rss, time_calls
-from plab.config import Config, ConfigError, load_config
-from plab.config_errors import COMPOSE_ERRORS, explain
-from plab.scene import SceneError
-from plab.sim import DeviceError, SimulationError
+from plab.config import Config, load_config
 from plab.suite import suite_tasks, task_list
-from plab.targets import TargetError
 
 __all__ = ["COLUMNS", "main", "rows"]
 
@@ -151,20 +148,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
     parser.add_argument("--device", help="the same as sim.device=...")
     parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
-    parser.add_argument("--batch", type=int, nargs="+", default=[1], help="numbers of environments")
-    parser.add_argument("--steps", type=int, help="environment steps per rollout")
-    parser.add_argument("--repeats", type=int, help="timed rollouts")
+    parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
+    parser.add_argument("--steps", type=positive, help="environment steps per rollout")
+    parser.add_argument("--repeats", type=positive, help="timed rollouts")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="what is timed")
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
-    parser.add_argument("--markdown", type=Path, help="file to write the paper's table to")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--skips", nargs="*", metavar="SKIP", help="rows with one skip off; all, or these")
     modes.add_argument("--scaling", action="store_true", help="rows for numbers of particles and grids")
     modes.add_argument("--paper", action="store_true", help="the paper's table beside ours")
     modes.add_argument("--limits", action="store_true", help="what the machine can do")
-    parser.add_argument("--particles", type=int, nargs="+", help="--scaling: numbers of particles")
-    parser.add_argument("--grids", type=int, nargs="+", help="--scaling: nodes per axis")
+    parser.add_argument("--particles", type=positive, nargs="+", help="--scaling: numbers of particles")
+    parser.add_argument("--grids", type=positive, nargs="+", help="--scaling: nodes per axis")
     return parser
 
 
@@ -255,16 +252,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, 1 if a skip changes results, 2 for a mistake of the user's.
     """
     options = _options(argv)
-    try:
-        return _run(options)
-    except COMPOSE_ERRORS as error:
-        message = explain(error)
-    except (ConfigError, SceneError, TargetError, DeviceError, SimulationError, MemoryError) as error:
-        message = str(error)
-    except OSError as error:
-        message = f"cannot write {error.filename}: {error.strerror}"
-    print(f"plab: {message}", file=sys.stderr)
-    return 2
+    return answered(lambda: _run(options))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,8 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
+from plab.arguments import positive, to_write
+from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
@@ -39,6 +41,9 @@ BATCH = 12
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
+
+REFUSAL = "refusal"
+"""Family of the scenes that are to be refused."""
 
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
@@ -77,7 +82,7 @@ def run_refusals() -> Iterator[dict[str, object]]:
     for name, scene in refusals().items():
         row: dict[str, object] = {
             "precision": "any",
-            "family": "refusal",
+            "family": REFUSAL,
             "case": name,
             "speed": "",
             "gradient": "",
@@ -193,16 +198,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="plab.bench.stability", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
-    parser.add_argument("--particles", type=int, help="particles per environment (300; 64 with --quick)")
-    parser.add_argument("--horizon", type=int, help="environment steps of the long horizon (1000)")
+    parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
+    parser.add_argument("--horizon", type=positive, help="environment steps of the long horizon (1000)")
     parser.add_argument("--family", nargs="+", help="only these families of cases")
-    parser.add_argument("--csv", type=Path, help="file to write a row per case to")
-    parser.add_argument("--gradients", type=Path, help="file for the gradient's norm per step back in time")
+    parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
+    what = "file for the gradient's norm per step back in time"
+    parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
     plan = QUICK if options.quick else FULL
     plan = replace(plan, particles=options.particles or plan.particles)
     plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
-    cases = [c for c in stress_cases(plan) if not options.family or c.family in options.family]
+    cases = stress_cases(plan)
+    families = list(dict.fromkeys([case.family for case in cases] + [REFUSAL]))
+    if unknown := set(options.family or ()) - set(families):
+        parser.error(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
+    return answered(lambda: _run(cases, options))
+
+
+def _run(cases: Sequence[Case], options: argparse.Namespace) -> int:
+    cases = [case for case in cases if not options.family or case.family in options.family]
     rows = (row for precision in options.precision for row in run_cases(cases, precision))
     table = list(report(COLUMNS, _chain(rows, options), options.csv))
     if options.gradients is not None:
@@ -229,6 +243,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
         print("no case has a gradient", file=sys.stderr)
         return
     table = pd.concat(parts, ignore_index=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(path, index=False, float_format="%.6g")
     # Imported late: the numbers are there even where Matplotlib is not.
     from plab.bench.diagrams import draw_norms
@@ -238,7 +253,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
 
 def _chain(rows: Iterator[dict[str, object]], options: argparse.Namespace) -> Iterator[dict[str, object]]:
     yield from rows
-    if not options.family or "refusal" in options.family:
+    if not options.family or REFUSAL in options.family:
         yield from run_refusals()
 
 

@@ -21,6 +21,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from plab.arguments import positive, rates, seed, to_write
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, recorded_scores, save_actions
 from plab.demonstrations.search import search
@@ -80,6 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         _show(pd.DataFrame(rows), args.markdown)
     except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
         print(f"plab: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     return 0
 
@@ -152,11 +156,8 @@ def _show(table: pd.DataFrame, markdown: Path | None) -> None:
     if markdown is not None:
         lines = [list(table.columns), ["---"] * len(table.columns), *cells]
         table_text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        markdown.parent.mkdir(parents=True, exist_ok=True)
         markdown.write_text(HEADING + table_text, encoding="utf-8")
-
-
-def _numbers(text: str) -> list[float]:
-    return [float(part) for part in text.split(",")]
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -165,16 +166,19 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
-    parser.add_argument("--markdown", type=Path, help="write the table to this file, too")
+    parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
     parser.add_argument("--record", action="store_true", help="record what is replayed")
     parser.add_argument("--search", action="store_true", help="search for better ones (geometric targets)")
     parser.add_argument(
-        "--lr", type=_numbers, default=[0.1, 0.03, 0.01], help="learning rates of random starts: 0.1,0.01"
+        "--lr", type=rates, default=[0.1, 0.03, 0.01], help="learning rates of random starts: 0.1,0.01"
     )
-    parser.add_argument("--iterations", type=int, default=200, help="updates of each candidate")
-    parser.add_argument("--every", type=int, default=10, help="updates between evaluations")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first actions")
-    return parser.parse_intermixed_args(argv)
+    parser.add_argument("--iterations", type=positive, default=200, help="updates of each candidate")
+    parser.add_argument("--every", type=positive, default=10, help="updates between evaluations")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the first actions")
+    options = parser.parse_intermixed_args(argv)
+    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
+        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    return options
 
 
 if __name__ == "__main__":

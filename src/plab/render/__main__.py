@@ -10,6 +10,7 @@ from typing import NoReturn
 
 from omegaconf import OmegaConf
 
+from plab.arguments import to_write
 from plab.config import ConfigError, choices, load_config
 from plab.render.graphics import RenderError, require_graphics
 from plab.scene import SceneError
@@ -139,6 +140,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.output = arguments.output or Path(f"{cfg.task.name}-v{cfg.variant}.png")
     else:
         raise RenderError("say what to draw: a result file, or a task such as task=Torus; --help explains")
+    try:
+        to_write(str(arguments.output))
+    except argparse.ArgumentTypeError as error:
+        raise RenderError(str(error)) from None
     return arguments
 
 

@@ -14,12 +14,13 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from plab.checks import cuda_is_usable
-from plab.config import load_config
+from plab.config import build_scene, load_config
 from plab.config_types import Config, SimConfig, TaskConfig
 from plab.problem import Problem
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scene import Scene
+from plab.sim import State
 
 __all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts"]
 
@@ -55,7 +56,7 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
 
     Raises:
         plab.results.ResultsError: If the file cannot be read.
-        RenderError: If it has no actions yet.
+        RenderError: If it has no actions yet, or some that its task does not take.
     """
     run = read(path)
     if run.best_actions is None:
@@ -65,7 +66,13 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
         _say("the run used CUDA, which this computer has not: replaying it on the CPU")
         sim.device = "cpu"
     cfg = dataclasses.replace(load_config(), variant=str(run.config["variant"]), task=task, sim=sim)
-    return cfg, run.best_actions
+    actions, components = run.best_actions, build_scene(cfg).action_dim
+    if actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
+        shape = list(actions.shape)
+        raise RenderError(f"{path} has actions of shape {shape}, but its task takes [steps, {components}]")
+    if actions.dtype.kind not in "iuf" or not np.isfinite(actions).all():
+        raise RenderError(f"{path} has actions that are not finite numbers")
+    return cfg, actions
 
 
 def _section(values: dict[str, Any], kind: type[Section]) -> Section:
@@ -80,7 +87,6 @@ def demonstration(cfg: Config) -> np.ndarray:
         RenderError: If the known actions do not fit the scene.
     """
     # Imported here: it reads tables, which the replay of a result does not need.
-    from plab.config import build_scene
     from plab.demonstrations import known_actions
 
     scene, actions = build_scene(cfg), known_actions(cfg)
@@ -112,7 +118,20 @@ def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
     for step in range(actions.shape[1]):
         simulator.step(actions[:, step])
         states.append(simulator.state())
-    scores = problem.scores(simulator.mass_tensor())
+    return _recordings(cfgs, problem, states, simulator.mass_tensor())
+
+
+def starts(cfgs: Sequence[Config]) -> list[Recording]:
+    """Return recordings of no step, of configurations of one kind of scene."""
+    problem = Problem(cfgs)
+    return _recordings(cfgs, problem, [problem.simulator.state()], problem.initial_mass)
+
+
+def _recordings(
+    cfgs: Sequence[Config], problem: Problem, states: Sequence[State], mass: np.ndarray
+) -> list[Recording]:
+    """Return recordings of all environments, from the states of their batch and the last one's mass."""
+    scores = problem.scores(mass)
     return [
         Recording(
             task=cfg.task.name,
@@ -121,25 +140,6 @@ def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
             target_mass=problem.target_mass[number],
             x=np.stack([state.x[number] for state in states]),
             poses=np.stack([state.poses[number] for state in states]),
-            score=scores[number].score,
-        )
-        for number, cfg in enumerate(cfgs)
-    ]
-
-
-def starts(cfgs: Sequence[Config]) -> list[Recording]:
-    """Return recordings of no step, of configurations of one kind of scene."""
-    problem = Problem(cfgs)
-    state = problem.simulator.state()
-    scores = problem.scores(problem.initial_mass)
-    return [
-        Recording(
-            task=cfg.task.name,
-            variant=cfg.variant,
-            scene=problem.scenes[number],
-            target_mass=problem.target_mass[number],
-            x=state.x[number : number + 1],
-            poses=state.poses[number : number + 1],
             score=scores[number].score,
         )
         for number, cfg in enumerate(cfgs)

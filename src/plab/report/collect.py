@@ -16,6 +16,7 @@ import yaml
 
 from plab.report.methods import ordered
 from plab.results import Row, lookup, rows
+from plab.results.loading import readable_rows
 from plab.selection import Selection
 from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 
@@ -130,7 +131,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
         plab.results.ResultsError: If there is nothing at ``source``.
     """
-    found, unreadable = rows(source)
+    found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]

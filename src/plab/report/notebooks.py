@@ -19,7 +19,7 @@ __all__ = ["NOTEBOOKS", "execute", "notebook_folder", "require_packages"]
 NOTEBOOKS = ("reproduction", "speed", "accuracy", "anatomy")
 """Names of the notebooks."""
 
-_PACKAGES = ("jupytext", "nbclient", "nbconvert", "ipykernel")
+_PACKAGES = ("jupytext", "nbclient", "nbconvert", "nbformat", "ipykernel", "IPython")
 
 
 def notebook_folder() -> Path:

@@ -192,35 +192,37 @@ def _iou_tables(
     ):
         methods = runs.methods if form == "ours" else [m for m in runs.methods if _in_paper(m)]
         grid = [[look(*key, m) for m in methods] for key in keys]
-        cells = pd.DataFrame(
-            [[cell.text for cell in line] for line in grid], columns=[method(m).label for m in methods]
-        )
-        if form == "paper":
-            cells = cells.replace("0/0", NOTHING)
-        for position, column in enumerate(names):
-            cells.insert(position, column, [key[position] for key in keys])
+        cells, data = _laid_out(grid, form, names, keys, methods)
         bold = np.array([[False] * len(names) + _best(line, methods) for line in grid])
-        data = [
-            dict(zip(names, key, strict=True)) | {"method": m} | _numbers(cell, form)
-            for key, line in zip(keys, grid, strict=True)
-            for m, cell in zip(methods, line, strict=True)
-        ]
-        made.append(
-            Table(
-                name,
-                form,
-                f"{title}, {_OWNER[form]}",
-                cells,
-                pd.DataFrame(data),
-                bold,
-                notes + more,
-                len(keys) > 40,
-            )
-        )
+        heading = f"{title}, {_OWNER[form]}"
+        made.append(Table(name, form, heading, cells, data, bold, notes + more, len(keys) > 40))
     return [*made, _compared(runs, name, title, names, keys, looks, difference)]
 
 
 _OWNER = {"ours": "plab", "paper": "the paper"}
+
+
+def _laid_out(
+    grid: list[list[Cell]],
+    form: str,
+    names: tuple[str, ...],
+    keys: list[tuple[str, ...]],
+    methods: Sequence[str],
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return a table's texts, a row per key, and its numbers, a row per key and method."""
+    cells = pd.DataFrame(
+        [[cell.text for cell in line] for line in grid], columns=[method(m).label for m in methods]
+    )
+    if form == "paper":
+        cells = cells.replace("0/0", NOTHING)
+    for position, column in enumerate(names):
+        cells.insert(position, column, [key[position] for key in keys])
+    data = [
+        dict(zip(names, key, strict=True)) | {"method": m} | _numbers(cell, form)
+        for key, line in zip(keys, grid, strict=True)
+        for m, cell in zip(methods, line, strict=True)
+    ]
+    return cells, pd.DataFrame(data)
 
 
 def _compared(

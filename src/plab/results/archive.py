@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from plab.results.files import encode, read, replace_file
-from plab.results.loading import Row, rows
+from plab.results.loading import Row, readable_rows, rows
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, member_name
 
 __all__ = ["Packed", "pack", "unpack"]
@@ -68,18 +68,9 @@ def pack(
     archive = Path(archive)
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
-    found, unreadable = rows(source)
-    chosen: dict[str, Row] = {}
-    for row in filter(wanted or _finished, found):
-        name = _member(row).as_posix()
-        if name in chosen:
-            raise ResultsError(
-                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
-            )
-        chosen[name] = row
-    if not chosen:
-        raise ResultsError("there is nothing to pack: no run fits")
-    content, size = io.BytesIO(), 0
+    found, unreadable = readable_rows(source)
+    chosen = _members(filter(wanted or _finished, found))
+    content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as members:
         for name, row in sorted(chosen.items()):
             run = read(row.path)
@@ -93,10 +84,25 @@ def pack(
             member = zipfile.ZipInfo(name, _EPOCH)
             member.external_attr = 0o644 << 16
             members.writestr(member, encode(run, compress=True), zipfile.ZIP_DEFLATED, 9)
-            size += row.path.stat().st_size if row.path.is_file() else 0
     _make_folder(archive)
+    size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     replace_file(archive, content.getvalue(), sync=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
+
+
+def _members(wanted: Iterable[Row]) -> dict[str, Row]:
+    """Return the runs to pack by their place in the archive."""
+    chosen: dict[str, Row] = {}
+    for row in wanted:
+        name = _member(row).as_posix()
+        if name in chosen:
+            raise ResultsError(
+                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
+            )
+        chosen[name] = row
+    if not chosen:
+        raise ResultsError("there is nothing to pack: no run fits")
+    return chosen
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:

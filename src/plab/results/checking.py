@@ -78,11 +78,16 @@ def problems(run: RunResult) -> list[str]:
 
 # ---------------------------------------------------------------------------------------------------- details
 
+_GET_RIGHTS = "ask whom it belongs to for the right to read it"
+
 
 def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
+    except PermissionError as error:
+        yield path, Problem(path, f"may not be read ({error.strerror})", _GET_RIGHTS)
+        return
     except (OSError, zipfile.BadZipFile) as error:
         yield path, Problem(path, f"truncated or damaged ({error})", "get it again, or pack it again")
         return
@@ -105,6 +110,8 @@ def _check_file(path: Path) -> Problem | None:
 
 
 def _advice_unreadable(path: Path, reason: str) -> str:
+    if reason.startswith("may not be read"):
+        return _GET_RIGHTS
     if "schema version" in reason:
         return "read it with the plab that wrote it"
     if "not a plab" in reason or not h5py.is_hdf5(path):

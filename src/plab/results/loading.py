@@ -23,7 +23,7 @@ from plab.results.index import Index
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
 from plab.selection import lookup
 
-__all__ = ["Row", "load", "read_rows", "rows", "run_files"]
+__all__ = ["Row", "load", "read_rows", "readable_rows", "rows", "run_files"]
 
 _SUMMARY_COLUMNS = (
     "task",
@@ -131,6 +131,19 @@ def rows(
     return _without_repetitions(found), unreadable
 
 
+def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
+    """Return the same as :func:`rows`, but do not go on with unreadable files alone.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``, or only files that cannot be read.
+    """
+    found, unreadable = rows(source)
+    sources = [source] if isinstance(source, str | Path) else source
+    if unreadable and not found and all(Path(root).is_file() for root in sources):
+        raise unreadable[0]
+    return found, unreadable
+
+
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
 
@@ -167,6 +180,8 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():
                 yield _member_row(archive, path, name)
+    except PermissionError as error:
+        yield ResultsError(f"{path} may not be read ({error.strerror})")
     except (OSError, zipfile.BadZipFile) as error:
         yield ResultsError(f"{path} is truncated or damaged ({error})")
 

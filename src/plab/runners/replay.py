@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -81,6 +82,10 @@ class EpisodeReplay(ReplayBuffer):
         size = 4 * sum(int(np.prod(shape)) for shape in shapes.values())
         _require_file(Path(path), size, create=added == 0)
         self._file = np.memmap(path, np.float32, "r+")
+        self._lay_out(shapes)
+
+    def _lay_out(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        """Set the arrays of these names and shapes, one after the other in the file."""
         start = 0
         for name, shape in shapes.items():
             part = self._file[start : start + int(np.prod(shape))]

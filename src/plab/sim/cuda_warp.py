@@ -59,7 +59,14 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
 
     Grids that particles gather from (velocity and the momentum's adjoint) hold float32 in pairs, each read at
     once.
+
+    Attributes:
+        node_threads: Threads of a launch over nodes.
+        particle_threads: Threads of a launch over particles, padding included.
     """
+
+    node_threads: int
+    particle_threads: int
 
     def gathered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid that particles gather from: :meth:`node4` reads, :meth:`put_nodes` writes it."""

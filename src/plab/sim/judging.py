@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,14 +52,16 @@ class Judge:
             values: The kernels' measures, shape [..., batch, 6]; see :data:`plab.sim.storage.MEASURES`.
         """
         overlap, peak = values[..., 3], values[..., 4]
-        target_sum, target_peak = self._scale_on_device(values) if on_device(values) else self._scale
+        target_sum, target_peak = self._scale_like(values)
         with np.errstate(invalid="ignore", divide="ignore"):
             both = overlap / (peak * target_peak)
             iou = both / (self._total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
 
-    def _scale_on_device(self, like: torch.Tensor) -> torch.Tensor:
-        """Sums and peaks as a tensor like this one, copied once."""
-        if self._tensor is None or self._tensor.dtype != like.dtype:
-            self._tensor = like.new_tensor(self._scale)
+    def _scale_like(self, values: Any) -> Any:
+        """Sums and peaks as an array, or as a tensor like this one, which is copied once."""
+        if not on_device(values):
+            return self._scale
+        if self._tensor is None or self._tensor.dtype != values.dtype:
+            self._tensor = values.new_tensor(self._scale)
         return self._tensor

@@ -8,12 +8,13 @@ particles on CUDA the order is made anew before every environment step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import taichi as ti
 
 if TYPE_CHECKING:
+    from plab.sim.cuda_engine import CudaEngine
     from plab.sim.engine import CpuEngine
 
 __all__ = ["ParticleOrder", "curve_order", "hilbert_index"]
@@ -81,7 +82,7 @@ class ParticleOrder:
             particles are padding, shape [batch * place].
     """
 
-    def __init__(self, engine: CpuEngine) -> None:
+    def __init__(self, engine: CpuEngine | CudaEngine) -> None:
         """Allocate; :meth:`start_from` comes next.
 
         Args:
@@ -90,7 +91,9 @@ class ParticleOrder:
         self._engine = engine
         self.numbers = self._array(1)
         if engine.sorts:
-            engine.allocate_order()
+            # The CPU's engine never does.
+            self._sorting = cast("CudaEngine", engine)
+            self._sorting.allocate_order()
             self._spare = self._array(1)
             self._moves = self.allocate(1)
 
@@ -154,6 +157,25 @@ class ParticleOrder:
             moves: From :meth:`allocate`; the order's own, with room for step 0, if None.
         """
         moves = self._moves if moves is None else moves
-        self._engine.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
+        self._sorting.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
         self.numbers, self._spare = self._spare, self.numbers
         self._changed = True
+
+    def move(
+        self, source: ti.Ndarray, slot: int, target: ti.Ndarray, to: int, moves: ti.Ndarray, t: int
+    ) -> None:
+        """Copy a state into another order.
+
+        Args:
+            source: Particle states, of which ``slot`` is copied.
+            slot: Time slot of the state.
+            target: Particle states to which it is copied.
+            to: Time slot there.
+            moves: What :meth:`sort` has written.
+            t: Environment step, the entry of ``moves``.
+        """
+        self._sorting.move(source, slot, target, to, moves, t)
+
+    def move_back(self, bar: ti.Ndarray, target: ti.Ndarray, moves: ti.Ndarray, t: int) -> None:
+        """Copy the adjoint of a moved state back into the order before; arguments as for :meth:`move`."""
+        self._sorting.move_back(bar, target, moves, t)

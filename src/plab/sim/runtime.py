@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
+import functools
 import io
 import os
 import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 # Taichi prints a banner on standard output unless told so before it is imported.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -19,6 +20,9 @@ __all__ = ["DEVICES", "PRECISIONS", "DeviceError", "Runtime", "SimulationError",
 
 DEVICES = ("cpu", "cuda")
 PRECISIONS = ("float32", "float64")
+
+CACHE_BYTES = 1 << 30
+"""Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
 
 
 class DeviceError(RuntimeError):
@@ -90,28 +94,18 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         ValueError: If a name is unknown.
         RuntimeError: If this process was forked from one that has started Taichi.
     """
-    global _current, _process
-    if _process not in (None, os.getpid()):
-        # Taichi would wait for its threads, which a fork leaves behind.
-        raise RuntimeError(
-            "plab cannot be used in a process forked from one that uses it: start workers with the context "
-            "'forkserver' or 'spawn', such as make_vec(..., vector_kwargs={'context': 'spawn'})"
-        )
-    _process = os.getpid()
+    global _current
+    _refuse_fork()
     if device not in DEVICES:
         raise ValueError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
         raise ValueError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     wanted = 1 if device == "cuda" else max(1, threads or available_threads())
-    same = _current is not None and (_current.device, _current.precision, _current.threads) == (
-        device,
-        precision,
-        wanted,
-    )
     # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so
     # that the next one starts from a fresh count when nothing is left of those before.
-    if same and len(_users) > 0:
-        return _current
+    if _current is not None and len(_users) > 0:
+        if (_current.device, _current.precision, _current.threads) == (device, precision, wanted):
+            return _current
     if device == "cuda" and not cuda_available():
         raise DeviceError(
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
@@ -125,6 +119,17 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     return _current
 
 
+def _refuse_fork() -> None:
+    global _process
+    if _process not in (None, os.getpid()):
+        # Taichi would wait for its threads, which a fork leaves behind.
+        raise RuntimeError(
+            "plab cannot be used in a process forked from one that uses it: start workers with the context "
+            "'forkserver' or 'spawn', such as make_vec(..., vector_kwargs={'context': 'spawn'})"
+        )
+    _process = os.getpid()
+
+
 def _start_taichi(device: str, precision: str, threads: int) -> None:
     ti.init(
         arch=ti.cuda if device == "cuda" else ti.cpu,
@@ -136,6 +141,8 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         # asserts.
         advanced_optimization=False,
         offline_cache=True,
+        # The suite's kernels need more than Taichi's own 100 MB, and would be removed and compiled in turns.
+        offline_cache_max_size_of_files=CACHE_BYTES,
         log_level=ti.WARN,
     )
 
@@ -155,18 +162,18 @@ def remember_source_positions() -> None:
 
     context = ast_transformer_utils.ASTTransformerContext
     original = getattr(context, "get_pos_info", None)
-    if original is None or hasattr(original, "remembers"):
+    if original is None or hasattr(original, "__wrapped__"):
         return
     texts: dict[tuple, str] = {}
 
-    def get_pos_info(self: object, node: ast.AST) -> str:
+    @functools.wraps(original)
+    def get_pos_info(self: Any, node: Any) -> str:
         place = (node.lineno, node.end_lineno, node.col_offset, node.end_col_offset, type(node))
         key = (self.file, self.lineno_offset, self.func.func.__name__, *place)
         if key not in texts:
             texts[key] = original(self, node)
         return texts[key]
 
-    get_pos_info.remembers = True
     context.get_pos_info = get_pos_info
 
 

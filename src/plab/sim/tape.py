@@ -164,7 +164,7 @@ class Tape:
                     self._history, slot - 1, self._history, slot, t, stamp, self._moves
                 )
             else:
-                self._engine.move(self._history, slot - 1, self._history, slot, self._moves, t)
+                self._particles.order.move(self._history, slot - 1, self._history, slot, self._moves, t)
         self._particles.advance(self._history, slot, 1, poses, actions, t, (t, t + 1))
 
     def _entry(self, t: int) -> int:
@@ -188,6 +188,8 @@ class Tape:
         """
         engine = self._engine
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+        # Allocated on the way forward.
+        assert self.bar is not None
         for array in (actions_bar, self.bar, engine.pose_bar, engine.frame_bar, engine.material_bar):
             array.fill(0)
         last = (steps - 1) // self._length
@@ -209,7 +211,7 @@ class Tape:
                 int(t >= contact_free),
             )
             if engine.sorts:
-                engine.move_back(self.bar, self._spare_bar, self._moves, t)
+                self._particles.order.move_back(self.bar, self._spare_bar, self._moves, t)
                 self.bar, self._spare_bar = self._spare_bar, self.bar
         return actions_bar
 

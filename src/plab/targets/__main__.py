@@ -21,6 +21,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from plab.arguments import to_write
 from plab.cache import cache_dir
 from plab.config import ConfigError, build_scene, load_config, variant_task
 from plab.scene import SceneError
@@ -34,13 +35,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parse(argv)
     try:
         table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
+        _show(table)
+        print(f"simulated targets are kept in {cache_dir() / 'targets'}")
+        if args.csv is not None:
+            _write(table, args.csv)
     except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2
-    _show(table)
-    print(f"simulated targets are kept in {cache_dir() / 'targets'}")
-    if args.csv is not None:
-        table.drop(columns="seconds").to_csv(args.csv, index=False, float_format="%.6g", lineterminator="\n")
+    except OSError as error:
+        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
     return 0
 
 
@@ -89,13 +93,21 @@ def _show(table: pd.DataFrame) -> None:
     Console().print(printed)
 
 
+def _write(table: pd.DataFrame, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table.drop(columns="seconds").to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
+
+
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m plab.targets", description="Build the suite's targets.")
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
-    parser.add_argument("--csv", type=Path, help="write the table to this file, too")
-    return parser.parse_intermixed_args(argv)
+    parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
+    options = parser.parse_intermixed_args(argv)
+    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
+        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    return options
 
 
 if __name__ == "__main__":

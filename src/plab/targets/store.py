@@ -94,10 +94,14 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
     path = Path(folder) / f"{name}3D-v{variant}.npy"
     if not Path(folder).is_dir():
         raise TargetError(f"targets.source: there is no folder {folder}")
-    if not path.is_file():
-        raise TargetError(f"targets.source: {path} does not exist; name the files like Move3D-v1.npy")
     try:
         mass = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise TargetError(
+            f"targets.source: {path} does not exist; name the files like Move3D-v1.npy"
+        ) from None
+    except PermissionError:
+        raise TargetError(f"targets.source: {path} may not be read") from None
     except (OSError, ValueError, EOFError) as error:
         raise TargetError(f"targets.source: {path} is no NumPy array file: {error}") from None
     _check_release_target(str(path), mass, scene)

@@ -1,0 +1,48 @@
+"""Arguments of command lines: numbers and files that are checked before anything is computed."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentTypeError
+from pathlib import Path
+
+__all__ = ["positive", "rates", "seed", "to_write"]
+
+
+def positive(text: str) -> int:
+    """Read a whole number from 1 on."""
+    if not text.isdecimal() or int(text) < 1:
+        raise ArgumentTypeError(f"'{text}' is not a whole number from 1 on")
+    return int(text)
+
+
+def seed(text: str) -> int:
+    """Read a whole number from 0 on."""
+    if not text.isdecimal():
+        raise ArgumentTypeError(f"'{text}' is not a whole number from 0 on")
+    return int(text)
+
+
+def rates(text: str) -> list[float]:
+    """Read learning rates with commas between them."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
+        raise ArgumentTypeError(f"'{text}' is no list of numbers above 0, such as 0.1,0.01")
+    return numbers
+
+
+def to_write(text: str) -> Path:
+    """Read the name of a file that can be written: hours of work should not end in none.
+
+    Folders above it that are not there yet are for whoever writes it to make.
+    """
+    path = Path(text)
+    there = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if (there == path) == there.is_dir():
+        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if there.is_dir() else 'no'} folder")
+    if not os.access(there, os.W_OK, effective_ids=os.access in os.supports_effective_ids):
+        raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
+    return path

@@ -1,0 +1,38 @@
+"""What a refusal has to be: one helpful line, an exit code that is not 0, nothing written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+__all__ = ["ending", "refusal", "snapshot"]
+
+
+def snapshot(folder: Path) -> dict[str, bytes | None]:
+    """Everything in a folder: folders, and files with what they hold."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
+
+
+def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
+    """Assert that a command line has refused what it was given; return the line that says why."""
+    assert code not in (0, None), f"accepted: {argv}"
+    assert "Traceback" not in out + err
+    lines = err.splitlines()
+    assert lines, f"no message: {argv}"
+    assert lines[-1].startswith(("plab", "python -m plab")) and ": " in lines[-1]
+    # argparse prints the usage, too, which goes over several lines.
+    assert len(lines) == 1 or lines[0].startswith("usage: ")
+    assert len(lines[-1]) > 15
+    return lines[-1]
+
+
+def ending(entry: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> object:
+    """Call a command line in this process; return its exit code, however it ends."""
+    try:
+        return entry(argv)
+    except SystemExit as stop:
+        # How argparse ends.
+        return stop.code

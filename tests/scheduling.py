@@ -1,0 +1,33 @@
+"""Which tests share a process where there are several: those that share a simulator, compiled once."""
+
+from __future__ import annotations
+
+import pytest
+from xdist.scheduler import LoadScopeScheduling
+
+__all__ = ["group", "pytest_xdist_make_scheduler"]
+
+TOGETHER = ("tests/verification/",)
+"""Folders whose files share a simulator."""
+
+
+def group(nodeid: str) -> str:
+    """Return what a test shares its process with: its file, or its folder where files share a simulator."""
+    file = nodeid.partition("::")[0]
+    return next((folder for folder in TOGETHER if file.startswith(folder)), file)
+
+
+class Grouped(LoadScopeScheduling):
+    """Hands out groups, one after the other, to the processes that come to have little to do."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return group(nodeid)
+
+
+@pytest.hookimpl(optionalhook=True, tryfirst=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> Grouped:
+    """Give xdist this way to share out tests, whatever its ``--dist``.
+
+    Its own ``loadgroup`` hands over groups in a part of the tests' names that pytest 9.2 no longer takes.
+    """
+    return Grouped(config, log)

@@ -1,0 +1,373 @@
+"""Bad invocations of the other command lines; rights of files, missing extras, arrays that do not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synthetic
+from plab import run, status
+from plab.bench import accuracy, precision, release, rl, speed, stability
+from plab.bench import results as bench_results
+from plab.demonstrations import __main__ as demonstrations
+from plab.render import __main__ as render
+from plab.report import __main__ as report
+from plab.results import __main__ as results
+from plab.targets import __main__ as targets
+from refusals import refusal
+from rights import ordinary_rights
+
+Entry = Callable[[Sequence[str]], int]
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def name_of(value: object) -> str:
+    """Name of a parameter: of words what they are, of a command line its module."""
+    return " ".join(value) if isinstance(value, list) else str(getattr(value, "__module__", value))
+
+
+TOOLS = [
+    (results.main, []),
+    (results.main, ["mend"]),
+    (results.main, ["check", "nowhere"]),
+    (results.main, ["check", "--all"]),
+    (results.main, ["pack", "nowhere", "--output", "a.plab.zip"]),
+    (results.main, ["pack", ".", "colour=red", "--output", "a.plab.zip"]),
+    (results.main, ["pack", "."]),
+    (results.main, ["pack", ".", "--output", "a.txt"]),
+    (results.main, ["unpack", "nowhere.plab.zip", "--output", "b"]),
+    (results.main, ["unpack"]),
+    (status.main, ["nowhere"]),
+    (status.main, ["one", "two"]),
+    (status.main, [".", "colour=red"]),
+    (status.main, [".", "seed=range(3"]),
+    (status.main, [".", "--json", "--csv"]),
+    (status.main, [".", "--yaml"]),
+    (report.main, []),
+    (report.main, ["graphs"]),
+    (report.main, ["tables", "--results", "nowhere"]),
+    (report.main, ["tables", "colour=red"]),
+    (report.main, ["tables", "--results", "example", "seed=range(3"]),
+    (report.main, ["curves", "--results", "nowhere"]),
+    (report.main, ["curves", "--results", "example", "--accuracy", "nowhere.csv"]),
+    (report.main, ["html", "--results", "nowhere"]),
+    (report.main, ["html", "--results", "example", "task=Nope"]),
+    (report.main, ["notebooks", "--results", "nowhere"]),
+    (report.main, ["tables", "--results", "nowhere", "--speed", "nowhere.csv"]),
+    (report.main, ["tables", "--out"]),
+    (render.main, []),
+    (render.main, ["nowhere.h5"]),
+    (render.main, ["a.h5", "b.h5"]),
+    (render.main, ["a.h5", "task=Rope"]),
+    (render.main, ["task=Nope"]),
+    (render.main, ["task=Rope", "--output", "a"]),
+    (render.main, ["task=Rope", "--output", "a.avi"]),
+    (render.main, ["task=Rope", "--size", "0x0"]),
+    (render.main, ["task=Rope", "--size", "wide"]),
+    (render.main, ["task=Rope", "--every", "0"]),
+    (render.main, ["task=Rope", "--every", "x"]),
+    (render.main, ["task=Rope", "--config-dir", "nowhere"]),
+    (render.main, ["task=Rope", "--contact-sheet", "a.png"]),
+    (render.main, ["--contact-sheet", "a.gif"]),
+    (targets.main, ["--task", "Nope"]),
+    (targets.main, ["--task", ""]),
+    (targets.main, ["--task", "Rope", "task=Move"]),
+    (targets.main, ["--task", "Rope", "variant=2"]),
+    (targets.main, ["--task", "Rope", "colour=red"]),
+    (targets.main, ["--task", "Rope", "seed=[1"]),
+    (targets.main, ["--task", "Rope", "sim.grid_size=7"]),
+    (targets.main, ["--task", "Rope", "--csv", "."]),
+    (targets.main, ["--colour"]),
+    (demonstrations.main, ["--task", "Nope"]),
+    (demonstrations.main, ["--task", "Move", "variant=2"]),
+    (demonstrations.main, ["--task", "Move", "sim.grid_size=x"]),
+    (demonstrations.main, ["--task", "Move", "--record", "sim.grid_size=32"]),
+    (demonstrations.main, ["--search", "--iterations", "0"]),
+    (demonstrations.main, ["--search", "--every", "0"]),
+    (demonstrations.main, ["--search", "--seed", "-1"]),
+    *((demonstrations.main, ["--search", f"--lr={given}"]) for given in ("", "x", "0", "-1", "nan", "0.1,")),
+    (demonstrations.main, ["--markdown", "."]),
+    (speed.main, ["task=Nope"]),
+    (speed.main, ["--task", "Nope"]),
+    (speed.main, ["seed=[1"]),
+    (speed.main, ["--device", "gpu"]),
+    (speed.main, ["--precision", "half"]),
+    (speed.main, ["--skips", "nothing"]),
+    (speed.main, ["--paper", "--limits"]),
+    (speed.main, ["--kinds", "nothing"]),
+    *((speed.main, [flag, "0"]) for flag in ("--batch", "--steps", "--repeats", "--particles", "--grids")),
+    (speed.main, ["--csv", "."]),
+    (precision.main, ["--task", "Nope"]),
+    (precision.main, ["--task", "Move", "--variant", "9"]),
+    (precision.main, ["--particles", "0"]),
+    (precision.main, ["--markdown", "."]),
+    (release.main, ["--choice", "nothing"]),
+    (release.main, ["--particles", "-1"]),
+    (bench_results.main, ["--runs", "0"]),
+    (bench_results.main, ["--rows", "-1"]),
+    (bench_results.main, ["--csv", "."]),
+    (rl.main, ["--methods", "adam"]),
+    (rl.main, ["--envs", "0"]),
+    (rl.main, ["--batches", "0"]),
+    (rl.main, ["task=Nope"]),
+    (stability.main, ["--family", "nothing"]),
+    (stability.main, ["--precision", "half"]),
+    (stability.main, ["--horizon", "0"]),
+    (stability.main, ["--particles", "x"]),
+    (stability.main, ["--gradients", "."]),
+    (accuracy.main, ["--task", "Table"]),
+    (accuracy.main, ["--device", "gpu"]),
+    (accuracy.main, ["--particles", "0"]),
+]
+
+
+def test_there_are_enough():
+    assert len({(entry.__module__, tuple(argv)) for entry, argv in TOOLS}) == len(TOOLS) >= 90
+
+
+@pytest.mark.parametrize(("entry", "argv"), TOOLS, ids=name_of)
+def test_bad_invocations_of_the_tools(refused, entry, argv):
+    line = refused(argv, entry)
+    # What was given is in the answer, or what would do.
+    words = [word for arg in argv for word in (arg, *re.split(r"[^A-Za-z0-9_]+", arg)) if len(word) > 1]
+    assert any(word in line for word in words) or re.search(r"choose |say |required|must be one of", line)
+
+
+def test_results_where_none_can_be_written(refused, tmp_path):
+    (tmp_path / "file").write_text("in the way\n", encoding="utf-8")
+    synthetic.save(synthetic.run(tmp_path / "results"))
+    assert "file" in refused(["pack", "results", "--output", "file/a.plab.zip"], results.main)
+    assert "file" in refused(["tables", "--results", "results", "--out", "file/tables"], report.main)
+    assert "file is no folder" in refused(["--task", "Rope", "--csv", "file/a.csv"], targets.main)
+    assert "file is no folder" in refused(["--csv", "file/a.csv"], speed.main)
+    assert "cannot write" in refused(["--output", "file/accuracy"], accuracy.main)
+    assert "file is no folder" in refused(["task=Rope", "--output", "file/a.png"], render.main)
+    assert "file is no folder" in refused(["--contact-sheet", "file/a.png"], render.main)
+
+
+@pytest.mark.parametrize(
+    ("module", "argv"),
+    [
+        ("plab.run", ["task=Ropee"]),
+        ("plab.run", ["--mutlirun"]),
+        ("plab.run", ["-m", "variant=1,2", "task=Nope"]),
+        ("plab.render", ["nowhere.h5"]),
+        ("plab.render", ["task=Rope", "--output", "film.avi"]),
+        ("plab.targets", ["--task", "Nope"]),
+        ("plab.status", ["nowhere"]),
+        ("plab.results", ["check", "nowhere"]),
+        ("plab.report", ["tables", "--results", "nowhere"]),
+    ],
+    ids=name_of,
+)
+def test_bad_invocations_as_processes(tmp_path, module, argv):
+    done = subprocess.run(
+        [sys.executable, "-m", module, *argv], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    refusal(done.returncode, done.stdout, done.stderr, argv)
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------------ rights
+
+
+@pytest.fixture
+def closed(tmp_path) -> Path:
+    """A folder that nobody may write to."""
+    folder = tmp_path / "closed"
+    folder.mkdir(mode=0o555)
+    return folder
+
+
+UNWRITABLE = [
+    (run.main, ["task=Move", "results_dir=closed"]),
+    (run.main, ["task=Move", "results_dir=closed/results"]),
+    (run.main, ["-m", "task=Move", "variant=1,2", "hydra.sweep.dir=closed/sweep"]),
+    (results.main, ["pack", "example.plab.zip", "--output", "closed/a.plab.zip"]),
+    (results.main, ["pack", "example.plab.zip", "--output", "closed/new/a.plab.zip"]),
+    (results.main, ["unpack", "example.plab.zip", "--output", "closed"]),
+    (results.main, ["unpack", "example.plab.zip", "--output", "closed/new"]),
+    (report.main, ["tables", "--results", "example.plab.zip", "--out", "closed"]),
+    (report.main, ["tables", "--results", "example.plab.zip", "--out", "closed/new"]),
+    (report.main, ["curves", "--results", "example.plab.zip", "--out", "closed"]),
+    (report.main, ["html", "--no-pictures", "--results", "example.plab.zip", "--out", "closed"]),
+    (render.main, ["task=Rope", "--output", "closed/a.png"]),
+    (render.main, ["--contact-sheet", "closed/a.png"]),
+    (targets.main, ["--task", "Rope", "--csv", "closed/a.csv"]),
+    (demonstrations.main, ["--task", "Move", "--markdown", "closed/a.md"]),
+    (speed.main, ["--csv", "closed/new/a.csv"]),
+    (precision.main, ["--markdown", "closed/a.md"]),
+    (release.main, ["--csv", "closed/a.csv"]),
+    (bench_results.main, ["--csv", "closed/a.csv"]),
+    (rl.main, ["--csv", "closed/a.csv"]),
+    (stability.main, ["--gradients", "closed/a.csv"]),
+    (accuracy.main, ["--output", "closed/new"]),
+]
+
+
+@pytest.mark.parametrize(("entry", "argv"), UNWRITABLE, ids=name_of)
+def test_folders_that_may_not_be_written_to(told, tmp_path, closed, entry, argv):
+    results.main(
+        ["pack", str(synthetic.save(synthetic.run(tmp_path / "results"))), "--output", "example.plab.zip"]
+    )
+    assert re.search(r"cannot write .*closed", told(argv, entry, ordinary_rights(tmp_path)))
+
+
+UNREADABLE = [
+    (run.main, ["task=Secret", "--config-dir", "mine"], "mine/task/Secret.yaml"),
+    (run.main, ["task=Rope", "targets.source=files"], "files/Rope3D-v1.npy"),
+    (run.main, ["task=Rope", "targets.source=files"], "files"),
+    (results.main, ["pack", "run.h5", "--output", "a.plab.zip"], "run.h5"),
+    (results.main, ["pack", "runs.plab.zip", "--output", "a.plab.zip"], "runs.plab.zip"),
+    (results.main, ["unpack", "runs.plab.zip", "--output", "new"], "runs.plab.zip"),
+    (status.main, ["runs.plab.zip"], "runs.plab.zip"),
+    (report.main, ["tables", "--results", "runs.plab.zip", "--out", "new"], "runs.plab.zip"),
+    (report.main, ["tables", "--results", "run.h5", "--speed", "rows.csv", "--out", "new"], "rows.csv"),
+    (report.main, ["curves", "--results", "run.h5", "--accuracy", "rows.csv", "--out", "new"], "rows.csv"),
+    (render.main, ["run.h5", "--output", "a.png"], "run.h5"),
+]
+
+
+@pytest.mark.parametrize(("entry", "argv", "hidden"), UNREADABLE, ids=name_of)
+def test_files_that_may_not_be_read(told, tmp_path, entry, argv, hidden):
+    for folder in ("mine/task", "files"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "mine/task/Secret.yaml").write_text("name: Secret\n", encoding="utf-8")
+    np.save(tmp_path / "files/Rope3D-v1.npy", np.ones((64, 64, 64)))
+    (tmp_path / "rows.csv").write_text("task,batch\n", encoding="utf-8")
+    synthetic.save(synthetic.run(tmp_path / "results")).rename(tmp_path / "run.h5")
+    results.main(["pack", "run.h5", "--output", "runs.plab.zip"])
+    mode = (tmp_path / hidden).stat().st_mode
+    (tmp_path / hidden).chmod(0)
+    try:
+        line = told(argv, entry, ordinary_rights(tmp_path))
+    finally:
+        (tmp_path / hidden).chmod(mode)
+    assert Path(hidden).name in line
+
+
+def test_a_closed_folder_of_sweeps(told, tmp_path, closed, monkeypatch):
+    monkeypatch.chdir(closed)
+    line = told(["-m", "task=Move", "variant=1,2"], run.main, ordinary_rights(tmp_path))
+    assert "cannot write" in line
+
+
+def test_a_result_that_may_not_be_read_is_left_alone(tmp_path, capsys):
+    path = synthetic.save(synthetic.run(tmp_path / "results"))
+    before = path.read_bytes()
+    path.chmod(0)
+    with ordinary_rights(tmp_path):
+        assert results.main(["check", "results"]) == 1
+    assert "may not be read" in capsys.readouterr().out
+    path.chmod(0o644)
+    assert path.read_bytes() == before and len(list(path.parent.iterdir())) == 1
+
+
+# ------------------------------------------------------------------------------------------------ extras
+
+HIDING = """\
+import importlib.machinery, os, pkgutil, sys
+
+MISSING = set(os.environ["PLAB_TEST_MISSING"].split())
+
+
+class Finder(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        hidden = name in MISSING or name.partition(".")[0] in MISSING
+        return None if hidden else super().find_spec(name, path, target)
+
+
+sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Finder
+walk = pkgutil.walk_packages
+
+
+def walk_packages(*args, **kwargs):
+    return (found for found in walk(*args, **kwargs) if found.name not in MISSING)
+
+
+pkgutil.walk_packages = walk_packages
+"""
+"""A Python in which some packages are not installed, as ``sitecustomize``."""
+
+LAUNCHER = "hydra_plugins.hydra_{0}_launcher hydra_plugins.hydra_{0}_launcher.{0}_launcher"
+
+EXTRAS = [
+    ("pyvista", "render", "plab.render", ["task=Rope"]),
+    ("PIL", "render", "plab.render", ["task=Rope", "--output", "a.gif"]),
+    ("pyvista PIL vtk vtkmodules", "render", "plab.render", ["--contact-sheet", "a.png"]),
+    ("imageio_ffmpeg", "render", "plab.render", ["task=Rope", "--output", "a.mp4"]),
+    ("tensorboard", "tensorboard", "plab.run", ["task=Move", "method=sac", "method.tensorboard=true"]),
+    *(
+        (package, "report", "plab.report", ["notebooks", "--results", "example"])
+        for package in ("IPython", "ipykernel", "jupytext", "nbclient", "nbconvert", "nbformat")
+    ),
+    (LAUNCHER.format("joblib"), "joblib", "plab.run", ["-m", "hydra/launcher=batch_joblib", "seed=0,1"]),
+    (LAUNCHER.format("joblib"), "joblib", "plab.run", ["-m", "hydra/launcher=joblib", "seed=0,1"]),
+    (
+        LAUNCHER.format("submitit"),
+        "submitit",
+        "plab.run",
+        ["-m", "hydra/launcher=submitit_slurm", "seed=0,1"],
+    ),
+    (
+        LAUNCHER.format("submitit"),
+        "submitit",
+        "plab.run",
+        ["-m", "hydra/launcher=submitit_local", "seed=0,1"],
+    ),
+    (LAUNCHER.format("ray"), "ray", "plab.run", ["-m", "hydra/launcher=ray", "seed=0,1"]),
+]
+
+
+@pytest.mark.parametrize(("missing", "extra", "module", "argv"), EXTRAS, ids=name_of)
+def test_missing_extras(tmp_path, missing, extra, module, argv):
+    hiding, empty = tmp_path / "hiding", tmp_path / "empty"
+    for folder in (hiding, empty):
+        folder.mkdir()
+    (hiding / "sitecustomize.py").write_text(HIDING, encoding="utf-8")
+    paths = os.pathsep.join(filter(None, [str(hiding), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, "-m", module, *argv],
+        cwd=empty,
+        env=os.environ | {"PYTHONPATH": paths, "PLAB_TEST_MISSING": missing},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert f"pip install 'plab[{extra}]'" in refusal(done.returncode, done.stdout, done.stderr, argv)
+    assert list(empty.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------------ shapes
+
+
+SHAPES = {
+    "no components": np.zeros((50, 0)),
+    "a component too few": np.zeros((50, 5)),
+    "a component too many": np.zeros((50, 7)),
+    "no steps": np.zeros((0, 6)),
+    "one dimension": np.zeros(300),
+    "three dimensions": np.zeros((1, 50, 6)),
+    "not finite": np.full((50, 6), np.nan),
+    "texts": np.full((50, 6), b"a"),
+}
+
+
+@pytest.mark.parametrize("actions", SHAPES.values(), ids=SHAPES)
+def test_actions_of_a_result_that_do_not_fit(told, tmp_path, actions):
+    made = dataclasses.replace(synthetic.run(tmp_path / "results"), best_actions=actions)
+    path = synthetic.save(made).relative_to(tmp_path)
+    assert path.name in told([str(path), "--output", "a.png"], render.main)
