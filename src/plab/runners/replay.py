@@ -106,7 +106,7 @@ class EpisodeReplay(ReplayBuffer):
             if self.added == 0:
                 return {name: torch.empty(a.shape, device=self.device) for name, a in arrays.items()}
             return {name: torch.from_numpy(a).to(self.device) for name, a in arrays.items()}
-        except torch.OutOfMemoryError as error:
+        except torch.cuda.OutOfMemoryError as error:
             raise ResultsError(
                 f"no room on the device for {self._file.nbytes / 1e9:.1f} GB of replay buffer: "
                 "set method.torch_device=cpu or a smaller method.buffer_size"
