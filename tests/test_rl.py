@@ -22,7 +22,8 @@ from plab.envs.core import EpisodeBatch
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
 from plab.runners import RunError, rl, run_config
-from plab.runners.common import COLUMNS, kept_batches
+from plab.runners.common import COLUMNS, kept_batches, policy_episode
+from plab.runners.policy import load_policy, policy_path
 from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import ALGORITHMS, LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
@@ -80,6 +81,12 @@ def assert_same_numbers(a: RunResult, b: RunResult) -> None:
         assert np.array_equal(a.masses[name], b.masses[name]), name
 
 
+def assert_nothing_else_is_left(result: RunResult) -> None:
+    """Assert that only the result and the policy are in the run's folder."""
+    names = {path.name for path in result.path.parent.iterdir()}
+    assert names == {result.path.name, policy_path(result.path).name}
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
     """An uninterrupted run of each method."""
@@ -105,7 +112,26 @@ def test_file_holds_the_whole_run(finished: dict[str, RunResult], method: str) -
     assert result.evaluation["score"] == judged.score > 0
     assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"}
     assert result.resume is None
-    assert [path.name for path in result.path.parent.iterdir()] == [result.path.name]
+    assert_nothing_else_is_left(result)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult], method: str) -> None:
+    """Its episode is that of the last row, bit for bit."""
+    result = finished[method]
+    policy = load_policy(result.path)
+    last = result.iterations.iloc[-1]
+    batch = EpisodeBatch([make_config(result.path.parents[2], method)])
+    done = policy_episode(batch, policy)
+    assert {name: done.measures[name] for name in COLUMNS} == {name: last[name] for name in COLUMNS}
+
+
+def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunResult], tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match=r"none\.policy\.npz is not there: sac, td3 and ppo write it"):
+        load_policy(tmp_path / "none.h5")
+    policy_path(tmp_path / "some.h5").write_bytes(b"no archive")
+    with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
+        load_policy(tmp_path / "some.h5")
 
 
 def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
@@ -215,7 +241,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
     resumed = run(cfg)
     assert_same_numbers(resumed, finished[method])
     assert resumed.provenance["resumed"] == 1
-    assert [path.name for path in resumed.path.parent.iterdir()] == [resumed.path.name]
+    assert_nothing_else_is_left(resumed)
 
 
 def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(

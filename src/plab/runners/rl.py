@@ -32,6 +32,7 @@ from plab.runners.common import (
     torch_settings,
 )
 from plab.runners.jobs import Job, title
+from plab.runners.policy import save_policy
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
 
@@ -66,6 +67,7 @@ def run_rl(jobs: Sequence[Job], note: str = "") -> None:
         if run.result.resume is None or int(run.result.resume["steps"]) < total:
             _train(cfg, training, replay_path, evaluator, run, note)
         # The partial file holds the last checkpoint, after which nothing is sampled any more.
+        save_policy(run.path, method.algorithm, cast("dict[str, Any]", run.result.resume))
         replay_path.unlink(missing_ok=True)
         with run.phase("evaluate"):
             judged, final_mass = evaluator.judge(cast(np.ndarray, run.result.best_actions))

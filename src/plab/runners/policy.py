@@ -1,0 +1,116 @@
+"""Trained policies: kept in a file beside the result, and taken from there."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+
+from plab.results import ResultsError
+from plab.runners.rl_models import ALGORITHMS, CLIP
+
+__all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
+
+EPSILON = 1e-8
+"""Added to variances of observations, as Stable-Baselines3 does."""
+
+
+class Policy:
+    """A trained policy, deterministic.
+
+    Attributes:
+        network: Stable-Baselines3's policy, which wants observations as it has seen them in training.
+    """
+
+    def __init__(self, network: BasePolicy, mean: np.ndarray | None, variance: np.ndarray | None) -> None:
+        """Take over a network.
+
+        Args:
+            network: The policy of a model.
+            mean: Means of the observations that scale them, shape [entry]; None if they were not scaled.
+            variance: Their variances, shape [entry].
+        """
+        self.network = network
+        self._mean, self._variance = mean, variance
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return actions, shape [env, action], for observations as the environments give them, shape [env,
+        entry]."""
+        if self._mean is not None and self._variance is not None:
+            scaled = (observation - self._mean) / np.sqrt(self._variance + EPSILON)
+            observation = np.clip(scaled, -CLIP, CLIP).astype(np.float32)
+        return self.network.predict(observation, deterministic=True)[0]
+
+
+def policy_path(result: Path) -> Path:
+    """Return the file of the policy of a run with this result file."""
+    return result.with_suffix(".policy.npz")
+
+
+def save_policy(result: Path, algorithm: str, state: Mapping[str, Any]) -> None:
+    """Write the policy of a checkpoint beside the result.
+
+    Args:
+        result: The run's result file.
+        algorithm: Learning algorithm, a key of :data:`plab.runners.rl_models.ALGORITHMS`.
+        state: The checkpoint, a :meth:`plab.runners.rl_trainer.Trainer.state`.
+
+    Raises:
+        ResultsError: If the file cannot be written.
+    """
+    # The replay buffer of a training that is over is not to be looked for.
+    without_buffer: dict[str, Any] = {
+        "replay_buffer_class": None,
+        "replay_buffer_kwargs": {},
+        "buffer_size": 1,
+    }
+    kind: type[BaseAlgorithm] = ALGORITHMS[algorithm].model
+    model = kind.load(io.BytesIO(state["model"].tobytes()), device="cpu", custom_objects=without_buffer)
+    buffer = io.BytesIO()
+    # torch takes files as it takes paths.
+    model.policy.save(cast(str, buffer))
+    arrays: dict[str, Any] = {
+        "algorithm": np.array(algorithm),
+        "policy": np.frombuffer(buffer.getvalue(), np.uint8),
+    }
+    if state["statistics"]:
+        moments = state["statistics"]["observation"]
+        arrays |= {"mean": np.asarray(moments["mean"]), "variance": np.asarray(moments["var"])}
+    path = policy_path(result)
+    try:
+        with path.open("wb") as file:
+            np.savez(file, **arrays)
+    except OSError as error:
+        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def load_policy(result: str | Path, device: str = "cpu") -> Policy:
+    """Return the policy that a run has trained.
+
+    Args:
+        result: The run's result file, as in the column ``path`` of a table of results.
+        device: Where the network is to be, ``cpu`` or ``cuda``.
+
+    Raises:
+        ResultsError: If there is no policy beside the result, or its file is broken.
+    """
+    path = policy_path(Path(result))
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        kind = ALGORITHMS[str(arrays["algorithm"])].model.policy_aliases["MlpPolicy"]
+        network = kind.load(cast(str, io.BytesIO(arrays["policy"].tobytes())), device=device)
+    except FileNotFoundError:
+        raise ResultsError(
+            f"{path} is not there: sac, td3 and ppo write it when a run ends; see docs/rl.md"
+        ) from None
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ResultsError(
+            f"{path} is no policy of plab's ({error}): run it again with force=true"
+        ) from error
+    return Policy(network, arrays.get("mean"), arrays.get("variance"))
