@@ -103,8 +103,9 @@ def require_capturable(optimizer: Optimizer, lr: float) -> None:
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm as _Model
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm as _OffPolicyModel
 else:
-    _Model = object
+    _Model = _OffPolicyModel = object
 
 
 class _Captured(_Model):
@@ -226,10 +227,10 @@ class CapturedPPO(_Captured, PPO):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
 
-class CapturedSAC(_Captured, SAC):
-    """Soft actor-critic with a learned entropy coefficient; targets follow at every update."""
+class _CapturedOffPolicy(_Captured, _OffPolicyModel):
+    """What the models that learn from a replay buffer share."""
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         """Update from the replay buffer."""
         if self.device.type == "cpu":
             super().train(gradient_steps, batch_size)
@@ -238,13 +239,24 @@ class CapturedSAC(_Captured, SAC):
 
     def train_captured(self, gradient_steps: int, batch_size: int) -> None:
         """Do what :meth:`train` of Stable-Baselines3 does with recorded updates."""
+        raise NotImplementedError
+
+    def _sample(self, batch_size: int) -> tuple[Tensor, ...]:
+        """Return observations, actions, next observations, ends of episodes and rewards to learn from."""
+        return cast(ReplayBuffer, self.replay_buffer).sample(batch_size, env=self._vec_normalize_env)[:5]
+
+
+class CapturedSAC(_CapturedOffPolicy, SAC):
+    """Soft actor-critic with a learned entropy coefficient; targets follow at every update."""
+
+    def train_captured(self, gradient_steps: int, batch_size: int) -> None:
+        """Do what :meth:`train` of Stable-Baselines3 does with recorded updates."""
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer, cast(Optimizer, self.ent_coef_optimizer)]
         self._update_learning_rate(optimizers)
         update, rows = self._captured(self._one_update), []
         for _ in range(gradient_steps):
-            data = cast(ReplayBuffer, self.replay_buffer).sample(batch_size, env=self._vec_normalize_env)
-            rows.append(update(*data[:5]).clone())
+            rows.append(update(*self._sample(batch_size)).clone())
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self._log_means(("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss"), rows)
@@ -282,15 +294,8 @@ class CapturedSAC(_Captured, SAC):
         return torch.stack([ent_coef[0], ent_coef_loss.detach(), critic_loss.detach(), actor_loss.detach()])
 
 
-class CapturedTD3(_Captured, TD3):
+class CapturedTD3(_CapturedOffPolicy, TD3):
     """Twin delayed deep deterministic policy gradient."""
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Update from the replay buffer."""
-        if self.device.type == "cpu":
-            super().train(gradient_steps, batch_size)
-        else:
-            self.train_captured(gradient_steps, batch_size)
 
     def train_captured(self, gradient_steps: int, batch_size: int) -> None:
         """Do what :meth:`train` of Stable-Baselines3 does with recorded updates."""
@@ -300,9 +305,8 @@ class CapturedTD3(_Captured, TD3):
         critic_losses, actor_losses = [], []
         for _ in range(gradient_steps):
             self._n_updates += 1
-            data = cast(ReplayBuffer, self.replay_buffer).sample(batch_size, env=self._vec_normalize_env)
             delayed = self._n_updates % self.policy_delay != 0
-            losses = (critics if delayed else both)(*data[:5]).clone()
+            losses = (critics if delayed else both)(*self._sample(batch_size)).clone()
             critic_losses.append(losses[:1])
             if not delayed:
                 actor_losses.append(losses[1:])
