@@ -122,7 +122,7 @@ TOOLS = [
     (rl.main, ["--envs", "0"]),
     (rl.main, ["--batches", "0"]),
     (rl.main, ["task=Nope"]),
-    (stability.main, ["--family", "nothing"]),
+    (stability.main, ["--quick", "--family", "nothing"]),
     (stability.main, ["--precision", "half"]),
     (stability.main, ["--horizon", "0"]),
     (stability.main, ["--particles", "x"]),
