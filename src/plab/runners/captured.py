@@ -7,6 +7,7 @@ launch. Nothing else differs from the classes they are made from; on the CPU the
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -237,9 +238,9 @@ class _CapturedOffPolicy(_Captured, _OffPolicyModel):
         else:
             self.train_captured(gradient_steps, batch_size)
 
+    @abstractmethod
     def train_captured(self, gradient_steps: int, batch_size: int) -> None:
         """Do what :meth:`train` of Stable-Baselines3 does with recorded updates."""
-        raise NotImplementedError
 
     def _sample(self, batch_size: int) -> tuple[Tensor, ...]:
         """Return observations, actions, next observations, ends of episodes and rewards to learn from."""

@@ -22,7 +22,7 @@ from plab.sim.material import (
     trial_gradient,
     yield_factor,
 )
-from plab.sim.motion import advance_pose, advance_pose_adjoint
+from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
@@ -340,15 +340,7 @@ class CudaPhases(OrderPhases, PosePhases):
         total = vec7(0.0)
         for back in range(self.substeps):
             s = self.substeps - 1 - back
-            pose_bar, u_bar = advance_pose_adjoint(
-                self.motions[m],
-                self.pose[e, s, m],
-                u,
-                self.low[e, m],
-                self.high[e, m],
-                self.minimal_gap[e, m],
-                bar + self.end_share[e, s, m],
-            )
+            pose_bar, u_bar = self.retreat_pose(e, m, s, u, bar + self.end_share[e, s, m])
             bar = pose_bar + self.start_share[e, s, m]
             total += u_bar
         self.pose_bar[e, m] = bar

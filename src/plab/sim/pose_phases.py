@@ -110,17 +110,23 @@ class PosePhases(Storage):
         """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
         end_bar, start_bar = self.frame_shares(e, m, s, self.collect_frame_adjoint(e, m))
         u = self.substep_motion(e, m, actions, t)
-        pose_bar, u_bar = advance_pose_adjoint(
+        pose_bar, u_bar = self.retreat_pose(e, m, s, u, self.pose_bar[e, m] + end_bar)
+        self.pose_bar[e, m] = pose_bar + start_bar
+        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
+
+    @ti.func
+    def retreat_pose(self, e, m: ti.template(), s, u, bar):
+        """Adjoints of the pose at the start of substep s and of its motion u, given that of the pose at its
+        end."""
+        return advance_pose_adjoint(
             self.motions[m],
             self.pose[e, s, m],
             u,
             self.low[e, m],
             self.high[e, m],
             self.minimal_gap[e, m],
-            self.pose_bar[e, m] + end_bar,
+            bar,
         )
-        self.pose_bar[e, m] = pose_bar + start_bar
-        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
 
     @ti.func
     def frame_shares(self, e, m: ti.template(), s, frame):
