@@ -10,6 +10,7 @@ import pytest
 
 from plab.scene import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator
+from plab.sim.memory import ENTRIES_MAX
 from plab.sim.order import curve_order, hilbert_index
 from plab.sim.runtime import available_threads
 
@@ -224,6 +225,14 @@ def test_memory_budget_is_named(sim: Simulator) -> None:
     with pytest.raises(MemoryError, match=r"set sim.memory_mb=\d+ or more"):
         sim.rollout(actions())
     sim.memory_mb = before
+
+
+def test_too_many_environments_for_an_array_are_named(
+    sim: Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ENTRIES_MAX, sim.device, 1)
+    with pytest.raises(MemoryError, match="3 environments are too many for a gradient of"):
+        sim.rollout(actions())
 
 
 def test_bad_physics_is_refused() -> None:

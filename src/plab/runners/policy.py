@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from plab.results import ResultsError
+from plab.results.files import replace_file
 from plab.runners.rl_models import ALGORITHMS, CLIP
 
 __all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
@@ -81,12 +82,9 @@ def save_policy(result: Path, algorithm: str, state: Mapping[str, Any]) -> None:
     if state["statistics"]:
         moments = state["statistics"]["observation"]
         arrays |= {"mean": np.asarray(moments["mean"]), "variance": np.asarray(moments["var"])}
-    path = policy_path(result)
-    try:
-        with path.open("wb") as file:
-            np.savez(file, **arrays)
-    except OSError as error:
-        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    replace_file(policy_path(result), packed.getvalue(), sync=True)
 
 
 def load_policy(result: str | Path, device: str = "cpu") -> Policy:

@@ -9,7 +9,7 @@ import taichi as ti
 from plab.scene import Scene
 from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE, STATE_MASK
 
-__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
+__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states", "longest_array"]
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 """Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
@@ -27,6 +27,11 @@ def kept_states(steps: int, slots_per_step: int, length: int) -> int:
     """
     segments = -(-steps // length)
     return length * slots_per_step + 2 + (segments if segments > 1 else 0)
+
+
+def longest_array(steps: int, slots_per_step: int, length: int) -> int:
+    """Return how many states the longer of the two arrays holds in which a gradient keeps them."""
+    return max(length * slots_per_step + 1, -(-steps // length))
 
 
 def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> int:
@@ -60,7 +65,7 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
     # The sparsest way to keep states, by the entries of the longer of its two arrays.
-    longest = min(max(length * slots_per_step + 1, -(-scene.horizon // length)) for length in lengths)
+    longest = min(longest_array(scene.horizon, slots_per_step, length) for length in lengths)
     return max(1, min(fitting, ENTRIES_MAX[device] // (longest * entries)))
 
 

@@ -6,7 +6,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
+from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states, longest_array
 from plab.sim.particles import Particles
 from plab.sim.storage import MEASURES
 
@@ -61,7 +61,7 @@ class Tape:
             The most that fit into the budget, or fewer if as many segments do; all have about this length.
 
         Raises:
-            MemoryError: If even one step per segment does not fit.
+            MemoryError: If no length fits into the budget, or none into arrays that Taichi can address.
         """
         slot_bytes, slots_per_step = self._particles.slot_bytes, self._slots_per_step
         self._engine.allocate_adjoint()
@@ -74,15 +74,16 @@ class Tape:
         def cost(length: int) -> int:
             return kept_states(steps, slots_per_step, length) * slot_bytes + fixed
 
-        slots = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
-        fitting = [
-            length
-            for length in range(1, steps + 1)
-            if cost(length) <= memory_mb * 1e6
-            and max(length * slots_per_step + 1, -(-steps // length)) <= slots
-        ]
+        room = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
+        lengths = [n for n in range(1, steps + 1) if longest_array(steps, slots_per_step, n) <= room]
+        if not lengths:
+            raise MemoryError(
+                f"{self._engine.batch} environments are too many for a gradient of {steps} steps, "
+                "whatever the memory: simulate fewer environments together, or fewer steps"
+            )
+        fitting = [length for length in lengths if cost(length) <= memory_mb * 1e6]
         if not fitting:
-            need = math.ceil(min(cost(length) for length in range(1, steps + 1)) / 1e6)
+            need = math.ceil(min(map(cost, lengths)) / 1e6)
             raise MemoryError(
                 f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
                 f"set sim.memory_mb={need} or more"
