@@ -1,0 +1,183 @@
+"""What one CUDA thread does in each phase: the same whether a launch is a substep or a whole step."""
+
+import taichi as ti
+
+from plab.sim.cuda_phases import CudaPhases
+from plab.sim.cuda_warp import NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
+from plab.sim.grid_phases import MASS_MIN
+from plab.sim.transfer import spline, widen
+
+__all__ = ["RESIDENT_BLOCK", "ThreadPhases"]
+
+RESIDENT_BLOCK = WARP_BLOCK
+"""Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
+resident whatever their registers."""
+
+
+class ThreadPhases(CudaPhases):
+    """Phases by thread.
+
+    Attributes:
+        resident_threads: Threads that are resident at once, in the kernels that are one launch per step.
+    """
+
+    resident_threads: int
+
+    @ti.func
+    def scatter_node(self, e, particle, base):
+        """Grid index of a particle's base node; negative, and another for each, where it is padding."""
+        node = e * self.nodes + self.node_index(base)
+        if particle >= self.particles:
+            node = -1 - particle
+        return node
+
+    @ti.func
+    def resident_turns(self, w, total):
+        """How many of ``total`` items resident thread w works on."""
+        return (total - w + self.resident_threads - 1) // self.resident_threads
+
+    @ti.func
+    def meet(self, w, meetings):
+        """Wait until all resident threads are here for the same time; returns how often they have met."""
+        ti.simt.grid.memfence()
+        ti.simt.block.sync()
+        if w % RESIDENT_BLOCK == 0:
+            goal = (meetings + 1) * (self.resident_threads // RESIDENT_BLOCK)
+            ti.atomic_add(self.arrivals[0], 1)
+            # An atomic that changes nothing: a plain load could be hoisted out of the loop.
+            while ti.atomic_or(self.arrivals[0], 0) < goal:
+                pass
+        ti.simt.block.sync()
+        # What others wrote must not be read from this processor's own cache.
+        ti.simt.grid.memfence()
+        return meetings + 1
+
+    @ti.func
+    def scatter_thread(self, state: ti.template(), before, after, q, stamp):
+        """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part."""
+        e, particle = self.particle_of(q)
+        tile = particle // self.lanes
+        source = self.tile_entry(before, e, tile)
+        lane = self.sorted_lane(state, source, tile, particle % self.lanes)
+        base, fx = self.stencil(self.vector(state, source, lane))
+        node = self.scatter_node(e, tile * self.lanes + lane, base)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+        a = ti.Vector.zero(self.real, 9)
+        if node >= 0:
+            a = self.material_particle(state, source, self.tile_entry(after, e, tile), lane, e, True)
+        if first:
+            self.mark_shared(e, base, stamp)
+        sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
+        heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
+        self.share_heads(heads, q, node, first, rank)
+        field = self.momentum_field(state, source, a, lane, fx)
+        self.scatter_runs(
+            self.momentum, 4, sums, heads, q, spline(fx), field, run, first, rank, total, doublings
+        )
+
+    @ti.func
+    def grid_thread(self, w, q, s):
+        """Grid update of node q of the active blocks by thread w; the node's momentum is cleared."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        total = self.take_nodes(self.momentum, stage, w, e, block, r)
+        # A test of which manipulators are near would cost a thread as much as contact with them.
+        near = ti.static((1 << self.manipulators) - 1)
+        v = self.update_node(e, s, self.node_of_block(block, r), near, total)
+        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
+
+    @ti.func
+    def scatter_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q, stamp):
+        """Scatter of a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes
+        of a warp take part."""
+        e, particle = self.particle_of(q)
+        tile = particle // self.lanes
+        source = self.tile_entry(before, e, tile)
+        target = self.tile_entry(after, e, tile)
+        entry9 = (e * self.tiles + tile) * 9
+        lane = self.sorted_lane(state, source, tile, particle % self.lanes)
+        x = self.vector(state, source, lane)
+        base, fx = self.stencil(x)
+        node = self.scatter_node(e, tile * self.lanes + lane, base)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+        a = ti.Vector.zero(self.real, 9)
+        if node >= 0:
+            a = self.material_particle(state, source, target, lane, e, False)
+            for i in ti.static(range(9)):
+                self.affine[entry9 + i][lane] = a[i]
+        if first:
+            self.mark_shared(e, base, stamp)
+        sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
+        heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
+        self.share_heads(heads, q, node, first, rank)
+        field = self.momentum_field(state, source, a, lane, fx)
+        w = spline(fx)
+        self.scatter_runs(self.momentum, 4, sums, heads, q, w, field, run, first, rank, total, doublings)
+        h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
+        self.scatter_runs(self.velocity_bar, 3, sums, heads, q, w, h, run, first, rank, total, doublings)
+
+    @ti.func
+    def grid_thread_adjoint(self, w, q, s):
+        """Grid update of node q of the active blocks by thread w, and its adjoint; the scattered sums are
+        cleared."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        i = self.node_of_block(block, r)
+        total = self.take_nodes(self.momentum, stage, w, e, block, r)
+        bar4 = self.take_nodes(self.velocity_bar, stage, w, e, block, r)
+        near = 0
+        if total[3] > MASS_MIN:
+            near = self.touching(e, s, self.position(i))
+        v, total_bar = self.update_node_adjoint(
+            e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
+        )
+        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
+        self.put_nodes(self.momentum_bar, stage, w, e, block, r, total_bar)
+
+    @ti.func
+    def gather_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q):
+        """Adjoint of both transfers and of the material, for thread q's own particle."""
+        e, particle = self.particle_of(q)
+        if particle < self.particles:
+            tile = particle // self.lanes
+            lane = particle % self.lanes
+            source = self.tile_entry(before, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            entry9 = (e * self.tiles + tile) * 9
+            a_bar = self.gather_particle_adjoint(
+                state, source, self.tile_entry(after, e, tile), bar, entry, entry9, lane, e
+            )
+            self.material_particle_adjoint(state, source, bar, entry, a_bar, lane, e)
+
+    @ti.func
+    def loss_thread(self, w, q):
+        """Loss terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
+        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        e, block, r = self.node_of(q)
+        mass = self.take_nodes(self.momentum, stage, w, e, block, r)[3]
+        density, sdf, slope, overlap = self.node_loss(e, self.node_of_block(block, r), mass)
+        self.put_nodes(self.velocity, stage, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
+        part = ti.Vector(
+            [ti.cast(density, ti.f64), ti.cast(sdf, ti.f64), ti.cast(overlap, ti.f64), ti.cast(mass, ti.f64)]
+        )
+        # All lanes of a warp have nodes of the same environment.
+        for k in ti.static(range(RUN_BITS)):
+            for c in ti.static(range(3)):
+                part[c] += self.wide_from_above(part[c], 1 << k)
+            part[3] = ti.max(part[3], self.wide_from_above(part[3], 1 << k))
+        if w % WARP == 0:
+            for c in ti.static(range(3)):
+                ti.atomic_add(self.loss_part[e, 0][c], part[c])
+            # Most are below a peak seen already.
+            if part[3] > self.loss_part[e, 0][3]:
+                ti.atomic_max(self.loss_part[e, 0][3], part[3])
+
+    @ti.func
+    def gather_thread(self, state: ti.template(), before, after, q, time):
+        """Grid to particle, for thread q's own particle."""
+        e, particle = self.particle_of(q)
+        if particle < self.particles:
+            tile = particle // self.lanes
+            source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            self.gather_particle(state, source, target, particle % self.lanes, e, time)
