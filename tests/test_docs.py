@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import itertools
 import re
@@ -138,3 +139,30 @@ def test_what_is_made_has_a_rule(command):
     rules = re.findall(r"^([a-z][a-z-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     wanted = [word for word in shlex.split(command.partition(";")[0])[1:] if "=" not in word]
     assert wanted and set(wanted) <= set(rules)
+
+
+PYTHON = [
+    pytest.param(code, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, code in enumerate(
+        re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    )
+]
+
+
+def test_python_is_found():
+    assert len(PYTHON) > 15
+
+
+@pytest.mark.parametrize("code", PYTHON)
+def test_python_that_is_shown_parses_and_imports_what_there_is(code):
+    # A head may stand for the whole definition.
+    code += "    ...\n" if code.rstrip().endswith(":") else ""
+    for node in ast.walk(ast.parse(code)):
+        if not isinstance(node, ast.ImportFrom) or (node.module or "").partition(".")[0] != "plab":
+            continue
+        module = importlib.import_module(node.module)
+        for name in (alias.name for alias in node.names):
+            # As the statement does: what the module has, or else a module of the package.
+            if not hasattr(module, name):
+                importlib.import_module(f"{node.module}.{name}")
