@@ -16,6 +16,7 @@ from plab.objective import (
     batch_scores,
     observation,
     rewards,
+    score_scale,
     scores,
     scores_from_iou,
     soft_iou,
@@ -154,7 +155,7 @@ def test_scores_where_nothing_can_be_gained():
 def test_total_loss_and_rewards(rng):
     weights = LossWeights(density=10.0, sdf=5.0, contact=2.0)
     initial, steps = rng.random((2, 3)), rng.random((2, 6, 3))
-    loss, reward = total_loss(steps, weights), rewards(initial, steps, weights)
+    loss, reward = total_loss(steps, weights.numbers), rewards(initial, steps, weights)
     assert loss.shape == reward.shape == (2, 6)
     for b, t in np.ndindex(2, 6):
         d, s, c = steps[b, t]
@@ -195,8 +196,9 @@ def test_scores_of_a_batch_are_those_of_its_episodes() -> None:
     start, end = np.array([0.2, 0.5, 0.9, 0.9]), np.array([0.1, 0.7, 0.9, 0.8])
     best = np.array([0.8, 0.8, 0.9, 0.9])
     alone = [scores_from_iou(*row) for row in zip(start, end, best, strict=True)]
-    score, printed = batch_scores(start, end, best)
+    scale = score_scale(start, best)
+    score, printed = batch_scores(scale, end)
     np.testing.assert_array_equal(score, [one.score for one in alone])
     np.testing.assert_array_equal(printed, [one.score_printed for one in alone])
-    tensor, _printed = batch_scores(start, torch.from_numpy(end), best)
+    tensor, _printed = batch_scores(torch.from_numpy(scale), torch.from_numpy(end))
     np.testing.assert_array_equal(tensor.numpy(), score)

@@ -21,6 +21,7 @@ __all__ = [
     "batch_scores",
     "observation",
     "rewards",
+    "score_scale",
     "scores",
     "scores_from_iou",
     "soft_iou",
@@ -49,6 +50,11 @@ class LossWeights:
     density: float
     sdf: float
     contact: float
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The weights of density, SDF and contact term, shape [3]."""
+        return np.array([self.density, self.sdf, self.contact])
 
 
 @dataclass(frozen=True)
@@ -206,51 +212,48 @@ def _gain(start: float, end: float, best: float) -> float:
     return (end - start) / way
 
 
-def batch_scores(start: ArrayLike, end: Any, best: ArrayLike) -> tuple[Any, Any]:
-    """Judge many episodes as :func:`scores_from_iou` judges one.
+def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
+    """Return the numbers by which :func:`batch_scores` judges, shape [4, 2, batch].
 
     Args:
         start: Soft IoUs of the initial mass tensors, shape [batch].
-        end: Soft IoUs of the final mass tensors, shape [batch]; an array or a tensor.
         best: Soft IoUs of the targets themselves, shape [batch].
+    """
+    start = np.broadcast_to(np.asarray(start, np.float64), (2, np.size(start)))
+    best = np.stack([np.asarray(best, np.float64), np.ones_like(start[0])])
+    nothing_to_gain = best - start <= 1e-12
+    # Divided by infinity the share is 0, to which what counts then is added.
+    way = np.where(nothing_to_gain, np.inf, best - start)
+    return np.stack([start, way, best - 1e-12, nothing_to_gain])
+
+
+def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
+    """Judge many episodes as :func:`scores_from_iou` judges one.
+
+    Args:
+        scale: From :func:`score_scale`, an array or a tensor like ``end``.
+        end: Soft IoUs of the final mass tensors, shape [batch]; an array or a tensor.
 
     Returns:
         ``score`` and ``score_printed``, like ``end``.
     """
-    start, best = np.asarray(start), np.asarray(best)
-    return _gains(start, end, best).clip(0.0, 1.0), _gains(start, end, np.ones_like(start))
+    start, way, least, nothing_to_gain = scale
+    score, printed = (end - start) / way + (end >= least) * nothing_to_gain
+    return score.clip(0.0, 1.0), printed
 
 
-def _gains(start: np.ndarray, end: Any, best: np.ndarray) -> Any:
-    way = best - start
-    nothing_to_gain = way <= 1e-12
-    # Divided by infinity the share is 0, to which what counts then is added.
-    share = (end - _like(end, start)) / _like(end, np.where(nothing_to_gain, np.inf, way))
-    return share + (end >= _like(end, best - 1e-12)) * _like(end, nothing_to_gain)
-
-
-def _is_tensor(array: object) -> bool:
-    return hasattr(array, "new_tensor")
-
-
-def _like(array: Any, values: ArrayLike) -> Any:
-    """Return values as a tensor if ``array`` is one, of its type and device."""
-    return array.new_tensor(np.asarray(values)) if _is_tensor(array) else np.asarray(values)
-
-
-def total_loss(terms: ArrayLike, weights: LossWeights) -> np.ndarray:
+def total_loss(terms: Any, weights: Any) -> Any:
     """Weigh and add the terms of the step loss.
 
     Args:
         terms: Density, SDF and contact term, in this order, shape [..., 3]; an array or a tensor.
-        weights: Their weights.
+        weights: Their weights, shape [3], like ``terms``; see :attr:`LossWeights.numbers`.
 
     Returns:
-        Loss, shape [...].
+        Loss, shape [...], like ``terms``.
     """
-    terms = terms if _is_tensor(terms) else np.asarray(terms)
     # No matrix product: its rounding depends on how many losses are computed at once.
-    return (terms * _like(terms, [weights.density, weights.sdf, weights.contact])).sum(-1)
+    return (terms * weights).sum(-1)
 
 
 def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeights) -> np.ndarray:
@@ -264,7 +267,8 @@ def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeight
     Returns:
         Rewards, shape [..., T].
     """
-    return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
+    before, after = (total_loss(np.asarray(terms), weights.numbers) for terms in (initial_terms, step_terms))
+    return before[..., None] - after
 
 
 def observation(x: ArrayLike, v: ArrayLike, poses: Sequence[ArrayLike]) -> np.ndarray:

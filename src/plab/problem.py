@@ -140,7 +140,7 @@ class Problem:
         final_mass = self.simulator.mass_tensor() if exact else None
         return Episodes(
             terms=result.step_terms,
-            loss=total_loss(result.step_terms, self.weights),
+            loss=total_loss(result.step_terms, self.weights.numbers),
             reward=rewards(result.initial_terms, result.step_terms, self.weights),
             iou=result.step_iou,
             final_mass=final_mass,

@@ -17,11 +17,11 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
-from plab.objective import OBSERVED_PARTICLES, batch_scores, total_loss
+from plab.objective import OBSERVED_PARTICLES, batch_scores, score_scale, total_loss
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, Simulator
-from plab.sim.tensors import on_device
+from plab.sim.tensors import Constants, on_device
 
 if TYPE_CHECKING:
     import torch
@@ -187,9 +187,11 @@ class EpisodeBatch:
         self._step: int | None = None
         self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
         judged = self.problem.initial_scores
-        self._start_iou = np.array([start.iou_initial for start in judged])
-        self._best_iou = np.array([start.iou_target_self for start in judged])
+        start, best = [one.iou_initial for one in judged], [one.iou_target_self for one in judged]
+        self._scale = Constants(score_scale(start, best))
+        self._weights = Constants(self.problem.weights.numbers)
         self._initial_info = self._info()
+        self._initial_loss = Constants(self._initial_info["loss"])
         self._initial_observation = self._observe()
 
     @property
@@ -249,8 +251,7 @@ class EpisodeBatch:
         observation = self._observe(actions)
         info = self._info(actions)
         self._step += 1
-        start = self._initial_info["loss"]
-        reward = (actions.new_tensor(start) if on_device(actions) else start) - info["loss"]
+        reward = self._initial_loss.like(actions) - info["loss"]
         return Transition(observation, reward, self._step == self.horizon, info)
 
     def frames(self) -> tuple[np.ndarray, ...]:
@@ -291,9 +292,9 @@ class EpisodeBatch:
     def _info(self, like: Array = None) -> dict[str, Array]:
         measures = self._simulator.measure(like)
         terms, iou = measures.terms, measures.iou
-        score, printed = batch_scores(self._start_iou, iou, self._best_iou)
+        score, printed = batch_scores(self._scale.like(iou), iou)
         return {
-            "loss": total_loss(terms, self.problem.weights),
+            "loss": total_loss(terms, self._weights.like(terms)),
             "loss_density": terms[:, 0],
             "loss_sdf": terms[:, 1],
             "loss_contact": terms[:, 2],

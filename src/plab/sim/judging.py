@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plab.sim.state import Measures
-from plab.sim.tensors import on_device
+from plab.sim.tensors import Constants
 
 if TYPE_CHECKING:
     import torch
@@ -19,7 +19,13 @@ __all__ = ["Judge"]
 
 
 class Judge:
-    """Knows what all states of a batch are compared with."""
+    """Knows what all states of a batch are compared with.
+
+    Attributes:
+        target_sum: Sums of the targets' masses, shape [batch].
+    """
+
+    target_sum: np.ndarray
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         """Start without a target: there is no IoU then, it is NaN.
@@ -28,8 +34,7 @@ class Judge:
             scenes: One per environment.
         """
         self._total = scenes[0].particle_mass * scenes[0].particle_count
-        self._scale = np.full((2, len(scenes)), np.nan)
-        self._tensor: torch.Tensor | None = None
+        self._scale = Constants(np.full((2, len(scenes)), np.nan))
 
     def set_target(self, mass: np.ndarray) -> None:
         """Compare with other targets.
@@ -37,13 +42,8 @@ class Judge:
         Args:
             mass: Mass tensors as the simulation holds them, shape [batch, n, n, n], float64.
         """
-        self._scale = np.stack([mass.sum(axis=(1, 2, 3)), mass.max(axis=(1, 2, 3))])
-        self._tensor = None
-
-    @property
-    def target_sum(self) -> np.ndarray:
-        """Sums of the targets' masses, shape [batch]."""
-        return self._scale[0]
+        self.target_sum = mass.sum(axis=(1, 2, 3))
+        self._scale = Constants([self.target_sum, mass.max(axis=(1, 2, 3))])
 
     def measures(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Return loss terms and soft IoU.
@@ -52,16 +52,8 @@ class Judge:
             values: The kernels' measures, shape [..., batch, 6]; see :data:`plab.sim.storage.MEASURES`.
         """
         overlap, peak = values[..., 3], values[..., 4]
-        target_sum, target_peak = self._scale_like(values)
+        target_sum, target_peak = self._scale.like(values)
         with np.errstate(invalid="ignore", divide="ignore"):
             both = overlap / (peak * target_peak)
             iou = both / (self._total / peak + target_sum / target_peak - both)
         return Measures(values[..., :3], iou)
-
-    def _scale_like(self, values: Any) -> Any:
-        """Sums and peaks as an array, or as a tensor like this one, which is copied once."""
-        if not on_device(values):
-            return self._scale
-        if self._tensor is None or self._tensor.dtype != values.dtype:
-            self._tensor = values.new_tensor(self._scale)
-        return self._tensor

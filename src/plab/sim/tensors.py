@@ -10,16 +10,42 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["action_array", "numbers_of", "on_device", "output_for", "step_actions", "write_numbers"]
+__all__ = [
+    "Constants",
+    "action_array",
+    "numbers_of",
+    "on_device",
+    "output_for",
+    "step_actions",
+    "write_numbers",
+]
 
 
 def on_device(array: object) -> bool:
     """Whether something is a CUDA tensor; PyTorch is not imported for that."""
     return bool(getattr(array, "is_cuda", False))
+
+
+class Constants:
+    """Numbers that meet arrays and CUDA tensors in every step, and go to the device only once."""
+
+    def __init__(self, values: ArrayLike) -> None:
+        """Take over numbers, of any shape."""
+        self._values = np.asarray(values, np.float64)
+        self._tensor: torch.Tensor | None = None
+
+    def like(self, array: Any) -> Any:
+        """Return the numbers as an array, or as a tensor of the type and on the device of a CUDA tensor."""
+        if not on_device(array):
+            return self._values
+        if self._tensor is None or (self._tensor.dtype, self._tensor.device) != (array.dtype, array.device):
+            self._tensor = array.new_tensor(self._values)
+        return self._tensor
 
 
 @ti.kernel
