@@ -119,7 +119,7 @@ class Particles:
         """User arrays to tiles in the initial order, the last tile padded with particles at rest."""
         engine = self.engine
         b, n = engine.batch, engine.particles
-        flat = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
+        flat: np.ndarray = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
         flat[:, :, [15, 19, 23]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import taichi as ti
@@ -323,6 +323,7 @@ class Simulator:
                 with a gradient.
         """
         self._require_gradient()
+        assert self._tape.bar is not None
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
         return self._particles.unpack(self._tape.bar.to_numpy(), poses, self._particles.order.initial)
 
@@ -375,7 +376,7 @@ class Simulator:
 
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
-        poses = self.poses()
+        poses = cast(np.ndarray, self.poses())
         return self._particles.unpack(self._particles.current.to_numpy(), poses)
 
     def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class State:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a state is judged by.
+    """What a state is judged by; arrays, or CUDA tensors where the caller asked for them.
 
     Attributes:
         terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
@@ -43,8 +43,8 @@ class Measures:
             NaN before :meth:`Simulator.set_target`.
     """
 
-    terms: np.ndarray | torch.Tensor
-    iou: np.ndarray | torch.Tensor
+    terms: Any
+    iou: Any
 
 
 @dataclass(frozen=True)

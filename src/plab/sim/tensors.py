@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
     import torch
+    from typing_extensions import TypeIs
 
 __all__ = [
     "Constants",
@@ -26,7 +27,7 @@ __all__ = [
 ]
 
 
-def on_device(array: object) -> bool:
+def on_device(array: object) -> "TypeIs[torch.Tensor]":
     """Whether something is a CUDA tensor; PyTorch is not imported for that."""
     return bool(getattr(array, "is_cuda", False))
 
