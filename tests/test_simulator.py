@@ -227,6 +227,26 @@ def test_memory_budget_is_named(sim: Simulator) -> None:
     sim.memory_mb = before
 
 
+def test_states_in_several_arrays_give_the_same_gradient(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    u = actions()
+    base = simulator(SCENES, device)
+    want, final = base.rollout(u), base.state()
+    slots = base._tape._slots_per_step + 1
+    monkeypatch.setitem(ENTRIES_MAX, device, slots * base._particles.slot_entries)
+    sim = simulator(SCENES, device)
+    for arrays in (STEPS, STEPS // 2):
+        got = sim.rollout(u)
+        assert len(sim._tape._history) == arrays
+        assert_same(got.step_terms, want.step_terms, device)
+        assert_same(got.gradient, want.gradient, device)
+        assert_same(sim.state().x, final.x, device)
+        # Not for all steps: two segments.
+        memory_mb = (sim.memory_bytes() - 2 * sim._particles.slot_bytes) / 1e6
+        sim = simulator(SCENES, device, memory_mb=memory_mb)
+
+
 def test_too_many_environments_for_an_array_are_named(
     sim: Simulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

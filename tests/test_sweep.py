@@ -307,7 +307,7 @@ def test_full_size_batches_fit_the_memory(device: str) -> None:
     limits = [batch_limit(scene, "float32", device, memory) for memory in (1.0, 4000.0, 8000.0, 40000.0)]
     assert limits[0] == 1 and limits == sorted(limits) and limits[1] >= 3 and limits[-1] > limits[1]
     lengths = range(1, scene.horizon + 1)
-    fewest = min(kept_states(scene.horizon, scene.substeps, length) for length in lengths)
+    fewest = min(kept_states(scene.horizon, scene.substeps, length, length) for length in lengths)
     particles = -(-scene.particle_count // 32) * 32
     assert limits[1] * fewest * particles * 24 * 4 <= 4000e6
     assert limits[1] * 2 > limits[2] - 2

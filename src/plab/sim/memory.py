@@ -9,7 +9,7 @@ import taichi as ti
 from plab.scene import Scene
 from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE, STATE_MASK
 
-__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states", "longest_array"]
+__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 """Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
@@ -20,18 +20,14 @@ REAL_BYTES = {"float32": 4, "float64": 8}
 BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
 
 
-def kept_states(steps: int, slots_per_step: int, length: int) -> int:
+def kept_states(steps: int, slots_per_step: int, length: int, reach: int) -> int:
     """Return how many states a gradient keeps if every ``length`` environment steps are one segment.
 
-    All states of one segment are kept, the first one of every segment, and two more.
+    All states of one segment are kept, in arrays of ``reach`` steps, each with one more at its start, the
+    first one of every segment, and one more.
     """
-    segments = -(-steps // length)
-    return length * slots_per_step + 2 + (segments if segments > 1 else 0)
-
-
-def longest_array(steps: int, slots_per_step: int, length: int) -> int:
-    """Return how many states the longer of the two arrays holds in which a gradient keeps them."""
-    return max(length * slots_per_step + 1, -(-steps // length))
+    segments, arrays = -(-steps // length), -(-length // reach)
+    return length * slots_per_step + arrays + 1 + (segments if segments > 1 else 0)
 
 
 def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> int:
@@ -52,11 +48,15 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     """
     real, lanes = REAL_BYTES[precision], LANES[device]
     entries = -(-scene.particle_count // lanes) * lanes * STATE
-    lengths = range(1, scene.horizon + 1)
     # On CUDA a step's start may be kept in two orders of the particles.
     slots_per_step = scene.substeps + (0 if device == "cpu" else 1)
-    states = [kept_states(scene.horizon, slots_per_step, length) + 1 for length in lengths]
-    kept = states[-1] if device == "cpu" else min(states)
+    if device == "cpu":
+        kept = kept_states(scene.horizon, slots_per_step, scene.horizon, scene.horizon) + 1
+    else:
+        # No array is longer than that of one step; there is one array for the segments.
+        segments_max = slots_per_step + 1
+        lengths = range(-(-scene.horizon // segments_max), scene.horizon + 1)
+        kept = min(kept_states(scene.horizon, slots_per_step, length, 1) for length in lengths) + 1
     # Current and initial state, stress, adjoints, orders and what goes with them: less than six more states.
     kept += 6
     # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts by cell; target and
@@ -64,9 +64,7 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     nodes = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
     grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
-    # The sparsest way to keep states, by the entries of the longer of its two arrays.
-    longest = min(longest_array(scene.horizon, slots_per_step, length) for length in lengths)
-    return max(1, min(fitting, ENTRIES_MAX[device] // (longest * entries)))
+    return max(1, min(fitting, ENTRIES_MAX[device] // ((slots_per_step + 1) * entries)))
 
 
 def array_bytes(data: ti.Field | ti.Ndarray) -> int:
@@ -80,7 +78,8 @@ def _entry_shape(field: ti.Field) -> tuple[int, ...]:
 
 
 def held_bytes(*holders: object) -> int:
-    """Bytes of all fields and arrays among the attributes of objects, each counted once."""
+    """Bytes of all fields and arrays among the attributes of objects, also in lists, each counted once."""
     values = [value for holder in holders for value in vars(holder).values()]
+    values += [part for value in values if isinstance(value, list) for part in value]
     held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
     return sum(array_bytes(value) for value in held.values())

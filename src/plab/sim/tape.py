@@ -6,7 +6,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states, longest_array
+from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
 from plab.sim.storage import MEASURES
 
@@ -17,7 +17,8 @@ class Tape:
     """Runs environment steps forward and back.
 
     The steps are divided into segments. Of each but the last only the first state is kept on the way forward;
-    its other states are computed again on the way back, in the same order of the particles.
+    its other states are computed again on the way back, in the same order of the particles. A segment's
+    states are in as many arrays as it takes: Taichi cannot address more than :data:`ENTRIES_MAX` numbers.
 
     Attributes:
         bar: Adjoint of the initial state after :meth:`backward`, in the initial order; None before the first.
@@ -31,10 +32,12 @@ class Tape:
         """
         self._particles = particles
         self._engine = particles.engine
-        self._history: ti.Ndarray | None = None
+        self._history: list[ti.Ndarray] = []
         self._checkpoints: ti.Ndarray | None = None
         self._moves: ti.Ndarray | None = None
+        # Environment steps per segment, and per array of the history.
         self._length = 0
+        self._reach = 0
         self.bar: ti.Ndarray | None = None
         self._spare_bar: ti.Ndarray | None = None
 
@@ -46,9 +49,16 @@ class Tape:
         step's start is kept in its own order and in that of the step before."""
         return self._engine.substeps + (1 if self._engine.sorts else 0)
 
-    def _first_slot(self, t: int) -> int:
-        """Slot of the history from which step t starts."""
-        return t % self._length * self._slots_per_step + (1 if self._engine.sorts else 0)
+    @property
+    def _reach_max(self) -> int:
+        """Environment steps whose states fit into one array."""
+        slots = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
+        return max(0, slots - 1) // self._slots_per_step
+
+    def _place(self, t: int) -> tuple[ti.Ndarray, int]:
+        """Array and slot of the history from which step t starts."""
+        number, within = divmod(t % self._length, self._reach)
+        return self._history[number], within * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
         """Environment steps per segment for a gradient over ``steps`` of them.
@@ -71,11 +81,13 @@ class Tape:
             # The orders of all steps, and the adjoint's other half.
             fixed += 4 * steps * self._particles.order.places + slot_bytes
 
-        def cost(length: int) -> int:
-            return kept_states(steps, slots_per_step, length) * slot_bytes + fixed
+        reach = self._reach_max
 
-        room = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
-        lengths = [n for n in range(1, steps + 1) if longest_array(steps, slots_per_step, n) <= room]
+        def cost(length: int) -> int:
+            return kept_states(steps, slots_per_step, length, reach) * slot_bytes + fixed
+
+        segments_max = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
+        lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
         if not lengths:
             raise MemoryError(
                 f"{self._engine.batch} environments are too many for a gradient of {steps} steps, "
@@ -93,11 +105,13 @@ class Tape:
         return -(-steps // segments)
 
     def _allocate(self, steps: int) -> None:
-        slots, segments = self._length * self._slots_per_step + 1, -(-steps // self._length)
-        per_slot = self._particles.current.shape[0]
-        if self._history is None or self._history.shape[0] < slots * per_slot:
-            self._history = None
-            self._history = self._particles.array(slots)
+        per_slot, segments = self._particles.current.shape[0], -(-steps // self._length)
+        parts = [min(self._reach, self._length - first) for first in range(0, self._length, self._reach)]
+        slots = [part * self._slots_per_step + 1 for part in parts]
+        held = [array.shape[0] // per_slot for array in self._history]
+        if len(held) < len(slots) or any(has < needs for has, needs in zip(held, slots, strict=False)):
+            self._history.clear()
+            self._history += [self._particles.array(count) for count in slots]
         if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * per_slot):
             self._checkpoints = None
             self._checkpoints = self._particles.array(segments)
@@ -132,6 +146,7 @@ class Tape:
         particles = self._particles
         self._length = length or steps
         if length is not None:
+            self._reach = min(length, self._reach_max)
             self._allocate(steps)
         last = (steps - 1) // self._length if length is not None else -1
         for t in range(steps):
@@ -141,32 +156,34 @@ class Tape:
             after = self._entry(t)
             if k == last:
                 if begins:
-                    self._engine.copy_slot(particles.current, 0, self._history, 0)
+                    self._engine.copy_slot(particles.current, 0, self._history[0], 0)
                 self._keep_step(t, actions, poses, known=False)
                 if terms is not None:
-                    end = self._first_slot(t) + self._engine.substeps
-                    particles.losses(terms, after, self._history, end)
+                    history, slot = self._place(t)
+                    particles.losses(terms, after, history, slot + self._engine.substeps)
             else:
                 moves = self._moves if length is not None else None
                 particles.step(poses, actions, t, entries=(t, t + 1), moves=moves)
                 if terms is not None:
                     particles.losses(terms, after)
         if length is not None:
-            end = self._first_slot(steps - 1) + self._engine.substeps
-            self._engine.copy_slot(self._history, end, particles.current, 0)
+            history, slot = self._place(steps - 1)
+            self._engine.copy_slot(history, slot + self._engine.substeps, particles.current, 0)
 
     def _keep_step(self, t: int, actions: ti.Ndarray, poses: ti.Ndarray, *, known: bool) -> None:
         """Run step t within the history; ``known`` tells that its order of the particles is."""
-        slot = self._first_slot(t)
+        history, slot = self._place(t)
+        number, within = divmod(t % self._length, self._reach)
+        if number and not within:
+            end = self._reach * self._slots_per_step
+            self._engine.copy_slot(self._history[number - 1], end, history, 0)
         if self._engine.sorts:
+            order = self._particles.order
             if not known:
-                stamp = self._particles.take_stamps(1)
-                self._particles.order.sort(
-                    self._history, slot - 1, self._history, slot, t, stamp, self._moves
-                )
+                order.sort(history, slot - 1, history, slot, t, self._particles.take_stamps(1), self._moves)
             else:
-                self._particles.order.move(self._history, slot - 1, self._history, slot, self._moves, t)
-        self._particles.advance(self._history, slot, 1, poses, actions, t, (t, t + 1))
+                order.move(history, slot - 1, history, slot, self._moves, t)
+        self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1))
 
     def _entry(self, t: int) -> int:
         """First entry of the measures after step t."""
@@ -198,15 +215,16 @@ class Tape:
             k = t // self._length
             if k < last and (t + 1) % self._length == 0:
                 self._recompute(k, actions, poses)
+            history, slot = self._place(t)
             engine.step_adjoint(
-                self._history,
+                history,
                 self.bar,
                 poses,
                 actions,
                 actions_bar,
                 terms,
                 self._entry(t),
-                self._first_slot(t),
+                slot,
                 t,
                 self._particles.take_stamps(engine.substeps + 1),
                 int(t >= contact_free),
@@ -218,6 +236,6 @@ class Tape:
 
     def _recompute(self, k: int, actions: ti.Ndarray, poses: ti.Ndarray) -> None:
         """Fill the history with the states of segment k."""
-        self._engine.copy_slot(self._checkpoints, k, self._history, 0)
+        self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
         for t in range(k * self._length, (k + 1) * self._length):
             self._keep_step(t, actions, poses, known=True)
