@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -9,9 +10,11 @@ __all__ = ["ending", "refusal", "snapshot"]
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    """Everything in a folder: folders, and files with what they hold."""
+    """Everything in a folder: folders, and files with what they hold, None where that may not be read."""
     return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        str(path.relative_to(folder)): path.read_bytes()
+        if path.is_file() and os.access(path, os.R_OK)
+        else None
         for path in folder.rglob("*")
     }
 
