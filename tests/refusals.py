@@ -1,4 +1,4 @@
-"""What a refusal has to be: one helpful line, an exit code that is not 0, nothing written."""
+"""What a refusal has to be: one helpful line, exit code 2, nothing written."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
     """Assert that a command line has refused what it was given; return the line that says why."""
-    assert code not in (0, None), f"accepted: {argv}"
+    # That of mistakes: 1 is left to what went wrong in a run or was found by a check.
+    assert code == 2, f"exit code {code}: {argv}"
     assert "Traceback" not in out + err
     lines = err.splitlines()
     assert lines, f"no message: {argv}"
