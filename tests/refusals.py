@@ -1,4 +1,4 @@
-"""What a refusal has to be: one helpful line, exit code 2, nothing written."""
+"""What a refusal has to be: one helpful line, exit code 2, nothing printed but the line, nothing written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
     """Assert that a command line has refused what it was given; return the line that says why."""
     # That of mistakes: 1 is left to what went wrong in a run or was found by a check.
     assert code == 2, f"exit code {code}: {argv}"
-    assert "Traceback" not in out + err
+    assert out == ""
+    assert "Traceback" not in err
     lines = err.splitlines()
     assert lines, f"no message: {argv}"
     assert lines[-1].startswith(("plab", "python -m plab")) and ": " in lines[-1]
