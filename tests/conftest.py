@@ -73,6 +73,7 @@ def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., st
         within: AbstractContextManager[None] | None = None,
     ) -> str:
         before = snapshot(tmp_path)
+        capsys.readouterr()
         with within or nullcontext():
             code = ending(entry, argv)
         line = refusal(code, *capsys.readouterr(), argv)

@@ -55,12 +55,12 @@ def _without_privilege() -> Iterator[None]:
         return
     libc = ctypes.CDLL(None)
     header, sets = _Header(VERSION, 0), (_Sets * 2)()
-    libc.capget(ctypes.byref(header), sets)
+    assert libc.capget(ctypes.byref(header), sets) == 0
     before = sets[0].effective
     sets[0].effective = before & ~OVERRIDES
-    libc.capset(ctypes.byref(header), sets)
+    assert libc.capset(ctypes.byref(header), sets) == 0
     try:
         yield
     finally:
         sets[0].effective = before
-        libc.capset(ctypes.byref(header), sets)
+        assert libc.capset(ctypes.byref(header), sets) == 0

@@ -13,6 +13,7 @@ import pytest
 
 from plab.bench import everyday, opcount, paper, skips, speed
 from plab.bench.table import report
+from plab.bench.workload import TENSORS
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
@@ -47,6 +48,14 @@ def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.Ca
     assert float(rows[1]["memory_mb"]) > float(rows[0]["memory_mb"])
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].split() == list(speed.COLUMNS) and len(printed) == 1 + len(rows)
+
+
+def test_only_the_kinds_asked_for_are_timed(tmp_path: Path) -> None:
+    """Tensors only on CUDA."""
+    path = tmp_path / "speed.csv"
+    command = [*TINY, "--quick", "--steps", "2", "--repeats", "1", "--kinds", "forward", TENSORS]
+    assert speed.main([*command, "--csv", str(path)]) == 0
+    assert [row["what"] for row in read(path)] == ["forward"]
 
 
 def test_a_skip_has_a_row_and_a_changed_result_is_told(
@@ -186,16 +195,20 @@ def test_everyday_things_are_timed_in_turns_with_another_source_tree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(everyday, "SETTLE", 0.0)
-    other, path = Path(everyday.plab.__file__).parents[1], tmp_path / "everyday.csv"
+    own, other, path = Path(everyday.plab.__file__).parents[1], tmp_path / "src", tmp_path / "everyday.csv"
+    (other / "plab").mkdir(parents=True)
+    (other / "plab" / "__init__.py").touch()
+    (other / "plab" / "results.py").write_text("def load(folder): pass\n")
     things = ["import plab", "load, first time"]
     everyday.main(
         ["--runs", "2", "--repeats", "2", "--against", str(other), "--only", *things, "--csv", str(path)]
     )
     rows = read(path)
-    assert [row["what"] for row in rows] == [things[0], things[0], things[1], things[1]]
+    expected = [(what, str(source)) for what in things for source in (other, own)]
+    assert [(row["what"], row["source"]) for row in rows] == expected
     assert all(0 < float(row["cpu_s"]) <= float(row["cpu_max_s"]) for row in rows)
-    # Loading imports pandas, on top.
-    assert float(rows[2]["cpu_s"]) > float(rows[0]["cpu_s"])
+    # Ours imports pandas, the other one nothing.
+    assert float(rows[3]["cpu_s"]) > 3 * float(rows[2]["cpu_s"])
 
 
 def test_an_everyday_thing_that_fails_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

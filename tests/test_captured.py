@@ -110,13 +110,19 @@ def test_updates_written_for_recording_are_those_of_the_library(
         np.testing.assert_allclose(ours.logger.seen[key], values, rtol=1e-4, atol=1e-6, err_msg=key)
 
 
-def test_a_saved_model_goes_on(tmp_path: Any) -> None:
+def test_a_saved_model_goes_on(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is kept for recorded updates is not saved, and is made again."""
+    monkeypatch.setattr(CapturedSAC, "train", CapturedSAC.train_captured)
     model = make(CapturedSAC, OFF_POLICY)
     model.learn(60)
+    assert "_updates" in model.__dict__
     model.save(tmp_path / "model.zip")
     again = CapturedSAC.load(tmp_path / "model.zip", env=model.get_env())
+    assert "_updates" not in again.__dict__
     for expected, found in zip(parameters(model), parameters(again), strict=True):
         assert torch.equal(found, expected)
+    again.learn(60, reset_num_timesteps=False)
+    assert any(not torch.equal(a, b) for a, b in zip(parameters(model), parameters(again), strict=True))
 
 
 def test_on_the_cpu_an_update_is_a_call() -> None:
@@ -164,14 +170,21 @@ def test_replayed_updates_are_those_of_the_library(name: str) -> None:
             train, model.train = model.train, lambda: None
             model.learn(60)
             model.train = train
+    before = parameters(ours)
     for round_ in range(12):
         for model in (theirs, ours):
             torch.manual_seed(round_)
             np.random.seed(round_)  # noqa: NPY002
             arguments = (2, 8) if isinstance(model, OffPolicyAlgorithm) else ()
             model.train(*arguments)
-    moved = [float((a - b).abs().max()) for a, b in zip(parameters(theirs), parameters(ours), strict=True)]
-    assert max(moved) < 2e-3, moved
+    after = parameters(ours)
+    apart = max(float((a - b).abs().max()) for a, b in zip(parameters(theirs), after, strict=True))
+    way = max(float((a - b).abs().max()) for a, b in zip(before, after, strict=True))
+    # Adam's steps are of a size of their own, however wrong the gradient: they are to go the same way.
+    assert apart < min(2e-3, 0.3 * way), (apart, way)
+    if isinstance(ours, SAC):
+        # It is no parameter of the policy.
+        torch.testing.assert_close(ours.log_ent_coef, theirs.log_ent_coef, rtol=0.0, atol=1e-3)
 
 
 @pytest.mark.gpu

@@ -36,19 +36,22 @@ def test_cuda_gives_what_the_cpu_gives() -> None:
     np.testing.assert_allclose(on_cuda[4]["final_info"]["iou"], on_cpu[4]["final_info"]["iou"], atol=1e-5)
 
 
-def test_tensors_stay_on_the_device() -> None:
+@pytest.mark.parametrize("own_stream", [False, True])
+def test_tensors_stay_on_the_device(own_stream: bool) -> None:
+    """Also where PyTorch works in another stream than Taichi."""
     cfgs = [load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2
     env, arrays = TensorEnv(cfgs), EpisodeBatch(cfgs)
-    first = env.reset()
-    np.testing.assert_array_equal(first.cpu().numpy(), arrays.reset()[0])
     generator = torch.Generator("cuda").manual_seed(0)
-    for _ in range(4):
-        actions = 2.0 * torch.rand((2, 6), generator=generator, device="cuda", dtype=torch.float64) - 1.0
-        got, want = env.step(actions), arrays.step(actions.cpu().numpy())
-        assert all(tensor.is_cuda for tensor in (got.observation, got.reward, *got.info.values()))
-        np.testing.assert_allclose(got.observation.cpu().numpy(), want.observation, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(got.reward.cpu().numpy(), want.reward, atol=1e-9)
-        np.testing.assert_allclose(got.info["score"].cpu().numpy(), want.info["score"], atol=1e-9)
+    with torch.cuda.stream(torch.cuda.Stream() if own_stream else torch.cuda.default_stream()):
+        first = env.reset()
+        np.testing.assert_array_equal(first.cpu().numpy(), arrays.reset()[0])
+        for _ in range(4):
+            actions = 2.0 * torch.rand((2, 6), generator=generator, device="cuda", dtype=torch.float64) - 1.0
+            got, want = env.step(actions), arrays.step(actions.cpu().numpy())
+            assert all(tensor.is_cuda for tensor in (got.observation, got.reward, *got.info.values()))
+            np.testing.assert_allclose(got.observation.cpu().numpy(), want.observation, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(got.reward.cpu().numpy(), want.reward, atol=1e-9)
+            np.testing.assert_allclose(got.info["score"].cpu().numpy(), want.info["score"], atol=1e-9)
 
 
 def test_gradients_of_tensors_stay_on_the_device() -> None:

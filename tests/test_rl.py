@@ -129,9 +129,18 @@ def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult],
 def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunResult], tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match=r"none\.policy\.npz is not there: sac, td3 and ppo write it"):
         load_policy(tmp_path / "none.h5")
-    policy_path(tmp_path / "some.h5").write_bytes(b"no archive")
-    with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
-        load_policy(tmp_path / "some.h5")
+    whole = policy_path(finished["sac"].path).read_bytes()
+    with np.load(policy_path(finished["sac"].path)) as file:
+        arrays = dict(file)
+    inner = arrays["policy"]
+    for broken in (b"", b"no archive", whole[:40], whole[: len(whole) // 2]):
+        policy_path(tmp_path / "some.h5").write_bytes(broken)
+        with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
+            load_policy(tmp_path / "some.h5")
+    for cut in (inner[:0], inner[:40], inner[: len(inner) // 2], np.arange(100, dtype=np.uint8)):
+        np.savez(policy_path(tmp_path / "some.h5"), **arrays | {"policy": cut})
+        with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
+            load_policy(tmp_path / "some.h5")
 
 
 def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
@@ -242,6 +251,24 @@ def test_resumed_run_equals_an_uninterrupted_one(
     assert_same_numbers(resumed, finished[method])
     assert resumed.provenance["resumed"] == 1
     assert_nothing_else_is_left(resumed)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("method", METHODS)
+def test_networks_on_cuda_are_trained_resumed_and_kept(tmp_path, monkeypatch, method) -> None:
+    cfg = make_config(tmp_path, method, "method.torch_device=cuda")
+    with monkeypatch.context() as patch:
+        break_after(patch, 2, OSError("gone"))
+        with pytest.raises(OSError, match="gone"):
+            run_config(cfg)
+    resumed = run(cfg)
+    assert resumed.provenance["resumed"] == 1
+    assert np.isfinite(resumed.iterations[1:].to_numpy()).all()
+    assert_nothing_else_is_left(resumed)
+    policy = load_policy(resumed.path, "cuda")
+    assert policy.network.device.type == "cuda"
+    done = policy_episode(EpisodeBatch([cfg]), policy)
+    assert all(math.isfinite(done.measures[name]) for name in COLUMNS)
 
 
 def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
@@ -363,7 +390,7 @@ def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size
     )
     if copies:
         # As on a CUDA device, where samples come from copies; the file must not matter then.
-        own._copies = {name: array.clone() for name, array in own._copy_to_device().items()}
+        own._copies = own._copy_to_device()
     plain = ReplayBuffer(min(buffer_size, steps * envs), observations, actions, "cpu", n_envs=envs)
     rng = np.random.default_rng(0)
     state = rng.normal(size=(envs, 3)).astype(np.float32)
@@ -376,7 +403,8 @@ def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size
         state = rng.normal(size=(envs, 3)).astype(np.float32) if done[0] else after
     assert own.size() == plain.size()
     if copies:
-        own.observations[:] = 0.0
+        for array in (own.observations, own.actions, own.rewards):
+            array[:] = 0.0
     sets = []
     for buffer in (own, plain):
         sample = buffer.sample(4000)

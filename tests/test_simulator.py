@@ -165,6 +165,18 @@ def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
     assert np.isfinite(sim.rollout(actions()).gradient).all()
 
 
+def test_a_step_that_is_not_checked_is_checked_by_what_measures(sim: Simulator) -> None:
+    sim.reset()
+    state = sim.state()
+    state.v[1, 7, 0] = math.nan
+    sim.set_state(state)
+    sim.step(np.zeros((3, 6)), check=False)
+    with pytest.raises(SimulationError, match="environment 1, environment step 1, substep 1"):
+        sim.measure()
+    sim.reset()
+    assert np.isfinite(sim.measure().terms).all()
+
+
 def assert_same(got: np.ndarray, want: np.ndarray, device: str) -> None:
     """Bit for bit on the CPU; on CUDA sums come in any order."""
     if device == "cpu":

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from plab.config import ConfigError, build_scene, load_config, variant_task
@@ -23,6 +24,7 @@ from plab.targets import (
     load_release_target,
     make_recipe,
 )
+from plab.targets import __main__ as command
 from plab.targets.store import TargetStore
 
 pytestmark = pytest.mark.physics
@@ -313,3 +315,8 @@ def test_a_target_of_too_few_particles_is_told(device):
     overrides = ("task=Rope", *COARSE[:3], "sim.particles_scale=1e-4", f"sim.device={device}")
     with pytest.raises(TargetError, match=r"the target is empty: .*raise sim.particles_scale"):
         Problem([load_config(overrides)])
+
+
+def test_the_table_is_written_to_a_new_folder_too(tmp_path):
+    command._write(pd.DataFrame({"task": ["Rope"], "seconds": [1.0]}), tmp_path / "new" / "a.csv")
+    assert (tmp_path / "new" / "a.csv").read_text() == "task\nRope\n"

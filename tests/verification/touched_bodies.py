@@ -42,7 +42,7 @@ def components(kind: str) -> list[int]:
 
 
 def build() -> Simulator:
-    """The simulator, float64 on the CPU, with an empty target: |mass - target| has no kink then."""
+    """The simulator, float64, with an empty target: |mass - target| has no kink then."""
     sim = Simulator(SCENES, precision="float64", device=DEVICE, full_gradient=True)
     n = sim.grid_size
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import pickle
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -10,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import get_device
 
 from plab.results import ResultsError
 from plab.results.files import replace_file
@@ -19,6 +22,9 @@ __all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
 
 EPSILON = 1e-8
 """Added to variances of observations, as Stable-Baselines3 does."""
+
+_BROKEN = (OSError, ValueError, KeyError, EOFError, RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile)
+"""What NumPy and PyTorch raise at a file that is cut off or of another kind."""
 
 
 class Policy:
@@ -102,13 +108,14 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
         kind = ALGORITHMS[str(arrays["algorithm"])].model.policy_aliases["MlpPolicy"]
-        network = kind.load(cast(str, io.BytesIO(arrays["policy"].tobytes())), device=device)
+        network = kind.load(cast(str, io.BytesIO(arrays["policy"].tobytes())), device="cpu")
     except FileNotFoundError:
         raise ResultsError(
             f"{path} is not there: sac, td3 and ppo write it when a run ends; see docs/rl.md"
         ) from None
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except _BROKEN as error:
         raise ResultsError(
             f"{path} is no policy of plab's ({error}): run it again with force=true"
         ) from error
-    return Policy(network, arrays.get("mean"), arrays.get("variance"))
+    # What the device answers says nothing about the file.
+    return Policy(network.to(get_device(device)), arrays.get("mean"), arrays.get("variance"))
