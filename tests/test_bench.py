@@ -96,6 +96,12 @@ def test_paper_table_is_whole() -> None:
     assert (table["forward_backward_ms"] > table["forward_ms"]).all() and (table["forward_ms"] > 10.0).all()
 
 
+def test_the_paper_table_is_written_to_a_new_folder(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "table.md"
+    paper.write_markdown(path, [dict.fromkeys(paper.COLUMNS, 1.0)])
+    assert path.read_text(encoding="utf-8").endswith("| 1.0 |\n")
+
+
 def test_operations_are_counted() -> None:
     nine = opcount._numbers(9)
     assert opcount._counted(lambda: opcount.plain(linear_algebra.mul)(nine, nine)) == 45

@@ -86,4 +86,5 @@ def write_markdown(path: Path, table: Sequence[Mapping[str, object]]) -> None:
         path: File to write.
         table: Rows.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(HEADING + markdown(COLUMNS, table), encoding="utf-8")

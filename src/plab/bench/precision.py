@@ -190,7 +190,7 @@ def _run(options: argparse.Namespace) -> int:
     rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
     if options.markdown is not None:
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
-        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles))
+        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles), encoding="utf-8")
     return 0
 
 
