@@ -225,6 +225,20 @@ def test_folders_that_may_not_be_written_to(told, tmp_path, closed, entry, argv)
     assert re.search(r"cannot write .*closed", told(argv, entry, ordinary_rights(tmp_path)))
 
 
+@pytest.mark.parametrize("mode", [0o000, 0o600])
+@pytest.mark.parametrize(
+    ("entry", "argv"),
+    [
+        (speed.main, ["--csv", "locked/a.csv"]),
+        (render.main, ["task=Rope", "--output", "locked/new/a.png"]),
+    ],
+    ids=name_of,
+)
+def test_folders_that_may_not_be_searched(told, tmp_path, entry, argv, mode):
+    (tmp_path / "locked").mkdir(mode=mode)
+    assert re.search(r"cannot write .*locked", told(argv, entry, ordinary_rights(tmp_path)))
+
+
 UNREADABLE = [
     (run.main, ["task=Secret", "--config-dir", "mine"], "mine/task/Secret.yaml"),
     (run.main, ["task=Rope", "targets.source=files"], "files/Rope3D-v1.npy"),

@@ -40,9 +40,12 @@ def to_write(text: str) -> Path:
     Folders above it that are not there yet are for whoever writes it to make.
     """
     path = Path(text)
-    there = next(place for place in (path, *path.absolute().parents) if place.exists())
-    if (there == path) == there.is_dir():
-        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if there.is_dir() else 'no'} folder")
-    if not os.access(there, os.W_OK, effective_ids=os.access in os.supports_effective_ids):
+    # Of pathlib's `exists` some versions raise where a folder may not be searched.
+    there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
+    folder = there.is_dir()
+    if (there == path) == folder:
+        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if folder else 'no'} folder")
+    needed = os.W_OK | os.X_OK if folder else os.W_OK
+    if not os.access(there, needed, effective_ids=os.access in os.supports_effective_ids):
         raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
     return path
