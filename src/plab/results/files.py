@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,7 +35,7 @@ _images = itertools.count()
 _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
 
-_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile)
+_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
 """What h5py, zlib and zipfile raise on files that are cut short, damaged or something else."""
 
 
