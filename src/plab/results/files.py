@@ -21,6 +21,7 @@ from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, NewerSchemaError
 
 __all__ = [
     "encode",
+    "explained",
     "opened",
     "opened_image",
     "read",
@@ -161,7 +162,7 @@ def split_archive(path: Path) -> tuple[Path, str] | None:
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open a run of this schema version, turning whatever is wrong with it into a ResultsError."""
     inside = split_archive(path)
-    with _explained(path):
+    with explained(path):
         if inside is None:
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
@@ -179,12 +180,13 @@ def opened(path: Path) -> Iterator[h5py.File]:
 @contextmanager
 def opened_image(image: bytes, path: Path) -> Iterator[h5py.File]:
     """Open the bytes of a run, as :func:`opened` does a file; ``path`` is for messages."""
-    with _explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
+    with explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
         yield _of_this_version(file, path)
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def explained(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with reading inside the ``with`` block into a ResultsError; ``path`` is named."""
     try:
         yield
     except FileNotFoundError as error:
