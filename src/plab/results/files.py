@@ -111,7 +111,17 @@ def read(path: str | Path) -> RunResult:
 
 
 def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Read a run's configuration and iterations alone, as :func:`read` does, in less time."""
+    """Read a run's configuration and iterations alone, in less time than :func:`read` takes for all of it.
+
+    Args:
+        path: The file, or the place in an archive, as for :func:`read`.
+
+    Returns:
+        The configuration, and the iterations, a row each.
+
+    Raises:
+        ResultsError: As for :func:`read`.
+    """
     path = Path(path)
     with opened(path) as file:
         config = attributes(file, names=("config",))["config"]

@@ -131,10 +131,10 @@ def rows(
 
 
 def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
-    """Return the same as :func:`rows`, but do not go on with unreadable files alone.
+    """Return the same as :func:`rows`, but raise where files are asked for and none can be read.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or only files that cannot be read.
+        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = rows(source)
     sources = [source] if isinstance(source, str | Path) else source
