@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import re
 import subprocess
@@ -17,9 +18,11 @@ import synthetic
 from plab import run, status
 from plab.bench import accuracy, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
+from plab.command import answered
 from plab.demonstrations import __main__ as demonstrations
 from plab.render import __main__ as render
 from plab.report import __main__ as report
+from plab.results import ResultsError
 from plab.results import __main__ as results
 from plab.targets import __main__ as targets
 from refusals import refusal
@@ -155,6 +158,27 @@ def test_results_where_none_can_be_written(refused, tmp_path):
     assert "cannot write" in refused(["--output", "file/accuracy"], accuracy.main)
     assert "file is no folder" in refused(["task=Rope", "--output", "file/a.png"], render.main)
     assert "file is no folder" in refused(["--contact-sheet", "file/a.png"], render.main)
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError("no name"), "no name"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "a.csv"),
+            "cannot write a.csv: Permission denied",
+        ),
+        (ResultsError("cannot write a.h5: No space left"), "cannot write a.h5: No space left"),
+    ],
+    ids=str,
+)
+def test_what_goes_wrong_on_the_way_is_one_line(capsys, error, line):
+    def run():
+        raise error
+
+    assert answered(run) == 2
+    assert capsys.readouterr().err == f"plab: {line}\n"
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.table import report
+from plab.command import answered
 from plab.config import Config, PpoConfig, load_config
 from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch

@@ -21,11 +21,11 @@ from collections.abc import Iterator, Sequence
 
 from plab.arguments import positive, to_write
 from plab.bench import paper, scaling, skips
-from plab.bench.command import answered
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
 from plab.bench.table import progress, report
 from plab.bench.workload import KINDS, TENSORS, build, peak_rss_mb, restart_peak_rss, time_calls
+from plab.command import answered
 from plab.config import Config, load_config
 from plab.suite import suite_tasks, task_list
 

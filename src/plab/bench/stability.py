@@ -26,10 +26,10 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
+from plab.command import answered
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
 from plab.suite import suite_tasks

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 import plab
+from plab.arguments import told
 from plab.examples import resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
@@ -55,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"plab: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"plab: {told(error)}", file=sys.stderr)
         return 2
     _tell(runs, made, out)
     return 0
