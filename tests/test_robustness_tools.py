@@ -118,6 +118,7 @@ TOOLS = [
     (precision.main, ["--markdown", "."]),
     (release.main, ["--choice", "nothing"]),
     (release.main, ["--particles", "-1"]),
+    *((entry, ["--particles", "1"]) for entry in (precision.main, release.main, stability.main)),
     (bench_results.main, ["--runs", "0"]),
     (bench_results.main, ["--rows", "-1"]),
     (bench_results.main, ["--csv", "."]),
