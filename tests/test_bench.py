@@ -76,7 +76,8 @@ def test_mistakes_are_answered_in_one_line(capsys: pytest.CaptureFixture) -> Non
         (["--skips", "everything"], "there is no 'everything'; choose from: empty_blocks"),
     ):
         assert speed.main(command) == 2
-        message = capsys.readouterr().err
+        printed, message = capsys.readouterr()
+        assert printed == ""
         assert message.startswith("plab: ") and message.count("\n") == 1 and words in message
 
 
