@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import gc
 import math
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from plab.bench import everyday, opcount, paper, skips, speed
+from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
@@ -47,6 +49,26 @@ def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.Ca
     assert float(rows[1]["memory_mb"]) > float(rows[0]["memory_mb"])
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].split() == list(speed.COLUMNS) and len(printed) == 1 + len(rows)
+
+
+def test_on_the_cpu_the_benchmark_of_speed_does_without_torch() -> None:
+    """Its memory would be part of the column peak_rss_mb."""
+    code = "import sys, plab.bench.speed; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+def test_actions_are_taken_to_the_device_once_and_before_they_are_timed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = []
+    monkeypatch.setattr("torch.as_tensor", lambda actions, device: taken.append(actions) or device)
+    load = workload.Workload(load_config(), None, np.zeros((1, 2, 3)), 0.0)
+    load.call(workload.FORWARD)
+    assert taken == []
+    load.call(workload.TENSORS)
+    load.call(workload.TENSORS)
+    assert load.tensor == "cuda" and len(taken) == 1
 
 
 def test_a_skip_has_a_row_and_a_changed_result_is_told(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from plab.bench.table import markdown, progress
-from plab.bench.workload import build, time_calls
+from plab.bench.workload import GRADIENT, REWARD, build, time_calls
 from plab.config import load_config
 
 __all__ = ["COLUMNS", "paper_table", "rows", "write_markdown"]
@@ -64,7 +64,7 @@ def rows(
             "precision": cfg.sim.precision,
             "batch": batch,
         }
-        kinds = (("forward", "forward + reward"), ("gradient", "forward + backward"))
+        kinds = (("forward", REWARD), ("gradient", GRADIENT))
         for name, kind in kinds:
             timing = time_calls(load.call(kind), repeats)
             ms = float(timing.ms(steps)[0]) / batch
