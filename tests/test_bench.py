@@ -217,9 +217,8 @@ def test_everyday_things_are_timed_in_turns_with_another_source_tree(
     monkeypatch.setattr(everyday, "SETTLE", 0.0)
     other, path = Path(everyday.plab.__file__).parents[1], tmp_path / "everyday.csv"
     things = ["import plab", "load, first time"]
-    everyday.main(
-        ["--runs", "2", "--repeats", "2", "--against", str(other), "--only", *things, "--csv", str(path)]
-    )
+    command = ["--runs", "2", "--repeats", "2", "--against", str(other), "--only", *things]
+    assert everyday.main([*command, "--csv", str(path)]) == 0
     rows = read(path)
     assert [row["what"] for row in rows] == [things[0], things[0], things[1], things[1]]
     assert all(0 < float(row["cpu_s"]) <= float(row["cpu_max_s"]) for row in rows)
@@ -228,6 +227,24 @@ def test_everyday_things_are_timed_in_turns_with_another_source_tree(
 
 
 def test_an_everyday_thing_that_fails_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "results").mkdir()
     monkeypatch.setattr(everyday, "THINGS", {"fails": ("-c", "raise SystemExit('broken')")})
     with pytest.raises(RuntimeError, match="broken"):
         list(everyday.measure(tmp_path, [tmp_path], 1, ["fails"]))
+
+
+def test_what_needs_an_index_finds_one_in_the_first_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def timed(arguments, folder, source, cache):
+        calls.append((cache.name, cache.exists(), arguments))
+        cache.mkdir(exist_ok=True)
+        return 0.1, 0.1
+
+    monkeypatch.setattr(everyday, "_timed", timed)
+    rows = list(everyday.measure(tmp_path, [tmp_path / "a", tmp_path / "b"], 1, ["load, again"]))
+    assert len(rows) == 2 and all(tuple(row) == everyday.COLUMNS for row in rows)
+    loads = everyday.THINGS["load, first time"]
+    assert calls == [(f"cache{n}", there, loads) for there in (False, True) for n in (0, 1)]

@@ -16,7 +16,7 @@ import pytest
 
 import synthetic
 from plab import run, status
-from plab.bench import accuracy, precision, release, rl, speed, stability
+from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
 from plab.command import answered
 from plab.demonstrations import __main__ as demonstrations
@@ -122,6 +122,10 @@ TOOLS = [
     (bench_results.main, ["--runs", "0"]),
     (bench_results.main, ["--rows", "-1"]),
     (bench_results.main, ["--csv", "."]),
+    *((everyday.main, [flag, "0"]) for flag in ("--runs", "--rows", "--repeats")),
+    (everyday.main, ["--only", "nothing"]),
+    (everyday.main, ["--against", "nowhere"]),
+    (everyday.main, ["--csv", "."]),
     (rl.main, ["--methods", "adam"]),
     (rl.main, ["--envs", "0"]),
     (rl.main, ["--batches", "0"]),
@@ -236,6 +240,7 @@ UNWRITABLE = [
     (precision.main, ["--markdown", "closed/a.md"]),
     (release.main, ["--csv", "closed/a.csv"]),
     (bench_results.main, ["--csv", "closed/a.csv"]),
+    (everyday.main, ["--csv", "closed/a.csv"]),
     (rl.main, ["--csv", "closed/a.csv"]),
     (stability.main, ["--gradients", "closed/a.csv"]),
     (accuracy.main, ["--output", "closed/new"]),
