@@ -29,6 +29,7 @@ from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import write_overview, write_page
+from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
@@ -194,7 +195,6 @@ def write_curves(
     from plab.report.costs import work_precision
     from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
     from plab.report.figures import save, style
-    from plab.report.series import load_rows, load_series
 
     drawings: list[Drawing] = []
     with style():
