@@ -51,6 +51,20 @@ def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.Ca
     assert printed[0].split() == list(speed.COLUMNS) and len(printed) == 1 + len(rows)
 
 
+def test_a_skip_has_a_row_and_a_changed_result_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "skips.csv"
+    command = [*TINY, "--skips", "waiting", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
+    assert speed.main(command) == 0
+    (row,) = read(path)
+    assert tuple(row) == skips.COLUMNS
+    assert row["equal"] == "True" and float(row["loss_difference"]) == 0.0
+    monkeypatch.setattr(skips, "_differences", lambda *_: (0.1, 0.0))
+    assert speed.main(command) == 1
+    assert "results differ by more than rounding: waiting" in capsys.readouterr().err
+
+
 def test_on_the_cpu_the_benchmark_of_speed_does_without_torch() -> None:
     """Its memory would be part of the column peak_rss_mb."""
     code = "import sys, plab.bench.speed; print('torch' in sys.modules)"
@@ -69,20 +83,6 @@ def test_actions_are_taken_to_the_device_once_and_before_they_are_timed(
     load.call(workload.TENSORS)
     load.call(workload.TENSORS)
     assert load.tensor == "cuda" and len(taken) == 1
-
-
-def test_a_skip_has_a_row_and_a_changed_result_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "skips.csv"
-    command = [*TINY, "--skips", "waiting", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
-    assert speed.main(command) == 0
-    (row,) = read(path)
-    assert tuple(row) == skips.COLUMNS
-    assert row["equal"] == "True" and float(row["loss_difference"]) == 0.0
-    monkeypatch.setattr(skips, "_differences", lambda *_: (0.1, 0.0))
-    assert speed.main(command) == 1
-    assert "results differ by more than rounding: waiting" in capsys.readouterr().err
 
 
 def test_every_skip_is_measured_on_some_device() -> None:
