@@ -21,7 +21,7 @@
 # make system-packages    on Debian or Ubuntu, as root: OpenGL without a screen, for pictures
 # make browser-packages   the same: Chromium, with which the page is tested
 # make tex-packages       the same: a small LaTeX, to typeset the tables
-# make clean    remove everything that can be made again, except results
+# make clean    remove everything that can be made again, except results and the measurements of make benchmark
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -102,8 +102,8 @@ html: $(VENV)/.report.stamp
 
 clean:
 	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov
-	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks .import_linter_cache
-	find src tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .import_linter_cache
+	find src benchmarks tests tools -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Installed again only when what is to be installed has changed. The dev set-up includes that of runs.
 $(VENV)/.run.stamp: pyproject.toml constraints.txt | $(BIN)/python

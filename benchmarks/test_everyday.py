@@ -7,20 +7,27 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from plab.bench.results import synthetic_run, template
-from plab.config import build_scene, load_config
+from plab.bench.results import SETTLE, write_runs
+from plab.config import Config, build_scene, load_config
 from plab.objective import target_sdf
 from plab.problem import Problem
-from plab.results import load, result_path, write
+from plab.results import load
 
-SMALL = ["task=Rope", "sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4"]
-SMALL += ["sim.particles_scale=0.03"]
+SMALL = (
+    "task=Rope",
+    "sim.grid_size=16",
+    "sim.horizon=3",
+    "sim.substeps=5",
+    "sim.dt=4e-4",
+    "sim.particles_scale=0.03",
+)
 """A scene of which a step takes a millisecond."""
 
 RUNS = 200
@@ -46,14 +53,10 @@ def test_compose(benchmark: BenchmarkFixture) -> None:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of result files."""
+    """A folder of result files, old enough for the index."""
     folder = tmp_path_factory.mktemp("results")
-    made = template("adam", ["method.iterations=5"])
-    for seed in range(RUNS):
-        config = made | {"seed": seed, "results_dir": str(folder)}
-        path = result_path(config)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(synthetic_run(config), path, compress=True)
+    write_runs(RUNS, 5, folder)
+    time.sleep(SETTLE)
     return folder
 
 
@@ -67,32 +70,41 @@ def test_load_results(
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
-    """A small scene, compiled."""
-    problem = Problem([load_config(SMALL)])
-    problem.rollout(np.zeros((1, 3, problem.simulator.action_dim)), gradient=True)
+def cfg() -> Config:
+    return load_config(SMALL)
+
+
+@pytest.fixture(scope="module")
+def still(cfg: Config) -> np.ndarray:
+    """Actions of an episode without motion, shape [1, T, A]."""
+    return np.zeros((1, cfg.sim.horizon, build_scene(cfg).action_dim))
+
+
+@pytest.fixture(scope="module")
+def problem(cfg: Config, still: np.ndarray) -> Problem:
+    """The small scene, compiled."""
+    problem = Problem([cfg])
+    problem.rollout(still, gradient=True)
     return problem
 
 
-def test_step(benchmark: BenchmarkFixture, problem: Problem) -> None:
-    simulator = problem.simulator
-    simulator.reset()
-    benchmark(simulator.step, np.zeros((1, simulator.action_dim)))
+def test_step(benchmark: BenchmarkFixture, problem: Problem, still: np.ndarray) -> None:
+    problem.simulator.reset()
+    benchmark(problem.simulator.step, still[:, 0])
 
 
-def test_gradient_of_a_rollout(benchmark: BenchmarkFixture, problem: Problem) -> None:
-    actions = np.zeros((1, 3, problem.simulator.action_dim))
-    rollout = benchmark(problem.rollout, actions, gradient=True)
+def test_gradient_of_a_rollout(benchmark: BenchmarkFixture, problem: Problem, still: np.ndarray) -> None:
+    rollout = benchmark(problem.rollout, still, gradient=True)
     assert np.isfinite(rollout.gradient).all()
 
 
 def test_build_a_scene(benchmark: BenchmarkFixture) -> None:
     cfg = load_config(["task=Move"])
     scene = benchmark(build_scene, cfg)
-    assert scene.grid_size == 64
+    assert scene.grid_size == cfg.sim.grid_size
 
 
 def test_distance_to_a_target(benchmark: BenchmarkFixture) -> None:
-    mass = np.zeros((64, 64, 64))
+    mass = np.zeros((load_config().sim.grid_size,) * 3)
     mass[20:40, 5:15, 20:40] = 1.0
     assert benchmark(target_sdf, mass).shape == mass.shape

@@ -5,13 +5,15 @@ from __future__ import annotations
 import csv
 import gc
 import math
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from plab.bench import everyday, opcount, paper, skips, speed
+from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
 from plab.bench.workload import TENSORS
 from plab.config import build_scene, load_config
@@ -72,6 +74,26 @@ def test_a_skip_has_a_row_and_a_changed_result_is_told(
     assert "results differ by more than rounding: waiting" in capsys.readouterr().err
 
 
+def test_on_the_cpu_the_benchmark_of_speed_does_without_torch() -> None:
+    """Its memory would be part of the column peak_rss_mb."""
+    code = "import sys, plab.bench.speed; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+def test_actions_are_taken_to_the_device_once_and_before_they_are_timed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = []
+    monkeypatch.setattr("torch.as_tensor", lambda actions, device: taken.append(actions) or device)
+    load = workload.Workload(load_config(), None, np.zeros((1, 2, 3)), 0.0)
+    load.call(workload.FORWARD)
+    assert taken == []
+    load.call(workload.TENSORS)
+    load.call(workload.TENSORS)
+    assert load.tensor == "cuda" and len(taken) == 1
+
+
 def test_every_skip_is_measured_on_some_device() -> None:
     assert {case.skip for case in skips.CASES} == {field.name for field in fields(Skips)}
     for case in skips.CASES:
@@ -85,7 +107,8 @@ def test_mistakes_are_answered_in_one_line(capsys: pytest.CaptureFixture) -> Non
         (["--skips", "everything"], "there is no 'everything'; choose from: empty_blocks"),
     ):
         assert speed.main(command) == 2
-        message = capsys.readouterr().err
+        printed, message = capsys.readouterr()
+        assert printed == ""
         assert message.startswith("plab: ") and message.count("\n") == 1 and words in message
 
 
@@ -103,6 +126,12 @@ def test_paper_table_is_whole() -> None:
     table = paper.paper_table()
     assert sorted(table.index) == suite_tasks()
     assert (table["forward_backward_ms"] > table["forward_ms"]).all() and (table["forward_ms"] > 10.0).all()
+
+
+def test_the_paper_table_is_written_to_a_new_folder(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "table.md"
+    paper.write_markdown(path, [dict.fromkeys(paper.COLUMNS, 1.0)])
+    assert path.read_text(encoding="utf-8").endswith("| 1.0 |\n")
 
 
 def test_operations_are_counted() -> None:
@@ -212,6 +241,24 @@ def test_everyday_things_are_timed_in_turns_with_another_source_tree(
 
 
 def test_an_everyday_thing_that_fails_is_no_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "results").mkdir()
     monkeypatch.setattr(everyday, "THINGS", {"fails": ("-c", "raise SystemExit('broken')")})
     with pytest.raises(RuntimeError, match="broken"):
         list(everyday.measure(tmp_path, [tmp_path], 1, ["fails"]))
+
+
+def test_what_needs_an_index_finds_one_in_the_first_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def timed(arguments, folder, source, cache):
+        calls.append((cache.name, cache.exists(), arguments))
+        cache.mkdir(exist_ok=True)
+        return 0.1, 0.1
+
+    monkeypatch.setattr(everyday, "_timed", timed)
+    rows = list(everyday.measure(tmp_path, [tmp_path / "a", tmp_path / "b"], 1, ["load, again"]))
+    assert len(rows) == 2 and all(tuple(row) == everyday.COLUMNS for row in rows)
+    loads = everyday.THINGS["load, first time"]
+    assert calls == [(f"cache{n}", there, loads) for there in (False, True) for n in (0, 1)]

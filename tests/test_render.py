@@ -385,7 +385,7 @@ REFUSED = [
     (["task=Rope", "--output", "rope"], "its suffix must be one of .png, .gif, .mp4"),
     (["task=Rope", "--size", "480"], "'480' is not a size such as 480x360"),
     (["task=Rope", "--size", "481x360"], "of even numbers"),
-    (["task=Rope", "--every", "0"], "--every must be at least 1"),
+    (["task=Rope", "--every", "0"], "argument --every: '0' is not a whole number from 1 on"),
     (["task=Rope", "--otuput", "x.png"], "--otuput"),
     (["a.h5", "b.h5"], "give one result file or overrides"),
     (["a.h5", "task=Rope"], "give one result file or overrides"),

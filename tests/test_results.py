@@ -28,6 +28,7 @@ from plab.results import (
     result_path,
     write,
 )
+from plab.results.hdf5 import attributes, columns
 
 
 def make_config(folder: Path, **changes) -> dict:
@@ -129,6 +130,13 @@ def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, com
         if field == "resume":  # numbers come back as arrays
             expected["next_iteration"] = np.asarray(4)
         assert_same(expected, getattr(back, field), field)
+
+
+def test_a_group_that_is_not_there_is_a_key_error(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "empty.h5", "w") as file:
+        for read_group in (attributes, columns):
+            with pytest.raises(KeyError):
+                read_group(file, "nothing")
 
 
 def test_round_trip_of_a_run_without_iterations(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -151,3 +152,16 @@ def test_archives_are_checked_run_by_run(tmp_path: Path, capsys) -> None:
     archive.write_bytes(archive.read_bytes()[:100])
     assert main(["check", str(archive)]) == 1
     assert "get it again" in capsys.readouterr().out
+
+
+def test_a_damaged_stream_in_an_archive_is_told(tmp_path: Path, capsys) -> None:
+    archive = tmp_path / "a.plab.zip"
+    pack(synthetic.save(synthetic.run(tmp_path / "results")), archive)
+    with zipfile.ZipFile(archive) as members:
+        (member,) = members.namelist()
+    image = bytearray(archive.read_bytes())
+    # The member's data begin after 30 bytes and its name; no block of deflate begins like this.
+    image[30 + len(member)] = 0xFF
+    archive.write_bytes(image)
+    assert main(["check", str(archive)]) == 1
+    assert "truncated or damaged (Error -3 while decompressing" in capsys.readouterr().out

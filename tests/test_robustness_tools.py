@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import re
 import subprocess
@@ -15,12 +16,14 @@ import pytest
 
 import synthetic
 from plab import run, status
-from plab.bench import accuracy, precision, release, rl, speed, stability
+from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
+from plab.command import answered
 from plab.demonstrations import __main__ as demonstrations
 from plab.render import __main__ as render
 from plab.render import graphics
 from plab.report import __main__ as report
+from plab.results import ResultsError
 from plab.results import __main__ as results
 from plab.sim import Simulator
 from plab.targets import __main__ as targets
@@ -121,9 +124,14 @@ TOOLS = [
     (precision.main, ["--markdown", "."]),
     (release.main, ["--choice", "nothing"]),
     (release.main, ["--particles", "-1"]),
+    *((entry, ["--particles", "1"]) for entry in (precision.main, release.main, stability.main)),
     (bench_results.main, ["--runs", "0"]),
     (bench_results.main, ["--rows", "-1"]),
     (bench_results.main, ["--csv", "."]),
+    *((everyday.main, [flag, "0"]) for flag in ("--runs", "--rows", "--repeats")),
+    (everyday.main, ["--only", "nothing"]),
+    (everyday.main, ["--against", "nowhere"]),
+    (everyday.main, ["--csv", "."]),
     (rl.main, ["--methods", "adam"]),
     (rl.main, ["--envs", "0"]),
     (rl.main, ["--batches", "0"]),
@@ -188,6 +196,27 @@ def test_results_where_none_can_be_written(refused, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (OSError("no name"), "no name"),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "a.csv"),
+            "cannot write a.csv: Permission denied",
+        ),
+        (ResultsError("cannot write a.h5: No space left"), "cannot write a.h5: No space left"),
+    ],
+    ids=str,
+)
+def test_what_goes_wrong_on_the_way_is_one_line(capsys, error, line):
+    def run():
+        raise error
+
+    assert answered(run) == 2
+    assert capsys.readouterr().err == f"plab: {line}\n"
+
+
+@pytest.mark.parametrize(
     ("module", "argv"),
     [
         ("plab.run", ["task=Ropee"]),
@@ -241,6 +270,7 @@ UNWRITABLE = [
     (precision.main, ["--markdown", "closed/a.md"]),
     (release.main, ["--csv", "closed/a.csv"]),
     (bench_results.main, ["--csv", "closed/a.csv"]),
+    (everyday.main, ["--csv", "closed/a.csv"]),
     (rl.main, ["--csv", "closed/a.csv"]),
     (stability.main, ["--gradients", "closed/a.csv"]),
     (accuracy.main, ["--output", "closed/new"]),
@@ -253,6 +283,20 @@ def test_folders_that_may_not_be_written_to(told, tmp_path, closed, entry, argv)
         ["pack", str(synthetic.save(synthetic.run(tmp_path / "results"))), "--output", "example.plab.zip"]
     )
     assert re.search(r"cannot write .*closed", told(argv, entry, ordinary_rights(tmp_path)))
+
+
+@pytest.mark.parametrize("mode", [0o000, 0o600])
+@pytest.mark.parametrize(
+    ("entry", "argv"),
+    [
+        (speed.main, ["--csv", "locked/a.csv"]),
+        (render.main, ["task=Rope", "--output", "locked/new/a.png"]),
+    ],
+    ids=name_of,
+)
+def test_folders_that_may_not_be_searched(told, tmp_path, entry, argv, mode):
+    (tmp_path / "locked").mkdir(mode=mode)
+    assert re.search(r"cannot write .*locked", told(argv, entry, ordinary_rights(tmp_path)))
 
 
 UNREADABLE = [

@@ -1,12 +1,13 @@
-"""Arguments of command lines: numbers and files that are checked before anything is computed."""
+"""Arguments of command lines: numbers, words and files that are checked before anything is computed."""
 
 from __future__ import annotations
 
 import os
-from argparse import ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError
+from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["positive", "rates", "seed", "to_write"]
+__all__ = ["positive", "rates", "refuse_task", "seed", "to_write", "told"]
 
 
 def positive(text: str) -> int:
@@ -40,9 +41,24 @@ def to_write(text: str) -> Path:
     Folders above it that are not there yet are for whoever writes it to make.
     """
     path = Path(text)
-    there = next(place for place in (path, *path.absolute().parents) if place.exists())
-    if (there == path) == there.is_dir():
-        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if there.is_dir() else 'no'} folder")
-    if not os.access(there, os.W_OK, effective_ids=os.access in os.supports_effective_ids):
+    # Of pathlib's `exists` some versions raise where a folder may not be searched.
+    there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
+    folder = there.is_dir()
+    if (there == path) == folder:
+        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if folder else 'no'} folder")
+    needed = os.W_OK | os.X_OK if folder else os.W_OK
+    if not os.access(there, needed, effective_ids=os.access in os.supports_effective_ids):
         raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
     return path
+
+
+def refuse_task(parser: ArgumentParser, overrides: Sequence[str]) -> None:
+    """Refuse overrides of task and variant, where all variants of the tasks of ``--task`` are taken."""
+    if taken := [word for word in overrides if word.partition("=")[0] in ("task", "variant")]:
+        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+
+
+def told(error: OSError) -> str:
+    """Return one line about a file that could not be written after all; not every error names it."""
+    reason = error.strerror or str(error)
+    return reason if error.filename is None else f"cannot write {error.filename}: {reason}"

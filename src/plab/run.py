@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
+from plab.arguments import told
 from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
@@ -70,10 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # be made.
         if tally.started:
             raise
-        reason = str(error)
-        if isinstance(error, OSError) and error.filename is not None:
-            reason = f"cannot write {error.filename}: {error.strerror}"
-        return _complain(reason, EXIT_USER_ERROR)
+        return _complain(told(error) if isinstance(error, OSError) else str(error), EXIT_USER_ERROR)
     except KeyboardInterrupt:
         tally.report()
         return _complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)

@@ -148,7 +148,7 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
             the results, or the paper's if there are none.
 
     Raises:
-        ResultsError: If there is nothing at ``source``.
+        ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
     """
     found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]

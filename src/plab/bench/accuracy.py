@@ -31,10 +31,10 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive
-from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_places, common_scene, own_components
 from plab.bench.precision import angle
 from plab.bench.table import report
+from plab.command import answered
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf

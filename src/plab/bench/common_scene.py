@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 from plab.sim.skips import Skips
 
 __all__ = ["ANY_SCENE", "PLACES", "common_actions", "common_places", "common_scene", "own_components"]
@@ -51,7 +51,7 @@ def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -
         places: Shapes of the manipulators of the common kind.
 
     Raises:
-        ValueError: If there are too many manipulators or too few particles.
+        plab.scene.SceneError: If there are too many manipulators or too few particles.
     """
     tools = [_parked(shape) for shape in places]
     for number, place in enumerate(_places(scene, places)):
@@ -89,7 +89,7 @@ def _places(scene: Scene, places: Sequence[str]) -> list[int]:
     for manipulator in scene.manipulators:
         place = next((p for p in free if places[p] == manipulator.shape), None)
         if place is None:
-            raise ValueError(f"{scene.name} has more manipulators of shape {manipulator.shape} than places")
+            raise SceneError(f"{scene.name} has more manipulators of shape {manipulator.shape} than places")
         free.remove(place)
         taken.append(place)
     return taken
@@ -111,7 +111,7 @@ def _parked(shape: str) -> Manipulator:
 def _shared(bodies: tuple[Body, ...], particles: int) -> tuple[Body, ...]:
     """Return the bodies with a number of particles shared out in proportion to what they had."""
     if particles < len(bodies):
-        raise ValueError(f"{particles} particles are too few for {len(bodies)} bodies")
+        raise SceneError(f"{particles} particles are too few for {len(bodies)} bodies")
     had = np.array([body.particles for body in bodies], dtype=float)
     shares = 1 + np.floor((particles - len(bodies)) * had / had.sum()).astype(int)
     shares[0] += particles - shares.sum()

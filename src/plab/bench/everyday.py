@@ -22,10 +22,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import plab
+from plab.arguments import positive, to_write
 from plab.bench.results import SETTLE, write_runs
 from plab.bench.table import progress, report
+from plab.command import answered
 
-__all__ = ["THINGS", "main", "measure"]
+__all__ = ["COLUMNS", "THINGS", "main", "measure"]
 
 _LOAD = "from plab.results import load; load('results')"
 _COMPOSE = "from plab.config import load_config; load_config(['task=Move'])"
@@ -44,6 +46,8 @@ THINGS: Mapping[str, Sequence[str]] = {
 }
 """Arguments of Python by what they do, in a folder with ``results``."""
 
+COLUMNS = ("what", "source", "cpu_s", "cpu_max_s", "wall_s")
+
 _FRESH = "load, first time"
 """What is measured without an index."""
 
@@ -51,7 +55,7 @@ _FRESH = "load, first time"
 def measure(
     folder: Path, sources: Sequence[Path], repeats: int, things: Sequence[str]
 ) -> Iterator[dict[str, object]]:
-    """Time things; yield a row for each of them and each source tree.
+    """Time things.
 
     Args:
         folder: Folder that holds ``results``; everything is written below it.
@@ -59,15 +63,22 @@ def measure(
         repeats: Times that each is done.
         things: Keys of :data:`THINGS`.
 
+    Yields:
+        A row of :data:`COLUMNS` per thing and source tree: the least and the largest processor's time, of
+        user and system, and the clock's time of the process with the least [s].
+
     Raises:
         RuntimeError: If one of them ends with another exit code than 0.
     """
+    caches = [folder / f"cache{number}" for number in range(len(sources))]
+    for source, cache in zip(sources, caches, strict=True):
+        # Whichever thing is the first finds an index.
+        _timed(("-c", _LOAD), folder, source, cache)
     for what in things:
         taken: dict[Path, list[tuple[float, float]]] = {source: [] for source in sources}
         for turn in range(repeats):
-            for number, source in enumerate(sources):
+            for source, cache in zip(sources, caches, strict=True):
                 progress(f"{what}, {turn + 1}/{repeats}")
-                cache = folder / f"cache{number}"
                 if what == _FRESH:
                     shutil.rmtree(cache, ignore_errors=True)
                 taken[source].append(_timed(THINGS[what], folder, source, cache))
@@ -107,28 +118,33 @@ def _children() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, measure, print, and write a CSV file if asked to."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.everyday", description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=1000, help="number of result files")
-    parser.add_argument("--rows", type=int, default=5, help="iterations of each")
-    parser.add_argument("--repeats", type=int, default=3, help="times that each thing is done")
+    parser.add_argument("--runs", type=positive, default=1000, help="number of result files")
+    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
+    parser.add_argument("--repeats", type=positive, default=3, help="times that each thing is done")
     parser.add_argument("--only", nargs="+", choices=list(THINGS), default=list(THINGS), help="what to time")
     parser.add_argument(
         "--against", type=Path, help="folder of another source tree's packages, to take turns with"
     )
-    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
+    if options.against is not None and not (options.against / "plab" / "__init__.py").is_file():
+        parser.error(f"--against: {options.against} holds no package plab; name a source tree's src")
+    return answered(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
     own = Path(plab.__file__).parents[1]
     sources = [own] if options.against is None else [options.against.resolve(), own]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_runs(options.runs, options.rows, folder / "results")
         time.sleep(SETTLE)
-        table = measure(folder, sources, options.repeats, options.only)
-        columns = ("what", "source", "cpu_s", "cpu_max_s", "wall_s")
-        report(columns, table, options.csv, {"what": 18})
+        report(COLUMNS, measure(folder, sources, options.repeats, options.only), options.csv, {"what": 18})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

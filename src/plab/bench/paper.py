@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from plab.bench.table import markdown, progress
-from plab.bench.workload import build, time_calls
+from plab.bench.workload import GRADIENT, REWARD, build, time_calls
 from plab.config import load_config
 
 __all__ = ["COLUMNS", "paper_table", "rows", "write_markdown"]
@@ -64,7 +64,7 @@ def rows(
             "precision": cfg.sim.precision,
             "batch": batch,
         }
-        kinds = (("forward", "forward + reward"), ("gradient", "forward + backward"))
+        kinds = (("forward", REWARD), ("gradient", GRADIENT))
         for name, kind in kinds:
             timing = time_calls(load.call(kind), repeats)
             ms = float(timing.ms(steps)[0]) / batch
@@ -86,4 +86,5 @@ def write_markdown(path: Path, table: Sequence[Mapping[str, object]]) -> None:
         path: File to write.
         table: Rows.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(HEADING + markdown(COLUMNS, table), encoding="utf-8")

@@ -20,9 +20,9 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
 from plab.bench.table import report
+from plab.command import answered
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
@@ -190,7 +190,7 @@ def _run(options: argparse.Namespace) -> int:
     rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
     if options.markdown is not None:
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
-        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles))
+        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles), encoding="utf-8")
     return 0
 
 

@@ -27,10 +27,10 @@ import numpy as np
 import taichi as ti
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
+from plab.command import answered
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
 from plab.sim import Simulator, particle_phases

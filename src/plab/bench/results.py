@@ -24,8 +24,8 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.table import report
+from plab.command import answered
 from plab.config import load_config
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance

@@ -4,8 +4,8 @@
     python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256
 
 prints a row per method and number of environments: transitions per second, and the milliseconds that each
-part takes per step of all environments. What runs is the training of plab.run, an update after every batch of
-episodes for ppo, in minibatches of the profile's size.
+part takes per step of all environments; each is waited for before the next one begins. What runs is the
+training of plab.run, an update after every batch of episodes for ppo, in minibatches of the profile's size.
 """
 
 from __future__ import annotations
@@ -21,21 +21,20 @@ from pathlib import Path
 from typing import Any
 
 import taichi as ti
+import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.table import report
+from plab.command import answered
 from plab.config import Config, PpoConfig, load_config
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.config_types import ALGORITHMS, OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.runners.common import torch_settings
 from plab.runners.rl_trainer import Trainer
 
 __all__ = ["main", "measure"]
-
-METHODS = ("sac", "td3", "ppo")
 
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
 """Simulator's step; loss and IoU; observations and their copy from the device; actions; learning."""
@@ -103,9 +102,10 @@ def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Ca
     def timed(*args: Any, **kwargs: Any) -> Any:
         start = time.perf_counter()
         result = call(*args, **kwargs)
-        if part == "simulate":
-            # A step on CUDA is only queued.
-            ti.sync()
+        # Work on CUDA is only queued: the next part that waits would be charged with it.
+        ti.sync()
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
         seconds[part] += time.perf_counter() - start
         return result
 
@@ -133,7 +133,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
     )
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["ppo", "sac"], help="methods")
+    parser.add_argument("--methods", nargs="+", choices=ALGORITHMS, default=["ppo", "sac"], help="methods")
     parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")

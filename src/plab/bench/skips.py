@@ -13,14 +13,12 @@ from typing import cast
 import numpy as np
 
 from plab.bench.table import progress
-from plab.bench.workload import WARM_UP, Workload, build
+from plab.bench.workload import FORWARD, GRADIENT, REWARD, WARM_UP, Workload, build
 from plab.config import ConfigError, load_config
 from plab.config_errors import pick
 from plab.sim import Skips
 
 __all__ = ["CASES", "COLUMNS", "Case", "cases_for", "rows"]
-
-FORWARD, REWARD, GRADIENT = "forward", "forward + reward", "forward + backward"
 
 COLUMNS = (
     "skip", "task", "device", "precision", "batch", "what", "ms", "ms_without", "ratio", "ratio_min",

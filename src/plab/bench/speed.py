@@ -21,11 +21,22 @@ from collections.abc import Iterator, Sequence
 
 from plab.arguments import positive, to_write
 from plab.bench import paper, scaling, skips
-from plab.bench.command import answered
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
 from plab.bench.table import progress, report
-from plab.bench.workload import KINDS, TENSORS, build, peak_rss_mb, restart_peak_rss, time_calls
+from plab.bench.workload import (
+    FORWARD,
+    GRADIENT,
+    KINDS,
+    OBSERVATION,
+    REWARD,
+    TENSORS,
+    build,
+    peak_rss_mb,
+    restart_peak_rss,
+    time_calls,
+)
+from plab.command import answered
 from plab.config import Config, load_config
 from plab.suite import suite_tasks, task_list
 
@@ -39,11 +50,11 @@ COLUMNS = (
 LIMIT_COLUMNS = ("device", "precision", "limit", "value", "unit")
 
 LAUNCHES = {
-    "forward": 1,
-    "forward + reward": 2,
-    "forward + reward + observation": 3,
+    FORWARD: 1,
+    REWARD: 2,
+    OBSERVATION: 3,
     TENSORS: 3,
-    "forward + backward": 3,
+    GRADIENT: 3,
 }
 """Launches per environment step that cannot be fewer: one for a step, for its loss, for its observation, and
 for its adjoint."""
@@ -51,7 +62,7 @@ for its adjoint."""
 WIDE = {"what": max(map(len, KINDS)), "skip": 18, "device": 6, "batch": 5}
 """Widths of columns whose entries are not as long as most."""
 
-QUICK_KINDS = ("forward", "forward + backward")
+QUICK_KINDS = (FORWARD, GRADIENT)
 
 
 def rows(
@@ -79,7 +90,7 @@ def rows(
         progress(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
         timing = time_calls(load.call(kind), repeats)
         median, least, most = timing.ms(steps)
-        best = bound(load, phases(load, kind == "forward + backward"), limits, LAUNCHES[kind])
+        best = bound(load, phases(load, kind == GRADIENT), limits, LAUNCHES[kind])
         work = batch * simulator.particle_count * simulator.substeps
         yield {
             "task": cfg.task.name,
@@ -87,7 +98,7 @@ def rows(
             "precision": simulator.precision,
             "batch": batch,
             "what": kind,
-            "first_s": round(load.first_step_s if kind == "forward" else timing.first_s, 2),
+            "first_s": round(load.first_step_s if kind == FORWARD else timing.first_s, 2),
             "median_ms": round(median, 3),
             "min_ms": round(least, 3),
             "max_ms": round(most, 3),

@@ -26,10 +26,11 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.command import answered
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
+from plab.command import answered
+from plab.config import ConfigError
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
 from plab.suite import suite_tasks
@@ -205,23 +206,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "file for the gradient's norm per step back in time"
     parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
+    return answered(lambda: _run(options))
+
+
+def _run(options: argparse.Namespace) -> int:
+    cases = _cases(options)
+    rows = (row for precision in options.precision for row in run_cases(cases, precision))
+    table = list(report(COLUMNS, _chain(rows, options), options.csv))
+    if options.gradients is not None:
+        write_norms(table, options.gradients)
+    return _summarise(pd.DataFrame(table))
+
+
+def _cases(options: argparse.Namespace) -> list[Case]:
+    """Return the cases that are asked for."""
     plan = QUICK if options.quick else FULL
     plan = replace(plan, particles=options.particles or plan.particles)
     plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
     cases = stress_cases(plan)
     families = list(dict.fromkeys([case.family for case in cases] + [REFUSAL]))
     if unknown := set(options.family or ()) - set(families):
-        parser.error(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
-    return answered(lambda: _run(cases, options))
-
-
-def _run(cases: Sequence[Case], options: argparse.Namespace) -> int:
-    cases = [case for case in cases if not options.family or case.family in options.family]
-    rows = (row for precision in options.precision for row in run_cases(cases, precision))
-    table = list(report(COLUMNS, _chain(rows, options), options.csv))
-    if options.gradients is not None:
-        write_norms(table, options.gradients)
-    return _summarise(pd.DataFrame(table))
+        raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
+    return [case for case in cases if not options.family or case.family in options.family]
 
 
 def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:

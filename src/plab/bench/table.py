@@ -30,12 +30,14 @@ def report(
     """
     wide = widths or {}
     least = [max(len(name), wide.get(name, 8)) for name in columns]
-    _print(columns, least)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         _append(path, columns, "w")
-    table = []
+    table: list[Mapping[str, object]] = []
     for row in rows:
+        if not table:
+            # Not before, so that a mistake is answered by one line alone.
+            _print(columns, least)
         values = [row[name] for name in columns]
         _print(values, least)
         if path is not None:

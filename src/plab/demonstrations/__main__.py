@@ -21,16 +21,15 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from plab.arguments import positive, rates, seed, to_write
+from plab.arguments import positive, rates, refuse_task, seed, to_write
+from plab.command import answered
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, recorded_scores, save_actions
 from plab.demonstrations.search import search
 from plab.objective import Scores
 from plab.problem import Problem
-from plab.scene import SceneError
-from plab.sim import DeviceError, SimulationError
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
-from plab.targets import EPISODE_STEPS, TargetError
+from plab.targets import EPISODE_STEPS
 
 HEADING = """\
 # Demonstrations
@@ -63,28 +62,24 @@ class Replay:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     args = _parse(argv)
-    try:
-        rows = []
-        for task in args.task:
-            cfgs = [
-                load_config([f"task={task}", f"variant={variant}", *args.overrides])
-                for variant in SUITE_VARIANTS
-            ]
-            if args.search or args.record:
-                _require_own_resolution(cfgs[0])
-            if args.search and "seed" not in cfgs[0].task.target:
-                _search(cfgs, args)
-            replays = replay(cfgs)
-            if args.record:
-                _record(replays)
-            rows += [_row(item) for item in replays]
-        _show(pd.DataFrame(rows), args.markdown)
-    except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
-        print(f"plab: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
+    return answered(lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> int:
+    rows = []
+    for task in args.task:
+        cfgs = [
+            load_config([f"task={task}", f"variant={variant}", *args.overrides]) for variant in SUITE_VARIANTS
+        ]
+        if args.search or args.record:
+            _require_own_resolution(cfgs[0])
+        if args.search and "seed" not in cfgs[0].task.target:
+            _search(cfgs, args)
+        replays = replay(cfgs)
+        if args.record:
+            _record(replays)
+        rows += [_row(item) for item in replays]
+    _show(pd.DataFrame(rows), args.markdown)
     return 0
 
 
@@ -176,8 +171,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--every", type=positive, default=10, help="updates between evaluations")
     parser.add_argument("--seed", type=seed, default=0, help="seed of the first actions")
     options = parser.parse_intermixed_args(argv)
-    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    refuse_task(parser, options.overrides)
     return options
 
 

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from omegaconf import OmegaConf
 
-from plab.arguments import to_write
+from plab.arguments import positive, to_write
 from plab.config import ConfigError, choices, load_config
 from plab.render.graphics import RenderError, require_graphics
 from plab.scene import SceneError
@@ -121,8 +121,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     arguments.overrides = [word for word in arguments.what if "=" in word]
     files = [word for word in arguments.what if "=" not in word]
     arguments.result = Path(files[0]) if files else None
-    if arguments.every < 1:
-        raise RenderError(f"--every must be at least 1, not {arguments.every}")
     if arguments.contact_sheet:
         given = [word for word in arguments.overrides if word.startswith(("task=", "variant="))]
         if files or given or arguments.output:
@@ -154,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--output", type=Path, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=Path, metavar="FILE", help="a .png")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
-    add("--every", type=int, default=1, metavar="K", help="a film has a frame every K environment steps")
+    add("--every", type=positive, default=1, metavar="K", help="a film has a frame every K environment steps")
     add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for python -m plab.run")
 
     def refuse(message: str) -> NoReturn:

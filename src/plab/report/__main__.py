@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 import plab
+from plab.arguments import told
 from plab.examples import resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
@@ -28,6 +29,7 @@ from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import write_overview, write_page
+from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
@@ -55,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"plab: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        print(f"plab: {told(error)}", file=sys.stderr)
         return 2
     _tell(runs, made, out)
     return 0
@@ -193,7 +195,6 @@ def write_curves(
     from plab.report.costs import work_precision
     from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
     from plab.report.figures import save, style
-    from plab.report.series import load_rows, load_series
 
     drawings: list[Drawing] = []
     with style():

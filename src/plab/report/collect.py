@@ -129,7 +129,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
 
     Raises:
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
-        plab.results.ResultsError: If there is nothing at ``source``.
+        plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
+            can be read.
     """
     found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]

@@ -7,9 +7,11 @@ from importlib.resources import files
 
 import pandas as pd
 
+from plab.suite import PAPER_SEEDS
+
 __all__ = ["PAPER_SEED_COUNT", "paper_table"]
 
-PAPER_SEED_COUNT = 3
+PAPER_SEED_COUNT = len(PAPER_SEEDS)
 """Runs of each configuration in the paper."""
 
 

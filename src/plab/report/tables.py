@@ -17,6 +17,7 @@ from plab.report.methods import GRADIENT, RL, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
 from plab.report.table import NOTHING, Table, number, spread
+from plab.suite import SUITE_VARIANTS
 
 __all__ = [
     "INTERVAL",
@@ -98,7 +99,7 @@ class Cells:
                 self._scores.get((task, variant, name), []) for variant in self._runs.variants
             ]
             return Cell(summarise(np.concatenate(scores)), len(self._runs.variants) * len(self._runs.seeds))
-        return Cell(_printed("iou_per_task", (task, name), 5 * PAPER_SEED_COUNT), 0)
+        return Cell(_printed("iou_per_task", (task, name), len(SUITE_VARIANTS) * PAPER_SEED_COUNT), 0)
 
 
 def _printed(name: str, key: tuple[str, ...], count: int) -> Summary:
@@ -109,9 +110,8 @@ def _printed(name: str, key: tuple[str, ...], count: int) -> Summary:
 @functools.cache
 def _numbers_of_paper(name: str) -> Mapping[tuple[str, ...], tuple[float, float]]:
     """Return mean and standard deviation by task, variant (if the table has variants) and method."""
-    rows = paper_table(name).drop(columns=["iou_mean", "iou_std"]).itertuples(index=False, name=None)
-    means = paper_table(name)[["iou_mean", "iou_std"]].to_numpy(float).tolist()
-    return {key: (mean, std) for key, (mean, std) in zip(rows, means, strict=True)}
+    rows = paper_table(name).itertuples(index=False, name=None)
+    return {tuple(key): (mean, std) for *key, mean, std in rows}
 
 
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:

@@ -62,8 +62,8 @@ def pack(
         keep_resume: Keep the state from which unfinished runs go on.
 
     Raises:
-        ResultsError: If there is nothing to pack, two runs claim the same place, or the archive cannot be
-            written.
+        ResultsError: If there is nothing to pack, ``source`` is files or archives, none of which can be read,
+            two runs claim the same place, or the archive cannot be written.
     """
     archive = Path(archive)
     if not archive.name.endswith(ARCHIVE_SUFFIX):

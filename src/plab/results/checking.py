@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from plab.objective import scores_from_iou
-from plab.results.files import read
+from plab.results.files import explained, read
 from plab.results.loading import run_files
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
@@ -83,13 +83,12 @@ _GET_RIGHTS = "ask whom it belongs to for the right to read it"
 
 def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with explained(path), zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-    except PermissionError as error:
-        yield path, Problem(path, f"may not be read ({error.strerror})", _GET_RIGHTS)
-        return
-    except (OSError, zipfile.BadZipFile) as error:
-        yield path, Problem(path, f"truncated or damaged ({error})", "get it again, or pack it again")
+    except ResultsError as error:
+        reason = _reason(error, path)
+        hidden = reason.startswith("may not be read")
+        yield path, Problem(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
         return
     for name in names:
         yield path / name, _check_file(path / name)
@@ -100,13 +99,18 @@ def _check_file(path: Path) -> Problem | None:
         run = read(path)
         found = problems(run)
     except ResultsError as error:
-        reason = str(error).removeprefix(str(path)).strip()
+        reason = _reason(error, path)
         return Problem(path, reason, _advice_unreadable(path, reason))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
     if found:
         return Problem(path, "; ".join(found), "run it again with force=true, or delete it")
     return None
+
+
+def _reason(error: ResultsError, path: Path) -> str:
+    """Return what is wrong with a file, without its name."""
+    return str(error).removeprefix(str(path)).strip()
 
 
 def _advice_unreadable(path: Path, reason: str) -> str:

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,7 @@ from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, NewerSchemaError
 
 __all__ = [
     "encode",
+    "explained",
     "opened",
     "opened_image",
     "read",
@@ -34,7 +36,7 @@ _images = itertools.count()
 _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
 
-_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile)
+_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
 """What h5py, zlib and zipfile raise on files that are cut short, damaged or something else."""
 
 
@@ -109,7 +111,17 @@ def read(path: str | Path) -> RunResult:
 
 
 def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Read a run's configuration and iterations alone, as :func:`read` does, in less time."""
+    """Read a run's configuration and iterations alone, in less time than :func:`read` takes for all of it.
+
+    Args:
+        path: The file, or the place in an archive, as for :func:`read`.
+
+    Returns:
+        The configuration, and the iterations, a row each.
+
+    Raises:
+        ResultsError: As for :func:`read`.
+    """
     path = Path(path)
     with opened(path) as file:
         config = attributes(file, names=("config",))["config"]
@@ -160,7 +172,7 @@ def split_archive(path: Path) -> tuple[Path, str] | None:
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open a run of this schema version, turning whatever is wrong with it into a ResultsError."""
     inside = split_archive(path)
-    with _explained(path):
+    with explained(path):
         if inside is None:
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
@@ -178,12 +190,13 @@ def opened(path: Path) -> Iterator[h5py.File]:
 @contextmanager
 def opened_image(image: bytes, path: Path) -> Iterator[h5py.File]:
     """Open the bytes of a run, as :func:`opened` does a file; ``path`` is for messages."""
-    with _explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
+    with explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
         yield _of_this_version(file, path)
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def explained(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with reading inside the ``with`` block into a ResultsError; ``path`` is named."""
     try:
         yield
     except FileNotFoundError as error:

@@ -6,7 +6,6 @@ import json
 import os
 import warnings
 import zipfile
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.results.files import opened, opened_image, split_archive
+from plab.results.files import explained, opened, opened_image, split_archive
 from plab.results.hdf5 import attributes
 from plab.results.index import Index
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
@@ -132,10 +131,10 @@ def rows(
 
 
 def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
-    """Return the same as :func:`rows`, but do not go on with unreadable files alone.
+    """Return the same as :func:`rows`, but raise where files are asked for and none can be read.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or only files that cannot be read.
+        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = rows(source)
     sources = [source] if isinstance(source, str | Path) else source
@@ -169,21 +168,16 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
     """Yield the rows of a result file or an archive, and what is wrong where there is none."""
-    if not path.name.endswith(ARCHIVE_SUFFIX):
-        try:
+    try:
+        if path.name.endswith(ARCHIVE_SUFFIX):
+            with explained(path), zipfile.ZipFile(path) as archive:
+                for name in archive.namelist():
+                    yield _member_row(archive, path, name)
+        else:
             with opened(path) as file:
                 yield _row(file, path)
-        except ResultsError as error:
-            yield error
-        return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                yield _member_row(archive, path, name)
-    except PermissionError as error:
-        yield ResultsError(f"{path} may not be read ({error.strerror})")
-    except (OSError, zipfile.BadZipFile) as error:
-        yield ResultsError(f"{path} is truncated or damaged ({error})")
+    except ResultsError as error:
+        yield error
 
 
 # ---------------------------------------------------------------------------------------------------- details
@@ -234,12 +228,12 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | ResultsError:
     try:
-        with opened_image(archive.read(name), path / name) as file:
+        with explained(path / name):
+            image = archive.read(name)
+        with opened_image(image, path / name) as file:
             return _row(file, path / name)
     except ResultsError as error:
         return error
-    except (zipfile.BadZipFile, zlib.error) as error:
-        return ResultsError(f"{path / name} is truncated or damaged ({error})")
 
 
 def _row(file: h5py.File, path: Path) -> Row:

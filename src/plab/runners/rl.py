@@ -8,7 +8,6 @@ a row of the results and comes with a checkpoint. To reproduce a result:
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 
+from plab.checks import check_packages
 from plab.config import ConfigError, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.progress import Report, show_progress
@@ -57,7 +57,8 @@ def run_rl(jobs: Sequence[Job], note: str = "") -> None:
     """
     (job,) = jobs
     cfg, run, method = job.cfg, job.run, job.cfg.method_as(RlConfig)
-    _check_installed(method)
+    check_packages(cfg)
+    _check_torch_device(method)
     replay_path, total = run.path.with_suffix(".replay"), total_steps(method, cfg.sim.horizon)
     with torch_settings(method.torch_threads), simulation_errors():
         with run.phase("build"):
@@ -177,10 +178,8 @@ def _logger(method: RlConfig, run: RunFile) -> Logger:
     return configure(str(run.path.with_suffix(".tensorboard")), ["tensorboard"])
 
 
-def _check_installed(method: RlConfig) -> None:
-    """Find out before anything is built whether what is asked for can be had."""
-    if method.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise ConfigError("method.tensorboard=true needs TensorBoard: pip install 'plab[tensorboard]'")
+def _check_torch_device(method: RlConfig) -> None:
+    """Find out before anything is built whether torch has the device."""
     if method.torch_device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"

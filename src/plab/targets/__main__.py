@@ -21,30 +21,27 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from plab.arguments import to_write
+from plab.arguments import refuse_task, to_write
 from plab.cache import cache_dir
-from plab.config import ConfigError, build_scene, load_config, variant_task
-from plab.scene import SceneError
-from plab.sim import DeviceError, SimulationError, Simulator
+from plab.command import answered
+from plab.config import build_scene, load_config, variant_task
+from plab.sim import Simulator
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
-from plab.targets import TargetError, build_targets
+from plab.targets import build_targets
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     args = _parse(argv)
-    try:
-        table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
-        _show(table)
-        print(f"simulated targets are kept in {cache_dir() / 'targets'}")
-        if args.csv is not None:
-            _write(table, args.csv)
-    except (ConfigError, SceneError, TargetError, DeviceError, SimulationError) as error:
-        print(f"plab: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"plab: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
-        return 2
+    return answered(lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> int:
+    table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
+    _show(table)
+    print(f"simulated targets are kept in {cache_dir() / 'targets'}")
+    if args.csv is not None:
+        _write(table, args.csv)
     return 0
 
 
@@ -105,8 +102,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
     parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
     options = parser.parse_intermixed_args(argv)
-    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    refuse_task(parser, options.overrides)
     return options
 
 
