@@ -240,23 +240,21 @@ def test_memory_budget_is_named(sim: Simulator) -> None:
 
 
 def test_states_in_several_arrays_give_the_same_gradient(
-    device: str, monkeypatch: pytest.MonkeyPatch
+    sim: Simulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     u = actions()
-    base = simulator(SCENES, device)
-    want, final = base.rollout(u), base.state()
-    slots = base._tape._slots_per_step + 1
-    monkeypatch.setitem(ENTRIES_MAX, device, slots * base._particles.slot_entries)
-    sim = simulator(SCENES, device)
-    for arrays in (STEPS, STEPS // 2):
+    want, final = sim.rollout(u), sim.state()
+    tape, slot_bytes = sim._tape, sim._particles.slot_bytes
+    slots = tape._slots_per_step + 1
+    monkeypatch.setitem(ENTRIES_MAX, sim.device, slots * sim._particles.slot_entries)
+    # One segment, and two where there is no room for all states.
+    for length in (STEPS, STEPS // 2):
         got = sim.rollout(u)
-        assert len(sim._tape._history) == arrays
-        assert_same(got.step_terms, want.step_terms, device)
-        assert_same(got.gradient, want.gradient, device)
-        assert_same(sim.state().x, final.x, device)
-        # Not for all steps: two segments.
-        memory_mb = (sim.memory_bytes() - 2 * sim._particles.slot_bytes) / 1e6
-        sim = simulator(SCENES, device, memory_mb=memory_mb)
+        assert (len(tape._history), tape._length) == (STEPS, length)
+        assert_same(got.step_terms, want.step_terms, sim.device)
+        assert_same(got.gradient, want.gradient, sim.device)
+        assert_same(sim.state().x, final.x, sim.device)
+        monkeypatch.setattr(sim, "memory_mb", (sim.memory_bytes() - 2 * slot_bytes) / 1e6)
 
 
 def test_too_many_environments_for_an_array_are_named(
