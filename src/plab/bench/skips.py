@@ -66,7 +66,7 @@ CASES = (
     ),
     Case("still_manipulators", ("task=Rope",), (GRADIENT, REWARD)),
     Case("adjoints", ("task=Torus",), (GRADIENT,), from_start=True),
-    Case("launches", ("task=Move",), (FORWARD,), devices=("cuda",)),
+    Case("launches", ("task=Move",), (FORWARD, GRADIENT), devices=("cuda",)),
     Case("waiting", ("task=Move",), devices=("cpu",)),
 )
 """A row of the table each, for every kind."""
