@@ -423,24 +423,23 @@ def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ppo_learns_to_flatten_dough(tmp_path: Path) -> None:
-    """On RollingPin, coarse: within 300 episodes better than any of 32 random ones."""
+def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
+    """On Torus, coarse: after 200 episodes better than any of 32 random ones, with noise and without."""
     fast = ("sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10", "sim.particles_scale=0.2")
-    training = ("method.num_envs=10", "method.episodes=300", "method.steps_per_update=500")
-    updates = ("method.minibatches=8", "method.lr=1e-3", "method.lr_decay=false", "method.evaluate_every=20")
+    training = ("method.num_envs=10", "method.episodes=200", "method.steps_per_update=500")
+    updates = ("method.minibatches=8", "method.lr_decay=false", "method.evaluate_every=20")
     folder = f"results_dir={tmp_path}"
-    cfg = load_config(["task=RollingPin", "method=ppo", "progress=false", *fast, *training, *updates, folder])
+    cfg = load_config(["task=Torus", "method=ppo", "progress=false", *fast, *training, *updates, folder])
     result = run(cfg)
     episodes = EpisodeBatch([cfg] * 32)
     episodes.reset()
     rng, reward = np.random.default_rng(0), np.zeros(32)
     for _ in range(cfg.sim.horizon):
-        step = episodes.step(rng.uniform(-1, 1, (32, 3)))
-        reward += step.reward
-    print(reward.mean(), reward.max(), step.info["score"].mean(), step.info["score"].max())
+        reward += episodes.step(rng.uniform(-1, 1, (32, 3))).reward
+    print(f"random episodes: {reward.mean():.3f}, best {reward.max():.3f}")
     print(result.iterations[["episodes", "reward", "score", "train_reward", "train_score"]].to_string())
-    assert result.iterations["reward"].max() > reward.max()
-    assert result.iterations["train_reward"].iloc[-1] > reward.mean()
+    # 0.12; after training 0.6 to 0.8 with three seeds.
+    assert result.iterations[["reward", "train_reward"]].iloc[-1].min() > 2 * reward.max() > 0
 
 
 def test_benchmark_measures_every_part(tmp_path: Path, capsys) -> None:
