@@ -4,7 +4,7 @@
 #
 # With the development tools; CONTRIBUTING.md has more about them:
 # make test-unit   only the tests that simulate nothing
-# make test-slow   the slow ones: all fifty configurations at full size, about half an hour on two cores
+# make test-slow   the slow ones: all fifty configurations at full size, half an hour on two cores at least
 # make lint        style, spelling, imports, unused code and dependencies
 # make typecheck   types of src/
 # make coverage    which lines of src/ the tests run, kernels left out
