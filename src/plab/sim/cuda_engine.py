@@ -16,7 +16,7 @@ import taichi as ti
 
 from plab.sim.cuda_phases import NEAREST_GROUPS
 from plab.sim.cuda_threads import RESIDENT_BLOCK, ThreadPhases
-from plab.sim.cuda_warp import NODE_BITS, WARP_BLOCK
+from plab.sim.cuda_warp import NODE_BITS, WARP, WARP_BLOCK
 from plab.sim.storage import MEASURES, STATE
 
 __all__ = ["CudaEngine"]
@@ -231,14 +231,8 @@ class CudaEngine(ThreadPhases):
         for e in range(self.batch):
             self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 4)
         for q in range(self.particle_threads):
-            e, particle = self.particle_of(q)
-            tile = particle // self.lanes
-            source = self.tile_entry(slot, e, tile)
-            lane = self.sorted_lane(state, source, tile, particle % self.lanes)
-            x = self.vector(state, source, lane)
-            base, fx = self.stencil(x)
-            node = self.scatter_node(e, tile * self.lanes + lane, base)
-            run, first, _rank, _total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+            e, tile, _entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
+            run, first, _rank, _total, doublings = self.run_of(node, node >= 0, q % WARP)
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)

@@ -24,12 +24,25 @@ class ThreadPhases(CudaPhases):
     resident_threads: int
 
     @ti.func
-    def scatter_node(self, e, particle, base):
-        """Grid index of a particle's base node; negative, and another for each, where it is padding."""
+    def sorted_particle(self, state: ti.template(), slot, q):
+        """The particle that thread q takes of its warp's tile, in the order of their base nodes; all lanes of
+        a warp take part.
+
+        Returns:
+            Environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and the
+            base node's grid index, which is negative, and another for each, where the particle is padding.
+        """
+        e, place = self.particle_of(q)
+        tile = place // self.lanes
+        entry = self.tile_entry(slot, e, tile)
+        lane = self.sorted_lane(state, entry, tile, place % self.lanes)
+        x = self.vector(state, entry, lane)
+        base, fx = self.stencil(x)
+        particle = tile * self.lanes + lane
         node = e * self.nodes + self.node_index(base)
         if particle >= self.particles:
             node = -1 - particle
-        return node
+        return e, tile, entry, lane, x, base, fx, node
 
     @ti.func
     def resident_turns(self, w, total):
@@ -55,18 +68,13 @@ class ThreadPhases(CudaPhases):
     @ti.func
     def scatter_thread(self, state: ti.template(), before, after, q, stamp):
         """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part."""
-        e, particle = self.particle_of(q)
-        tile = particle // self.lanes
-        source = self.tile_entry(before, e, tile)
-        lane = self.sorted_lane(state, source, tile, particle % self.lanes)
-        base, fx = self.stencil(self.vector(state, source, lane))
-        node = self.scatter_node(e, tile * self.lanes + lane, base)
-        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+        e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, q % WARP)
+        if first:
+            self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
         if node >= 0:
             a = self.material_particle(state, source, self.tile_entry(after, e, tile), lane, e, True)
-        if first:
-            self.mark_shared(e, base, stamp)
         sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
         heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
         self.share_heads(heads, q, node, first, rank)
@@ -90,23 +98,17 @@ class ThreadPhases(CudaPhases):
     def scatter_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q, stamp):
         """Scatter of a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes
         of a warp take part."""
-        e, particle = self.particle_of(q)
-        tile = particle // self.lanes
-        source = self.tile_entry(before, e, tile)
+        e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
-        lane = self.sorted_lane(state, source, tile, particle % self.lanes)
-        x = self.vector(state, source, lane)
-        base, fx = self.stencil(x)
-        node = self.scatter_node(e, tile * self.lanes + lane, base)
-        run, first, rank, total, doublings = self.run_of(node, node >= 0, particle % self.lanes)
+        run, first, rank, total, doublings = self.run_of(node, node >= 0, q % WARP)
+        if first:
+            self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
         if node >= 0:
             a = self.material_particle(state, source, target, lane, e, False)
             for i in ti.static(range(9)):
                 self.affine[entry9 + i][lane] = a[i]
-        if first:
-            self.mark_shared(e, base, stamp)
         sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
         heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
         self.share_heads(heads, q, node, first, rank)
