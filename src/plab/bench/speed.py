@@ -30,6 +30,7 @@ from plab.bench.workload import (
     KINDS,
     OBSERVATION,
     REWARD,
+    ROLLOUT,
     TENSORS,
     build,
     peak_rss_mb,
@@ -54,6 +55,7 @@ LAUNCHES = {
     REWARD: 2,
     OBSERVATION: 3,
     TENSORS: 3,
+    ROLLOUT: 2,
     GRADIENT: 3,
 }
 """Launches per environment step that cannot be fewer: one for a step, for its loss, for its observation, and

@@ -27,6 +27,7 @@ __all__ = [
     "KINDS",
     "OBSERVATION",
     "REWARD",
+    "ROLLOUT",
     "TENSORS",
     "Timing",
     "Workload",
@@ -40,6 +41,7 @@ FORWARD = "forward"
 REWARD = "forward + reward"
 OBSERVATION = "forward + reward + observation"
 TENSORS = "forward + reward + observation, tensors"
+ROLLOUT = "rollout + losses"
 GRADIENT = "forward + backward"
 
 NOISE = 0.02
@@ -175,8 +177,8 @@ def _forward(
     ti.sync()
 
 
-def _forward_backward(load: Workload) -> None:
-    load.simulator.rollout(load.actions)
+def _rollout(load: Workload, gradient: bool) -> None:
+    load.simulator.rollout(load.actions, gradient)
     ti.sync()
 
 
@@ -185,11 +187,13 @@ KINDS: dict[str, Callable[[Workload], None]] = {
     REWARD: lambda load: _forward(load, reward=True),
     OBSERVATION: lambda load: _forward(load, reward=True, observation=True),
     TENSORS: lambda load: _forward(load, reward=True, observation=True, tensors=True),
-    GRADIENT: _forward_backward,
+    ROLLOUT: lambda load: _rollout(load, gradient=False),
+    GRADIENT: lambda load: _rollout(load, gradient=True),
 }
 """What can be timed. The reward is what every step's is made of, loss terms and IoU, on the host; the
-observation is what the environments return; the backward pass includes the losses. With tensors, actions,
-rewards and observations are on the device, as in training there; on the CPU there is no such row."""
+observation is what the environments return. With tensors, actions, rewards and observations are on the
+device, as in training there; on the CPU there is no such row. A rollout is one call for all steps and their
+loss terms, as for the optimisers; the backward pass includes it."""
 
 
 @dataclass(frozen=True)
