@@ -179,9 +179,9 @@ class TransferTiles(ParticlePhases):
             at: First entry of the thread's share of ``spread``.
             work_at: First entry of the thread's share of ``work``.
         """
-        gather(
-            self.velocity, node, self.axis * self.axis, self.axis, self.weights(at, lane), self.work, work_at
-        )
+        # A variable: what is passed on as an expression is compiled again wherever it is used.
+        w = self.weights(at + WEIGHTS, lane)
+        gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.work, work_at)
         scale = 4.0 * self.inv_dx
         f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
         x = self.vector(state, source, lane)

@@ -162,7 +162,8 @@ class CudaPhases(OrderPhases, PosePhases):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.node_index(base), spline(fx))
+        w = spline(fx)
+        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.node_index(base), w)
         scale = 4.0 * self.inv_dx
         speed = 0.0 * fx[0]
         for i in ti.static(range(3)):
@@ -192,15 +193,10 @@ class CudaPhases(OrderPhases, PosePhases):
         v_after = self.vector(state, after + 3, lane)
         q = self.affine_field(self.mass * self.vector(state, source + 3, lane), self.mass, a, fx, 1.0)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
-        m0, mx, my, mz, slope = self.moments_adjoint(
-            self.velocity,
-            self.momentum_bar,
-            e * self.nodes + self.node_index(base),
-            spline(fx),
-            spline_slope(fx),
-            q,
-            h,
-        )
+        w = spline(fx)
+        dw = spline_slope(fx)
+        node = e * self.nodes + self.node_index(base)
+        m0, mx, my, mz, slope = self.moments_adjoint(self.velocity, self.momentum_bar, node, w, dw, q, h)
         c_bar = self.load(bar, target + 6, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
@@ -232,12 +228,14 @@ class CudaPhases(OrderPhases, PosePhases):
         out = ti.Vector.zero(self.real, 9)
         p = self.material[e]
         c = self.load(state, source + 6, lane, 9)
-        g = trial_gradient(c, self.load(state, source + 15, lane, 9), self.dt)
+        f = self.load(state, source + 15, lane, 9)
+        g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
         _q, _det, _norm, k = yield_factor(d, p[2], self.series)
         if self.served(z2, j):
-            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
+            tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
+            a = self.stress_and_momentum(tau, c)
             for i in ti.static(range(9)):
                 out[i] = a[i]
             if ti.static(update):

@@ -79,9 +79,8 @@ class ThreadPhases(CudaPhases):
         heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
         self.share_heads(heads, q, node, first, rank)
         field = self.momentum_field(state, source, a, lane, fx)
-        self.scatter_runs(
-            self.momentum, 4, sums, heads, q, spline(fx), field, run, first, rank, total, doublings
-        )
+        w = spline(fx)
+        self.scatter_runs(self.momentum, 4, sums, heads, q, w, field, run, first, rank, total, doublings)
 
     @ti.func
     def grid_thread(self, w, q, s):

@@ -93,7 +93,8 @@ def hencky_strain(g: ti.template(), j, series: ti.template()):
     c = inverse_cbrt(j, series.cbrt_steps)
     c2 = c * c
     b = outer_sym(g)
-    w = inverse_sym((c2 * b[0] + 1.0, c2 * b[1] + 1.0, c2 * b[2] + 1.0, c2 * b[3], c2 * b[4], c2 * b[5]))
+    shifted = (c2 * b[0] + 1.0, c2 * b[1] + 1.0, c2 * b[2] + 1.0, c2 * b[3], c2 * b[4], c2 * b[5])
+    w = inverse_sym(shifted)
     z = (1.0 - 2.0 * w[0], 1.0 - 2.0 * w[1], 1.0 - 2.0 * w[2], -2.0 * w[3], -2.0 * w[4], -2.0 * w[5])
     y = square_sym(z)
     i1 = z[0] + z[1] + z[2]
@@ -146,7 +147,8 @@ def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()
     q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     s = k - 1.0
     m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
-    return mul_sym_mat(polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d)), g)
+    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d))
+    return mul_sym_mat(m, g)
 
 
 @ti.func
@@ -387,7 +389,8 @@ def strain_adjoint(
     """
     p = sandwich_sym(w, z_bar)
     scale = 4.0 * c2
-    g_b = mul_sym_mat((scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5]), g)
+    b_bar = (scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5])
+    g_b = mul_sym_mat(b_bar, g)
     j_all = j_bar - (2.0 / 3.0) * c2 / j * (c2_bar + 2.0 * dot_sym(p, outer_sym(g)))
     cof = cofactor(g)
     total = [g_b[i] + g_bar[i] + j_all * cof[i] for i in range(9)]

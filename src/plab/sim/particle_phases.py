@@ -180,7 +180,8 @@ class ParticlePhases(Storage):
         """
         p = self.material[e]
         c = [state[source + 6 + i] for i in range(9)]
-        g = trial_gradient(c, [state[source + 15 + i] for i in range(9)], self.dt)
+        f = [state[source + 15 + i] for i in range(9)]
+        g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
         for i in ti.static(range(9)):
@@ -189,17 +190,15 @@ class ParticlePhases(Storage):
             self.stage[at + 9 + i] = d[i]
         _q, _det, _norm, k = yield_factor(d, p[2], self.series)
         if self.all_served(z2, j):
-            a = self.stress_and_momentum(stress(d, j, c2, p[0], p[1], p[2], self.series), c)
+            tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
+            a = self.stress_and_momentum(tau, c)
             for i in ti.static(range(9)):
                 self.affine[entry9 + i] = a[i]
             if ti.static(update):
                 if self.flows(k.min()):
-                    f_new = flow(
-                        [self.stage[at + 9 + i] for i in range(6)],
-                        [self.stage[at + i] for i in range(9)],
-                        p[2],
-                        self.series,
-                    )
+                    strain = [self.stage[at + 9 + i] for i in range(6)]
+                    trial = [self.stage[at + i] for i in range(9)]
+                    f_new = flow(strain, trial, p[2], self.series)
                     for i in ti.static(range(9)):
                         state[target + 15 + i] = f_new[i]
                 else:
@@ -254,7 +253,8 @@ class ParticlePhases(Storage):
     def strain_tile(self, state: ti.template(), source, at):
         """Strain of a tile into ``stage``; whether the series served."""
         c = [state[source + 6 + i] for i in range(9)]
-        g = trial_gradient(c, [state[source + 15 + i] for i in range(9)], self.dt)
+        f = [state[source + 15 + i] for i in range(9)]
+        g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
         for i in ti.static(range(9)):
@@ -273,7 +273,8 @@ class ParticlePhases(Storage):
     def stress_tile_adjoint(self, entry9, mu, lam, yield_strain, at):
         """Adjoint of a tile's stress, from ``stage`` to ``stage``; whether any of its particles yields."""
         d = [self.stage[at + STAGE_D + i] for i in range(6)]
-        tau_bar = self.stress_symmetric([self.affine[entry9 + i] for i in range(9)])
+        a_bar = [self.affine[entry9 + i] for i in range(9)]
+        tau_bar = self.stress_symmetric(a_bar)
         d_bar, k_bar, c2_bar, j_bar = stress_adjoint(
             d,
             self.stage[at + STAGE_SCALARS],
@@ -295,13 +296,10 @@ class ParticlePhases(Storage):
     @ti.func
     def flow_tile_adjoint(self, bar: ti.template(), target, yield_strain, at):
         """Adjoint of a tile's plastic flow, from ``stage`` to ``stage``."""
-        d_bar, k_bar, g_bar = flow_adjoint(
-            [self.stage[at + STAGE_D + i] for i in range(6)],
-            [self.stage[at + i] for i in range(9)],
-            [bar[target + 15 + i] for i in range(9)],
-            yield_strain,
-            self.series,
-        )
+        d = [self.stage[at + STAGE_D + i] for i in range(6)]
+        g = [self.stage[at + i] for i in range(9)]
+        f_new_bar = [bar[target + 15 + i] for i in range(9)]
+        d_bar, k_bar, g_bar = flow_adjoint(d, g, f_new_bar, yield_strain, self.series)
         for i in ti.static(range(6)):
             self.stage[at + STAGE_D_BAR + i] = self.stage[at + STAGE_D_BAR + i] + d_bar[i]
         self.stage[at + STAGE_BARS] = self.stage[at + STAGE_BARS] + k_bar
@@ -311,11 +309,14 @@ class ParticlePhases(Storage):
     @ti.func
     def parameter_tile_adjoint(self, entry9, yield_strain, at):
         """Add a tile's adjoints of the material's parameters, from ``stage``."""
+        d = [self.stage[at + STAGE_D + i] for i in range(6)]
+        a_bar = [self.affine[entry9 + i] for i in range(9)]
+        tau_bar = self.stress_symmetric(a_bar)
         mu_bar, lam_bar, yield_bar = parameter_adjoint(
-            [self.stage[at + STAGE_D + i] for i in range(6)],
+            d,
             self.stage[at + STAGE_SCALARS],
             self.stage[at + STAGE_SCALARS + 1],
-            self.stress_symmetric([self.affine[entry9 + i] for i in range(9)]),
+            tau_bar,
             self.stage[at + STAGE_BARS],
             yield_strain,
             self.series,
@@ -340,12 +341,15 @@ class ParticlePhases(Storage):
         """Adjoint of a tile's strain, from ``stage`` to C and F in ``bar``."""
         # A loop of one round, which LLVM cannot know: it keeps the two parts in blocks of their own.
         for _ in range(self.once[None]):
+            z = [self.stage[at + STAGE_Z + i] for i in range(6)]
+            d = [self.stage[at + STAGE_D + i] for i in range(6)]
+            d_bar = [self.stage[at + STAGE_D_BAR + i] for i in range(6)]
             z_bar = log_adjoint(
-                [self.stage[at + STAGE_Z + i] for i in range(6)],
+                z,
                 self.stage[at + STAGE_SCALARS + 2],
                 self.stage[at + STAGE_SCALARS + 3],
-                [self.stage[at + STAGE_D + i] for i in range(6)],
-                [self.stage[at + STAGE_D_BAR + i] for i in range(6)],
+                d,
+                d_bar,
                 self.stage[at + STAGE_BARS],
                 yield_strain,
                 self.series,
