@@ -85,6 +85,36 @@ def test_functions_need_no_scrolling(path):
     assert [(name, length) for name, length in lengths if length > 60] == []
 
 
+def templates(function: ast.FunctionDef) -> list[bool]:
+    """Which parameters of a function of Taichi's, self apart, take what they are given as it stands."""
+    parameters = [one for one in function.args.args if one.arg != "self"]
+    return [
+        one.annotation is not None and ast.unparse(one.annotation) == "ti.template()" for one in parameters
+    ]
+
+
+def test_no_expression_is_compiled_again_wherever_it_is_used():
+    # What is passed for a template parameter stands wherever that is used: 36 times used, 36 times compiled.
+    trees = {path: ast.parse(path.read_text()) for path in MODULES if path.parent.name == "sim"}
+    nodes = [(path, node) for path, tree in trees.items() for node in ast.walk(tree)]
+    functions: dict[str, list[list[bool]]] = {}
+    for _path, node in nodes:
+        if isinstance(node, ast.FunctionDef) and "ti.func" in map(ast.unparse, node.decorator_list):
+            functions.setdefault(node.name, []).append(templates(node))
+    assert any(map(any, functions["gather"]))
+    found = []
+    for path, node in nodes:
+        if not isinstance(node, ast.Call):
+            continue
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)
+        for takes in functions.get(name, []):
+            for given, template in zip(node.args, takes, strict=False):
+                computed = isinstance(given, ast.Call | ast.ListComp | ast.List | ast.Tuple | ast.BinOp)
+                if template and computed and not ast.unparse(given).startswith("ti.static("):
+                    found.append(f"{path.name}:{node.lineno}: {ast.unparse(given)}")
+    assert not found
+
+
 def test_the_version_is_semantic_and_in_one_place():
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
     assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

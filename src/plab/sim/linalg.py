@@ -173,7 +173,8 @@ def mat_from_sym(s: ti.template()):
 @ti.func
 def mul_sym_mat(s: ti.template(), b: ti.template()):
     """S B with S symmetric, B full."""
-    return mul(mat_from_sym(s), b)
+    full = mat_from_sym(s)
+    return mul(full, b)
 
 
 @ti.func
@@ -192,7 +193,9 @@ def sym_product_twice(a: ti.template(), b: ti.template()):
 @ti.func
 def sandwich_sym(w: ti.template(), z: ti.template()):
     """W Z W of two symmetric matrices, symmetric."""
-    wz = mul(mat_from_sym(w), mat_from_sym(z))
+    full_w = mat_from_sym(w)
+    full_z = mat_from_sym(z)
+    wz = mul(full_w, full_z)
     return (
         wz[0] * w[0] + wz[1] * w[3] + wz[2] * w[4],
         wz[3] * w[3] + wz[4] * w[1] + wz[5] * w[5],
