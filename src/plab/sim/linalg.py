@@ -173,8 +173,7 @@ def mat_from_sym(s: ti.template()):
 @ti.func
 def mul_sym_mat(s: ti.template(), b: ti.template()):
     """S B with S symmetric, B full."""
-    full = mat_from_sym(s)
-    return mul(full, b)
+    return mul(mat_from_sym(s), b)
 
 
 @ti.func
@@ -193,9 +192,7 @@ def sym_product_twice(a: ti.template(), b: ti.template()):
 @ti.func
 def sandwich_sym(w: ti.template(), z: ti.template()):
     """W Z W of two symmetric matrices, symmetric."""
-    full_w = mat_from_sym(w)
-    full_z = mat_from_sym(z)
-    wz = mul(full_w, full_z)
+    wz = mul(mat_from_sym(w), mat_from_sym(z))
     return (
         wz[0] * w[0] + wz[1] * w[3] + wz[2] * w[4],
         wz[3] * w[3] + wz[4] * w[1] + wz[5] * w[5],

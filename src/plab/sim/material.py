@@ -138,8 +138,7 @@ def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()
     t0 = v2 * (e0 * e0 + 2.0 * e1 * e2 * dk) - v1 * e0 + lam * j * (j - 1.0)
     t1 = v2 * (2.0 * e0 * e1 + 2.0 * e1 * e2 * qk + e2 * e2 * dk) - v1 * e1
     t2 = v2 * (e1 * e1 + 2.0 * e0 * e2 + e2 * e2 * qk) - v1 * e2
-    d2 = square_sym(d)
-    return polynomial_sym(t0, t1 * k, t2 * k * k, d, d2)
+    return polynomial_sym(t0, t1 * k, t2 * k * k, d, square_sym(d))
 
 
 @ti.func
@@ -148,8 +147,7 @@ def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()
     q, det_d, _norm, k = yield_factor(d, yield_strain, series)
     s = k - 1.0
     m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
-    d2 = square_sym(d)
-    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, d2)
+    m = polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d))
     return mul_sym_mat(m, g)
 
 
@@ -262,8 +260,7 @@ def parameter_adjoint(
         Adjoints of mu, lambda and yield strain.
     """
     # The stress is linear in mu and lambda.
-    per_mu = stress(d, j, c2, 1.0, 0.0, yield_strain, series)
-    mu_bar = dot_sym(tau_bar, per_mu)
+    mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
     _q, _det, norm, k = yield_factor(d, yield_strain, series)
     yield_bar = ti.select(k < 1.0, k_bar / norm, 0.0 * k)
     return mu_bar, (tau_bar[0] + tau_bar[1] + tau_bar[2]) * j * (j - 1.0), yield_bar
@@ -394,8 +391,7 @@ def strain_adjoint(
     scale = 4.0 * c2
     b_bar = (scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5])
     g_b = mul_sym_mat(b_bar, g)
-    b = outer_sym(g)
-    j_all = j_bar - (2.0 / 3.0) * c2 / j * (c2_bar + 2.0 * dot_sym(p, b))
+    j_all = j_bar - (2.0 / 3.0) * c2 / j * (c2_bar + 2.0 * dot_sym(p, outer_sym(g)))
     cof = cofactor(g)
     total = [g_b[i] + g_bar[i] + j_all * cof[i] for i in range(9)]
     cg = mul_tn(c, total)

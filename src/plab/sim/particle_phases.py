@@ -80,12 +80,6 @@ class ParticlePhases(Storage):
         """Three scalars of one particle as a vector."""
         return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
 
-    @ti.func
-    def matrix(self, state: ti.template(), entry, lane):
-        """Nine scalars of one particle as a 3x3 matrix, row by row."""
-        a = self.load(state, entry, lane, 9)
-        return as_matrix(a)
-
     @ti.kernel
     def observe(
         self,
@@ -220,8 +214,8 @@ class ParticlePhases(Storage):
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.material[e]
-        c = self.matrix(state, source + 6, lane)
-        f = self.matrix(state, source + 15, lane)
+        c = as_matrix(self.load(state, source + 6, lane, 9))
+        f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
         out = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(9)):
@@ -396,9 +390,9 @@ class ParticlePhases(Storage):
     ):
         """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
         p = self.material[e]
-        c = self.matrix(state, source + 6, lane)
-        f = self.matrix(state, source + 15, lane)
-        f_new_bar = self.matrix(bar, target + 15, lane)
+        c = as_matrix(self.load(state, source + 6, lane, 9))
+        f = as_matrix(self.load(state, source + 15, lane, 9))
+        f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
         a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
