@@ -15,7 +15,7 @@ import pytest
 
 from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
-from plab.bench.workload import TENSORS
+from plab.bench.workload import FORWARD, ROLLOUT, TENSORS
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
@@ -55,9 +55,9 @@ def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.Ca
 def test_only_the_kinds_asked_for_are_timed(tmp_path: Path) -> None:
     """Tensors only on CUDA."""
     path = tmp_path / "speed.csv"
-    command = [*TINY, "--quick", "--steps", "2", "--repeats", "1", "--kinds", "forward", TENSORS]
+    command = [*TINY, "--quick", "--steps", "2", "--repeats", "1", "--kinds", FORWARD, ROLLOUT, TENSORS]
     assert speed.main([*command, "--csv", str(path)]) == 0
-    assert [row["what"] for row in read(path)] == ["forward"]
+    assert [row["what"] for row in read(path)] == [FORWARD, ROLLOUT]
 
 
 def test_a_skip_has_a_row_and_a_changed_result_is_told(
