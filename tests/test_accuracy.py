@@ -72,7 +72,7 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_finer_steps_come_closer_to_the_reference() -> None:
-    plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(16, 24), steps=6, particles=200)
+    plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(24, 32), steps=6, particles=200)
     table = pd.DataFrame(rows(["Move"], plan))
     hard = table[
         (table["contact"] == "hard") & (table["axis"] == "substeps") & (table["material"] == "series")
