@@ -12,7 +12,6 @@ from plab.scene import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator
 from plab.sim.memory import ENTRIES_MAX
 from plab.sim.order import curve_order, hilbert_index
-from plab.sim.runtime import available_threads
 
 pytestmark = pytest.mark.physics
 
@@ -185,14 +184,6 @@ def assert_same(got: np.ndarray, want: np.ndarray, device: str) -> None:
         np.testing.assert_array_equal(got, want)
     else:
         np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
-
-
-def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    cpus = available_threads()
-    for text, count in (("1", 1), (str(cpus + 1), cpus), ("0", cpus), ("many", cpus)):
-        monkeypatch.setenv("OMP_NUM_THREADS", text)
-        assert available_threads() == count
 
 
 def test_a_broken_environment_does_not_disturb_the_others(sim: Simulator) -> None:

@@ -1,0 +1,48 @@
+"""How plab starts Taichi, and what it changes in it."""
+
+import inspect
+
+import pytest
+import taichi as ti
+
+from plab.sim.runtime import available_threads, start_runtime
+
+
+def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    cpus = available_threads()
+    for text, count in (("1", 1), (str(cpus + 1), cpus), ("0", cpus), ("many", cpus)):
+        monkeypatch.setenv("OMP_NUM_THREADS", text)
+        assert available_threads() == count
+
+
+@pytest.mark.physics
+def test_a_function_is_read_once_and_errors_still_name_its_line(monkeypatch) -> None:
+    start_runtime("cpu", "float32")
+    read = []
+    findsource = inspect.findsource
+    monkeypatch.setattr(
+        "taichi.lang._wrap_inspect._builtin_findsource",
+        lambda thing: read.append(thing) or findsource(thing),
+    )
+
+    @ti.func
+    def half(x):
+        return 0.5 * x
+
+    @ti.func
+    def broken(x):
+        return half(x) + unknown  # noqa: F821
+
+    @ti.kernel
+    def quarter(x: ti.f32) -> ti.f32:
+        return half(half(x)) + 0.0 * half(x)
+
+    @ti.kernel
+    def fails(x: ti.f32) -> ti.f32:
+        return broken(x)
+
+    assert quarter(4.0) == 1.0
+    assert read.count(half.func.func) == 1
+    with pytest.raises(ti.TaichiNameError, match=r"in broken:\n *return half\(x\) \+ unknown"):
+        fails(1.0)
