@@ -74,6 +74,17 @@ def test_a_skip_has_a_row_and_a_changed_result_is_told(
     assert "results differ by more than rounding: waiting" in capsys.readouterr().err
 
 
+def test_a_skip_that_needs_more_memory_is_told_and_the_others_are_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    path = tmp_path / "skips.csv"
+    command = [*TINY, "sim.memory_mb=2", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
+    assert speed.main([*command, "--skips", "adjoints", "waiting"]) == 1
+    assert [row["skip"] for row in read(path)] == ["waiting"]
+    told = capsys.readouterr().err
+    assert "not measured: adjoints, 1 environment(s): the gradient of 50 steps needs at least" in told
+
+
 def test_on_the_cpu_the_benchmark_of_speed_does_without_torch() -> None:
     """Its memory would be part of the column peak_rss_mb."""
     code = "import sys, plab.bench.speed; print('torch' in sys.modules)"

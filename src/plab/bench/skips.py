@@ -87,7 +87,13 @@ def cases_for(device: str, names: Sequence[str] | None) -> list[Case]:
 
 
 def rows(
-    cases: Sequence[Case], overrides: Sequence[str], batch: int, steps: int, repeats: int, quick: bool
+    cases: Sequence[Case],
+    overrides: Sequence[str],
+    batch: int,
+    steps: int,
+    repeats: int,
+    quick: bool,
+    refused: list[str],
 ) -> Iterator[dict[str, object]]:
     """Measure skips.
 
@@ -98,6 +104,7 @@ def rows(
         steps: Environment steps per rollout; a whole episode where a case starts at the scene's start.
         repeats: Timed pairs of rollouts.
         quick: Only the first kind of each case.
+        refused: Where a case needs more memory than the budget, a line is added here; the others go on.
 
     Yields:
         A row per case and kind; ``ratio`` is the time without the skip over the time with it.
@@ -117,7 +124,10 @@ def rows(
         )
         for kind in case.kinds[: 1 if quick else None]:
             progress(f"{case.skip}: {kind}, {batch} environment(s) on {cfg.sim.device}")
-            yield _row(case, with_it, without, kind, repeats)
+            try:
+                yield _row(case, with_it, without, kind, repeats)
+            except MemoryError as error:
+                refused.append(f"{case.skip}, {batch} environment(s): {error}")
         del with_it, without
 
 

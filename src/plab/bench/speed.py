@@ -216,23 +216,23 @@ def _precision(options: argparse.Namespace) -> list[str]:
 def _run_skips(options: argparse.Namespace) -> int:
     overrides = _precision(options)
     cases = skips.cases_for(load_config(overrides).sim.device, options.skips)
+    how = (options.steps, options.repeats, options.quick)
+    refused: list[str] = []
     table = report(
         skips.COLUMNS,
-        (
-            row
-            for batch in options.batch
-            for row in skips.rows(cases, overrides, batch, options.steps, options.repeats, options.quick)
-        ),
+        (row for batch in options.batch for row in skips.rows(cases, overrides, batch, *how, refused)),
         options.csv,
         WIDE,
     )
+    for line in refused:
+        print(f"plab: not measured: {line}", file=sys.stderr)
     broken = [str(row["skip"]) for row in table if not row["equal"]]
     if broken:
         again = ""
         if table[0]["device"] == "cuda" and table[0]["precision"] == "float32":
             again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
         print(f"plab: results differ by more than rounding: {', '.join(broken)}{again}", file=sys.stderr)
-    return 1 if broken else 0
+    return 1 if broken or refused else 0
 
 
 def _run_scaling(options: argparse.Namespace) -> None:

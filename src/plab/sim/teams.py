@@ -6,8 +6,11 @@ from collections.abc import Callable, Sequence
 
 __all__ = ["TeamChoice"]
 
+PROBE_FIRST = 10
+"""So many launches after a choice the other team is tried again, then after twice as many."""
+
 PROBE = 100
-"""Every so many launches the team that is not the best so far is tried again."""
+"""In the end the other team is tried every so many launches."""
 
 RECENT = 3
 """A team is as fast as the fastest of so many of its launches: one that was interrupted says little."""
@@ -29,6 +32,8 @@ class TeamChoice:
         self._sizes = tuple(dict.fromkeys(sizes))
         self._seconds: dict[int, deque[float]] = {}
         self._launches = 0
+        self._best: int | None = None
+        self._interval = self._probe_at = 0
 
     def run(self, kernel: Callable, args: tuple) -> None:
         """Launch a kernel with a team's size before its other arguments."""
@@ -47,6 +52,12 @@ class TeamChoice:
         if min(tried.values()) < RECENT:
             return min(self._sizes, key=lambda size: tried[size])
         best = min(self._sizes, key=lambda size: min(self._seconds[size]))
-        if self._launches % PROBE == 0:
+        if best != self._best:
+            # What led to the choice may have been a moment's disturbance.
+            self._best, self._interval = best, PROBE_FIRST
+            self._probe_at = self._launches + PROBE_FIRST
+        elif self._launches >= self._probe_at:
+            self._interval = min(2 * self._interval, PROBE)
+            self._probe_at = self._launches + self._interval
             return next((size for size in self._sizes if size != best), best)
         return best
