@@ -15,7 +15,7 @@ import pytest
 
 from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
-from plab.bench.workload import FORWARD, ROLLOUT, TENSORS
+from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
@@ -74,15 +74,18 @@ def test_a_skip_has_a_row_and_a_changed_result_is_told(
     assert "results differ by more than rounding: waiting" in capsys.readouterr().err
 
 
-def test_a_skip_that_needs_more_memory_is_told_and_the_others_are_measured(
+def test_what_needs_more_memory_is_told_and_the_others_are_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    path = tmp_path / "skips.csv"
+    path = tmp_path / "some.csv"
     command = [*TINY, "sim.memory_mb=2", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
     assert speed.main([*command, "--skips", "adjoints", "waiting"]) == 1
     assert [row["skip"] for row in read(path)] == ["waiting"]
     told = capsys.readouterr().err
     assert "not measured: adjoints, 1 environment(s): the gradient of 50 steps needs at least" in told
+    assert speed.main([*command, "--batch", "1", "2", "--kinds", GRADIENT, FORWARD]) == 1
+    assert [(row["batch"], row["what"]) for row in read(path)] == [("1", FORWARD), ("2", FORWARD)]
+    assert "not measured: forward + backward, 2 environment(s): the gradient of 2" in capsys.readouterr().err
 
 
 def test_on_the_cpu_the_benchmark_of_speed_does_without_torch() -> None:

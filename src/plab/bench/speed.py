@@ -68,7 +68,13 @@ QUICK_KINDS = (FORWARD, GRADIENT)
 
 
 def rows(
-    cfg: Config, batch: int, steps: int, repeats: int, kinds: Sequence[str], limits: Limits
+    cfg: Config,
+    batch: int,
+    steps: int,
+    repeats: int,
+    kinds: Sequence[str],
+    limits: Limits,
+    refused: list[str],
 ) -> Iterator[dict[str, object]]:
     """Measure one configuration and batch size.
 
@@ -79,6 +85,7 @@ def rows(
         repeats: Timed rollouts.
         kinds: What is timed, keys of :data:`plab.bench.workload.KINDS`.
         limits: What the machine can do.
+        refused: Where a kind needs more memory than there may be, a line is added here; the others go on.
 
     Yields:
         A row per kind; times are per environment step of the whole batch.
@@ -90,7 +97,11 @@ def rows(
         if kind == TENSORS and simulator.device == "cpu":
             continue
         progress(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
-        timing = time_calls(load.call(kind), repeats)
+        try:
+            timing = time_calls(load.call(kind), repeats)
+        except MemoryError as error:
+            refused.append(f"{kind}, {batch} environment(s): {error}")
+            continue
         median, least, most = timing.ms(steps)
         best = bound(load, phases(load, kind == GRADIENT), limits, LAUNCHES[kind])
         work = batch * simulator.particle_count * simulator.substeps
@@ -114,7 +125,7 @@ def rows(
         }
 
 
-def _all_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
+def _all_rows(options: argparse.Namespace, refused: list[str]) -> Iterator[dict[str, object]]:
     """Rows of the plain benchmark, precision by precision: Taichi starts anew for each."""
     for precision in options.precision or [None]:
         chosen = [*options.overrides, *([f"sim.precision={precision}"] if precision else [])]
@@ -124,7 +135,8 @@ def _all_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
             for batch in options.batch:
                 gc.collect()
                 cfg = load_config([*chosen, *_task(task)])
-                yield from rows(cfg, batch, options.steps, options.repeats, options.kinds, limits)
+                how = (options.steps, options.repeats, options.kinds)
+                yield from rows(cfg, batch, *how, limits, refused)
 
 
 def _task(name: str | None) -> list[str]:
@@ -204,8 +216,17 @@ def _run(options: argparse.Namespace) -> int:
     elif options.paper:
         _run_paper(options)
     else:
-        report(COLUMNS, _all_rows(options), options.csv, WIDE)
+        refused: list[str] = []
+        report(COLUMNS, _all_rows(options, refused), options.csv, WIDE)
+        return _not_measured(refused)
     return 0
+
+
+def _not_measured(refused: Sequence[str]) -> int:
+    """Say what needs more memory than there may be; the exit code."""
+    for line in refused:
+        print(f"plab: not measured: {line}", file=sys.stderr)
+    return 1 if refused else 0
 
 
 def _precision(options: argparse.Namespace) -> list[str]:
@@ -224,15 +245,14 @@ def _run_skips(options: argparse.Namespace) -> int:
         options.csv,
         WIDE,
     )
-    for line in refused:
-        print(f"plab: not measured: {line}", file=sys.stderr)
+    code = _not_measured(refused)
     broken = [str(row["skip"]) for row in table if not row["equal"]]
     if broken:
         again = ""
         if table[0]["device"] == "cuda" and table[0]["precision"] == "float32":
             again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
         print(f"plab: results differ by more than rounding: {', '.join(broken)}{again}", file=sys.stderr)
-    return 1 if broken or refused else 0
+    return 1 if broken else code
 
 
 def _run_scaling(options: argparse.Namespace) -> None:
@@ -262,7 +282,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; those of the process by default.
 
     Returns:
-        Exit code: 0, 1 if a skip changes results, 2 for a mistake of the user's.
+        Exit code: 0, 1 if a skip changes results or a row needs too much memory, 2 for a mistake of the
+        user's.
     """
     options = _options(argv)
     return answered(lambda: _run(options))

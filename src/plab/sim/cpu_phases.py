@@ -70,8 +70,9 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
-                self.scatter_momentum(entry9, lane, node, at, self.bounded(grid_index * WORK))
+                place = self.places[places_at + NODE][lane]
+                node = self.bounded(grid_index * self.nodes + place)
+                self.scatter_momentum(entry9, lane, place, node, at, self.bounded(grid_index * WORK))
 
     @ti.func
     def grid_chunk(self, e, c, s):
@@ -140,9 +141,10 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                node = self.bounded(grid_index * self.nodes + self.places[places_at + NODE][lane])
-                self.scatter_momentum(entry9, lane, node, at, work_at)
-                self.scatter_adjoint(bar, entry, lane, node, at, work_at)
+                place = self.places[places_at + NODE][lane]
+                node = self.bounded(grid_index * self.nodes + place)
+                self.scatter_momentum(entry9, lane, place, node, at, work_at)
+                self.scatter_adjoint(bar, entry, lane, place, node, at, work_at)
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):

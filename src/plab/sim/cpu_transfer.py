@@ -114,10 +114,13 @@ class TransferTiles(ParticlePhases):
         ]
 
     @ti.func
-    def own(self, entry, node):
+    def own(self, entry, place):
         """An entry, the same, that LLVM takes for a particle's own: with one for the whole tile it would keep
-        an address for each of dozens of entries, more than there are registers."""
-        return self.bounded(entry + (node >> 31))
+        an address for each of dozens of entries, more than there are registers.
+
+        ``place`` is the base node as it stands in ``places``: not negative, but LLVM must not know.
+        """
+        return self.bounded(entry + (place >> 31))
 
     @ti.func
     def base_value(self, at, lane, last):
@@ -125,35 +128,39 @@ class TransferTiles(ParticlePhases):
         return ti.Vector([self.spread[at][lane], self.spread[at + 1][lane], self.spread[at + 2][lane], last])
 
     @ti.func
-    def scatter_momentum(self, entry9, lane, grid_node, at, work_at):
+    def scatter_momentum(self, entry9, lane, place, grid_node, at, work_at):
         """Add a particle's momentum and mass to its nodes.
 
         Args:
             entry9: Entry of the tile in ``affine``.
             lane: Particle of the tile.
+            place: Its base node, from ``places``.
             grid_node: Index of the base node in ``momentum``.
             at: First entry of the thread's share of ``spread``.
             work_at: First entry of the thread's share of ``work``.
         """
-        a = self.load(self.affine, entry9, lane, 9)
+        a = self.load(self.affine, self.own(entry9, place), lane, 9)
         value = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, work_at)
+        own_work = self.own(work_at, place)
+        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, own_work)
 
     @ti.func
-    def scatter_adjoint(self, bar: ti.template(), target, lane, grid_node, at, work_at):
+    def scatter_adjoint(self, bar: ti.template(), target, lane, place, grid_node, at, work_at):
         """Add what a particle contributes to the adjoint of the grid's velocities.
 
         Args:
             bar: Adjoint of the particle state after the substep.
             target: Entry of the tile in it.
             lane: Particle of the tile.
+            place: Its base node, from ``places``.
             grid_node: Index of the base node in ``velocity_bar``.
             at: First entry of the thread's share of ``spread``.
             work_at: First entry of the thread's share of ``work``.
         """
         c_bar = self.load(bar, target + 6, lane, 9)
         value = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
-        self.scatter_field(self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, work_at)
+        own_work = self.own(work_at, place)
+        self.scatter_field(self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, own_work)
 
     @ti.func
     def scatter_field(
@@ -209,15 +216,13 @@ class TransferTiles(ParticlePhases):
         after,
         bar: ti.template(),
         target,
-        entry9_tile,
+        entry9,
         lane,
         node,
-        at_tile,
+        at,
         work_at,
     ):
         """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
-        at = self.own(at_tile, node)
-        entry9 = self.own(entry9_tile, node)
         a = self.load(self.affine, entry9, lane, 9)
         c_bar = self.load(bar, target + 6, lane, 9)
         self.work[work_at + 7] = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
