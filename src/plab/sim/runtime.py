@@ -158,7 +158,7 @@ def cuda_available() -> bool:
 def remember_sources() -> None:
     """Let Taichi read and lay out the source of a function once, not at every inlining.
 
-    That is a fifth of what compiling from a warm cache takes. What a future Taichi no longer has is left as
+    That is a sixth of what compiling from a warm cache takes. What a future Taichi no longer has is left as
     it is.
     """
     from taichi.lang import kernel_impl
