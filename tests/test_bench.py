@@ -17,6 +17,7 @@ from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
 from plab.config import build_scene, load_config
+from plab.losses import make_terms
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
@@ -169,7 +170,8 @@ def scene() -> Scene:
 
 
 def simulator(**settings: object) -> Simulator:
-    sim = Simulator([scene()], precision="float64", **settings)
+    terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0})
+    sim = Simulator([scene()], terms=terms, precision="float64", **settings)
     # The target is the ball a node further, so that the slope of each term differs from place to place.
     mass = np.roll(sim.mass_tensor(), 1, axis=1)
     sim.set_target(mass, target_sdf(mass[0])[None])
@@ -198,7 +200,7 @@ def test_skips_change_nothing(usual: Simulator, device: str) -> None:
     for weights in ((10.0, 10.0, 1.0), (10.0, 0.0, 0.0)):
         results = []
         for sim in (usual, thorough):
-            sim.set_loss_weights(*weights)
+            sim.set_weights(dict(zip(("density", "sdf", "contact"), weights, strict=True)))
             results.append(sim.rollout(actions()))
         losses = [result.step_terms @ weights for result in results]
         np.testing.assert_allclose(losses[0], losses[1], rtol=1e-9)

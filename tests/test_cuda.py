@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import plab.sim.cuda_engine as cuda_engine
+from plab.losses import make_terms
 from plab.sim import Simulator, State
 from suite import batch
 
@@ -29,13 +30,13 @@ def random_actions() -> np.ndarray:
 
 def disturbed_simulator(device: str, precision: str, contact: str) -> Simulator:
     """A simulator with random targets that starts moving and strained, partly beyond the series' reach."""
-    simulator = Simulator(SCENES, precision=precision, device=device)
+    terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0})
+    simulator = Simulator(SCENES, terms=terms, precision=precision, device=device)
     simulator.set_contact(contact)
     rng = np.random.default_rng(3)
     n = SCENES[0].grid_size
     shape = (len(SCENES), n, n, n)
     simulator.set_target(0.3 * SCENES[0].particle_mass * rng.random(shape), rng.random(shape))
-    simulator.set_loss_weights(10.0, 10.0, 1.0)
     rest = simulator.state()
     matrices = rest.C.shape
     strain = np.where(np.arange(matrices[1]) % 17 == 0, 0.3, 0.02)[None, :, None, None]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from plab.objective import (
-    LossWeights,
     batch_scores,
     observation,
     rewards,
@@ -153,9 +152,9 @@ def test_scores_where_nothing_can_be_gained():
 
 
 def test_total_loss_and_rewards(rng):
-    weights = LossWeights(density=10.0, sdf=5.0, contact=2.0)
+    weights = np.array([10.0, 5.0, 2.0])
     initial, steps = rng.random((2, 3)), rng.random((2, 6, 3))
-    loss, reward = total_loss(steps, weights.numbers), rewards(initial, steps, weights)
+    loss, reward = total_loss(steps, weights), rewards(initial, steps, weights)
     assert loss.shape == reward.shape == (2, 6)
     for b, t in np.ndindex(2, 6):
         d, s, c = steps[b, t]

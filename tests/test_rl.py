@@ -22,7 +22,7 @@ from plab.envs.core import EpisodeBatch
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
 from plab.runners import RunError, rl, run_config
-from plab.runners.common import COLUMNS, kept_batches, policy_episode
+from plab.runners.common import episode_columns, kept_batches, policy_episode
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import ALGORITHMS, LinearDecay, cycle_steps
@@ -50,6 +50,8 @@ COARSE = (
 
 OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")
 """Updates begin in the second batch of episodes, and the buffer remembers the last four episodes."""
+
+COLUMNS = episode_columns(["density", "sdf", "contact"])
 
 METHODS = {
     "sac": OFF_POLICY,

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plab.losses import make_terms
 from plab.scene import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator
 from plab.sim.memory import ENTRIES_MAX
@@ -27,6 +28,8 @@ def ball(*, center: tuple[float, float, float] = (0.5, 0.4, 0.5), friction: floa
     return Scene("ball", (Body("sphere", center, (0.1,), 300),), tools, grid_size=16, substeps=5, dt=2e-4)
 
 
+WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}
+
 SCENES = (ball(), ball(center=(0.4, 0.3, 0.6)), ball(friction=0.1))
 
 
@@ -40,7 +43,7 @@ def actions(batch: int = len(SCENES)) -> np.ndarray:
 
 def simulator(scenes: tuple[Scene, ...], device: str, **settings: float) -> Simulator:
     """A simulator whose targets are the scenes' own volume, moved."""
-    sim = Simulator(scenes, device=device, **settings)
+    sim = Simulator(scenes, terms=make_terms(WEIGHTS), device=device, **settings)
     n = sim.grid_size
     grid = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(grid - 0.6, axis=-1)

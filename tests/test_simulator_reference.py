@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import reference_mpm as reference
+from plab.losses import make_terms
 from plab.scene import sample_particles
 from plab.sim import Simulator, State
 from suite import batch
@@ -17,13 +18,15 @@ pytestmark = pytest.mark.physics
 
 SCENES = batch()
 STEPS = 1
+TERMS = ("density", "sdf", "contact")
 WEIGHTS = (10.0, 10.0, 1.0)
 
 
 @pytest.fixture(scope="module")
 def simulator(device: str) -> Simulator:
     # With all gradients: tests/verification uses the same kernels.
-    return Simulator(SCENES, precision="float64", device=device, full_gradient=True)
+    terms = make_terms(dict(zip(TERMS, WEIGHTS, strict=True)))
+    return Simulator(SCENES, terms=terms, precision="float64", device=device, full_gradient=True)
 
 
 def actions(steps: int = STEPS) -> np.ndarray:
@@ -132,7 +135,6 @@ def test_loss_terms_and_mass_agree(simulator: Simulator) -> None:
 def test_gradients_agree_with_autograd(simulator: Simulator, contact: str, start: str) -> None:
     simulator.set_contact(contact)
     simulator.set_target(*targets())
-    simulator.set_loss_weights(*WEIGHTS)
     state = START[start](simulator)
     simulator.set_initial_state(state)
     u = actions(2)
@@ -159,7 +161,6 @@ def test_gradients_agree_with_central_differences(simulator: Simulator, contact:
     mass, sdf = targets()
     # An empty target: |mass - target| has no kink then.
     simulator.set_target(0.0 * mass, sdf)
-    simulator.set_loss_weights(*WEIGHTS)
     simulator.set_initial_state(START[start](simulator))
     u = actions(2)
     direction = np.random.default_rng(5).normal(size=u.shape)

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 __all__ = [
     "OBSERVED_PARTICLES",
     "TARGET_MASS",
-    "LossWeights",
     "Scores",
     "batch_scores",
     "observation",
@@ -35,26 +34,6 @@ OBSERVED_PARTICLES = 200
 
 TARGET_MASS = 1e-4
 """Mass above which a grid node belongs to the target."""
-
-
-@dataclass
-class LossWeights:
-    """Weights of the three terms of the step loss.
-
-    Attributes:
-        density: Weight of ``sum |S - S*|``.
-        sdf: Weight of ``sum sdf* S``.
-        contact: Weight of the moving manipulators' squared distances to the nearest particle.
-    """
-
-    density: float
-    sdf: float
-    contact: float
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The weights of density, SDF and contact term, shape [3]."""
-        return np.array([self.density, self.sdf, self.contact])
 
 
 @dataclass(frozen=True)
@@ -246,8 +225,8 @@ def total_loss(terms: Any, weights: Any) -> Any:
     """Weigh and add the terms of the step loss.
 
     Args:
-        terms: Density, SDF and contact term, in this order, shape [..., 3]; an array or a tensor.
-        weights: Their weights, shape [3], like ``terms``; see :attr:`LossWeights.numbers`.
+        terms: Unweighted terms, shape [..., term]; an array or a tensor.
+        weights: Their weights, shape [term], like ``terms``.
 
     Returns:
         Loss, shape [...], like ``terms``.
@@ -256,18 +235,19 @@ def total_loss(terms: Any, weights: Any) -> Any:
     return (terms * weights).sum(-1)
 
 
-def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: LossWeights) -> np.ndarray:
+def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: ArrayLike) -> np.ndarray:
     """Reward of each step: the loss at the initial state minus the loss after the step.
 
     Args:
-        initial_terms: Loss terms of the initial state, shape [..., 3].
-        step_terms: Loss terms after each environment step, shape [..., T, 3].
-        weights: Weights of the terms.
+        initial_terms: Loss terms of the initial state, shape [..., term].
+        step_terms: Loss terms after each environment step, shape [..., T, term].
+        weights: Weights of the terms, shape [term].
 
     Returns:
         Rewards, shape [..., T].
     """
-    before, after = (total_loss(np.asarray(terms), weights.numbers) for terms in (initial_terms, step_terms))
+    numbers = np.asarray(weights)
+    before, after = (total_loss(np.asarray(terms), numbers) for terms in (initial_terms, step_terms))
     return before[..., None] - after
 
 

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from plab.config import ConfigError, build_scene, variant_task
-from plab.objective import LossWeights, Scores, rewards, scores, scores_from_iou, target_sdf, total_loss
+from plab.losses import make_terms
+from plab.objective import Scores, rewards, scores, scores_from_iou, target_sdf, total_loss
 from plab.sim import Rollout, Simulator
 from plab.targets import TargetError, build_targets, load_release_target
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from plab.config import Config
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem", "build_scenes"]
+__all__ = ["Episodes", "Problem", "build_scenes", "build_simulator"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Episodes:
     """What a rollout of all environments gave.
 
     Attributes:
-        terms: Unweighted loss terms (density, SDF, contact) after each step, shape [batch, T, 3].
+        term_names: Names of the terms of the loss.
+        terms: The terms after each step, unweighted, shape [batch, T, term].
         loss: Weighted step losses, shape [batch, T].
         reward: Rewards, shape [batch, T].
         iou: Soft IoU with the target after each step, shape [batch, T].
@@ -44,6 +46,7 @@ class Episodes:
         failures: Environments that broke off, and when and why; their numbers mean nothing.
     """
 
+    term_names: tuple[str, ...]
     terms: np.ndarray
     loss: np.ndarray
     reward: np.ndarray
@@ -66,6 +69,19 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
     return [scenes[kind] for kind in kinds]
 
 
+def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
+    """Build a simulator of some scenes with the loss, precision, device and memory of a configuration.
+
+    Raises:
+        plab.config.ConfigError: If there is no such term of the loss.
+        plab.scene.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+        plab.sim.DeviceError: If CUDA was asked for and is not there.
+    """
+    sim, method = cfg.sim, cfg.method
+    terms = make_terms(method.loss_weights, method.loss_terms)
+    return Simulator(scenes, terms=terms, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
+
+
 def _kinds(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal where configurations differ in method, seed and files only."""
     return [json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.sim)]) for cfg in cfgs]
@@ -77,7 +93,8 @@ class Problem:
     Attributes:
         scenes: One scene per environment.
         simulator: Their simulator, in its initial state.
-        weights: Weights of the loss terms.
+        term_names: Names of the terms of the loss; those of weight 0 are left out.
+        weights: Their weights, shape [term].
         initial_mass: Mass tensors of the initial states, shape [batch, n, n, n].
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
         initial_scores: How close the initial states are.
@@ -87,8 +104,8 @@ class Problem:
         """Build everything.
 
         Args:
-            cfgs: One configuration per environment, alike in ``sim``, ``targets`` and the loss weights.
-            simulator: Simulator of the very same scenes, if there is one already.
+            cfgs: One configuration per environment, alike in ``sim``, ``targets`` and the loss.
+            simulator: Simulator of the very same scenes and terms of the loss, if there is one already.
 
         Raises:
             plab.config.ConfigError: If the configurations do not fit together.
@@ -97,20 +114,19 @@ class Problem:
             plab.sim.DeviceError: If CUDA was asked for and is not there.
         """
         _require_alike(cfgs)
-        sim = cfgs[0].sim
         # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
         kinds = _kinds(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
         self.scenes = build_scenes(cfgs)
-        self.weights: LossWeights = cfgs[0].method.loss_weights
-        self.simulator = simulator or Simulator(
-            self.scenes, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb
-        )
+        self.simulator = simulator or build_simulator(self.scenes, cfgs[0])
+        weights = cfgs[0].method.loss_weights
+        self.term_names = tuple(term.name for term in self.simulator.terms)
+        self.weights = np.array([weights[name] for name in self.term_names])
         self.target_mass = _targets([cfgs[first[kind]] for kind in kinds], self.scenes, self.simulator)
         # Distances to equal targets are equal.
         distances = {kind: _distance(self.target_mass[k]) for kind, k in first.items()}
         self.simulator.set_target(self.target_mass, np.stack([distances[kind] for kind in kinds]))
-        self.simulator.set_loss_weights(self.weights.density, self.weights.sdf, self.weights.contact)
+        self.simulator.set_weights({name: weights[name] for name in self.term_names})
         # Making a target leaves another contact model behind than finding it in the cache.
         self.simulator.set_contact("soft")
         self.simulator.reset()
@@ -139,8 +155,9 @@ class Problem:
         result = self.simulator.rollout(actions, gradient=gradient, strict=strict)
         final_mass = self.simulator.mass_tensor() if exact else None
         return Episodes(
+            term_names=self.term_names,
             terms=result.step_terms,
-            loss=total_loss(result.step_terms, self.weights.numbers),
+            loss=total_loss(result.step_terms, self.weights),
             reward=rewards(result.initial_terms, result.step_terms, self.weights),
             iou=result.step_iou,
             final_mass=final_mass,
@@ -191,10 +208,14 @@ def _targets(cfgs: Sequence[Config], scenes: Sequence[Scene], simulator: Simulat
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """Refuse configurations of which one simulator could only follow the first."""
     for number, cfg in enumerate(cfgs):
-        for part in ("sim", "method.loss_weights", "targets"):
-            first, this = (vars(attrgetter(part)(one)) for one in (cfgs[0], cfg))
-            if differing := [f"{part}.{key}" for key in first if first[key] != this.get(key)]:
+        for part in ("sim", "method.loss_weights", "method.loss_terms", "targets"):
+            first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
+            if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:
                 raise ConfigError(
                     f"{differing[0]} differs between sub-environments 0 and {number}: "
                     f"they share one simulator"
                 )
+
+
+def _entries(section: Any) -> dict[str, Any]:
+    return section if isinstance(section, dict) else vars(section)

@@ -1,14 +1,17 @@
 """The simulator for PyTorch.
 
-Trajectory losses that can be differentiated by the actions, and environments whose observations, actions and
-rewards are tensors. With ``sim.device=cuda`` they stay on the device.
+Trajectory losses that can be differentiated by the actions, states for losses of your own, which can be
+differentiated by initial state and material, too, and environments whose observations, actions and rewards
+are tensors. With ``sim.device=cuda`` they stay on the device.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
@@ -17,8 +20,9 @@ from plab.envs.core import EpisodeBatch, Transition
 if TYPE_CHECKING:
     from plab.config import Config
     from plab.problem import Problem
+    from plab.sim import Recording, Simulator, State
 
-__all__ = ["TensorEnv", "rollout"]
+__all__ = ["States", "TensorEnv", "rollout", "simulate"]
 
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
@@ -62,6 +66,133 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None]:
         (gradient,) = ctx.saved_tensors
         return loss_bar[:, None, None] * gradient, None
+
+
+class States(NamedTuple):
+    """States after environment steps, each of shape [batch, T, ...]; T is 1 for the last state alone.
+
+    Attributes:
+        x: Particle positions [domain units], shape [batch, T, particle, 3].
+        v: Particle velocities, likewise.
+        poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, T, manipulator, 8].
+        mass: Mass tensors, shape [batch, T, n, n, n]; empty if they were not asked for.
+    """
+
+    x: torch.Tensor
+    v: torch.Tensor
+    poses: torch.Tensor
+    mass: torch.Tensor
+
+
+def simulate(
+    simulator: Simulator,
+    actions: torch.Tensor,
+    *,
+    every_step: bool = True,
+    mass: bool = True,
+    material: torch.Tensor | None = None,
+    **initial: torch.Tensor,
+) -> States:
+    """Run actions and return the states that they lead to, for any function of them that PyTorch can
+    differentiate.
+
+    The function's gradient reaches actions, initial state and material. The contact model is the one that the
+    simulator is set to; terms of a loss that it was built with play no part. ``backward`` has to be called
+    before the simulator runs again. The derivative by a quaternion is that of the rotation matrix's
+    polynomial.
+
+    Args:
+        simulator: The simulator; built with ``full_gradient=True`` where initial state or material require a
+            gradient.
+        actions: Actions, shape [batch, T, A], of any floating-point type and on any device.
+        every_step: Whether to return the state after every environment step, or the last one alone.
+        mass: Whether to return mass tensors.
+        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3]; as they are if None.
+        **initial: What the initial state is to have, as in :class:`plab.sim.State`: any of ``x``, ``v``,
+        ``C``, ``F``
+            and ``poses``. The simulator keeps it, as it does the material.
+
+    Returns:
+        The states, like ``actions`` in type and device.
+
+    Raises:
+        TypeError: If ``initial`` names something else.
+        ValueError: If a shape is wrong or an action is not finite.
+        plab.scene.SceneError: If the material cannot be simulated.
+        plab.sim.SimulationError: If state or gradient stop being finite.
+        MemoryError: If the gradient does not fit the memory budget.
+        RuntimeError: If a gradient was asked for after the simulator has run again, or needs
+            ``full_gradient=True``.
+    """
+    if unknown := set(initial) - set(_FIELDS):
+        raise TypeError(f"'{min(unknown)}' is no part of a state: {', '.join(_FIELDS)}")
+    given = [initial.get(name) for name in _FIELDS]
+    return States(*_States.apply(simulator, every_step, mass, actions, material, *given))
+
+
+_FIELDS = ("x", "v", "C", "F", "poses")
+
+
+class _States(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        simulator: Simulator,
+        every_step: bool,
+        mass: bool,
+        actions: torch.Tensor,
+        material: torch.Tensor | None,
+        *initial: torch.Tensor | None,
+    ) -> tuple[torch.Tensor, ...]:
+        if material is not None:
+            simulator.set_material(*_numbers(material).T)
+        _start(simulator, {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None})
+        given = actions.detach()
+        if not (given.is_cuda and simulator.device == "cuda"):
+            given = given.cpu().double().numpy()
+        recording = simulator.record(
+            given, every_step=every_step, mass=mass, gradient=any(ctx.needs_input_grad)
+        )
+        ctx.simulator, ctx.recording = simulator, recording
+        ctx.likes = actions, material, *initial
+        ctx.set_materialize_grads(False)
+        taken = recording.mass if mass else np.zeros(0)
+        shown = recording.x, recording.v, recording.poses, taken
+        return tuple(torch.as_tensor(part).to(actions, copy=True) for part in shown)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *bars: torch.Tensor | None) -> tuple[Any, ...]:
+        recording: Recording = ctx.recording
+        on_cuda = ctx.simulator.device == "cuda"
+        named = zip(("x", "v", "poses", "mass"), bars, strict=True)
+        held = {
+            name: bar.detach() if on_cuda and bar.is_cuda else _numbers(bar)
+            for name, bar in named
+            if bar is not None and bar.numel()
+        }
+        actions, material, *initial = ctx.likes
+        gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions)]
+        if ctx.needs_input_grad[4]:
+            gradients.append(torch.as_tensor(ctx.simulator.material_gradient()).to(material))
+        else:
+            gradients.append(None)
+        wanted = ctx.needs_input_grad[5:]
+        state: State | None = ctx.simulator.state_gradient() if any(wanted) else None
+        for name, like, asked in zip(_FIELDS, initial, wanted, strict=True):
+            gradients.append(torch.as_tensor(getattr(state, name)).to(like) if asked else None)
+        return None, None, None, *gradients
+
+
+def _numbers(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()
+
+
+def _start(simulator: Simulator, parts: dict[str, np.ndarray]) -> None:
+    """Replace parts of the initial state."""
+    if parts:
+        simulator.reset()
+        simulator.set_initial_state(replace(simulator.state(), **parts))
 
 
 class TensorEnv:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from plab.losses import make_terms
 from plab.scene import sample_particles
 from plab.sim import Simulator, State
 from suite import DEVICE, FAR, KINDS, NEAR, batch, scene
@@ -43,12 +44,12 @@ def components(kind: str) -> list[int]:
 
 def build() -> Simulator:
     """The simulator, float64, with an empty target: |mass - target| has no kink then."""
-    sim = Simulator(SCENES, precision="float64", device=DEVICE, full_gradient=True)
+    terms = make_terms(dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True)))
+    sim = Simulator(SCENES, terms=terms, precision="float64", device=DEVICE, full_gradient=True)
     n = sim.grid_size
     nodes = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(nodes - (0.6, 0.35, 0.42), axis=-1)
     sim.set_target(np.zeros((BATCH, n, n, n)), np.broadcast_to(distance, (BATCH, n, n, n)))
-    sim.set_loss_weights(*WEIGHTS)
     return sim
 
 

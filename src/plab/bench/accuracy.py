@@ -31,7 +31,14 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive
-from plab.bench.common_scene import ANY_SCENE, common_actions, common_places, common_scene, own_components
+from plab.bench.common_scene import (
+    ANY_SCENE,
+    common_actions,
+    common_places,
+    common_scene,
+    grid_terms,
+    own_components,
+)
 from plab.bench.precision import angle
 from plab.bench.table import report
 from plab.command import answered
@@ -275,10 +282,14 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int, device
             # Taichi's memory goes with the old simulator, before there is a new one.
             simulator = None
             simulator = Simulator(
-                [scene], precision=setting.precision, device=device, particles=[x], skips=skips
+                [scene],
+                terms=grid_terms(),
+                precision=setting.precision,
+                device=device,
+                particles=[x],
+                skips=skips,
             )
         simulator.set_scenes([scene], particles=[x])
-        simulator.set_loss_weights(10.0, 10.0, 0.0)
         if setting.axis not in attempt.targets:
             simulator.set_contact("hard")
             simulator.rollout(attempt.demonstration[None], gradient=False)

@@ -3,7 +3,8 @@
 A simulator's environments must have the same manipulators and as many particles. Here every scene has all
 manipulators that any task has, those that its task lacks parked outside the domain and without motion, and
 its bodies share a given number of particles. The physics inside the domain is the task's own; the contact
-term of the loss is not, because the parked manipulators are far from everything: leave its weight at 0.
+term of the loss is not, because the parked manipulators are far from everything: :func:`grid_terms` leave it
+out.
 """
 
 from __future__ import annotations
@@ -14,10 +15,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from plab.losses import make_terms
+from plab.losses.term import Term
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 from plab.sim.skips import Skips
 
-__all__ = ["ANY_SCENE", "PLACES", "common_actions", "common_places", "common_scene", "own_components"]
+__all__ = [
+    "ANY_SCENE",
+    "PLACES",
+    "common_actions",
+    "common_places",
+    "common_scene",
+    "grid_terms",
+    "own_components",
+]
 
 ANY_SCENE = Skips(plasticity=False, friction=False)
 """For simulators that are given other scenes later, which may yield or rub where the first do not."""
@@ -34,6 +45,11 @@ PARKED_SIZES = {
     "Cylinder": (0.1, 0.2),
     "Box": (0.05, 0.05, 0.05),
 }
+
+
+def grid_terms() -> tuple[Term, ...]:
+    """Return the suite's terms of the mass tensor, with the suite's weights."""
+    return make_terms({"density": 10.0, "sdf": 10.0})
 
 
 def common_places(scenes: Sequence[Scene]) -> tuple[str, ...]:

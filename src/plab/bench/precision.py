@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, own_components
+from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, grid_terms, own_components
 from plab.bench.table import report
 from plab.command import answered
 from plab.config import build_scene, load_config
@@ -117,8 +117,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
     Yields:
         For each configuration its target and an :class:`Outcome` per kind of actions.
     """
-    simulator = Simulator([configurations[0].scene], precision=precision, skips=ANY_SCENE)
-    simulator.set_loss_weights(10.0, 10.0, 0.0)
+    simulator = Simulator([configurations[0].scene], terms=grid_terms(), precision=precision, skips=ANY_SCENE)
     for number, start in enumerate(configurations):
         simulator.set_scenes([start.scene])
         final = {}

@@ -27,7 +27,7 @@ import numpy as np
 import taichi as ti
 
 from plab.arguments import positive, to_write
-from plab.bench.common_scene import ANY_SCENE
+from plab.bench.common_scene import ANY_SCENE, grid_terms
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
 from plab.command import answered
@@ -167,9 +167,7 @@ def rows(tasks: Sequence[str], particles: int, choices: Sequence[str]) -> Iterat
 
 def _simulator(configurations: Sequence[Start], choice: Choice) -> Simulator:
     skips = replace(ANY_SCENE, singular_values=choice.series)
-    simulator = Simulator([configurations[0].scene], precision="float64", skips=skips)
-    simulator.set_loss_weights(10.0, 10.0, 0.0)
-    return simulator
+    return Simulator([configurations[0].scene], terms=grid_terms(), precision="float64", skips=skips)
 
 
 def _states(configurations: Sequence[Start], choice: Choice) -> Mapping[str, Mapping[str, np.ndarray]]:

@@ -30,7 +30,7 @@ from plab.config import load_config
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
-from plab.results.schema import COLUMNS, FAMILY_COLUMNS
+from plab.results.schema import COLUMNS, FAMILY_COLUMNS, loss_columns
 from plab.selection import Selection
 from plab.status import survey
 from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
@@ -64,7 +64,7 @@ def synthetic_run(
         np.arange(rows) if "iterations" in method else np.linspace(0, method["episodes"], rows).astype(int)
     )
     curve = score * (1.0 - np.exp(-3.0 * np.arange(rows) / max(rows - 1, 1)))
-    columns = (*COLUMNS, *FAMILY_COLUMNS[method["family"]])
+    columns = (*COLUMNS, *loss_columns(config), *FAMILY_COLUMNS[method["family"]])
     table = pd.DataFrame({name: rng.uniform(0.0, 1.0, rows) for name in columns})
     table["iteration"], table["episodes"], table["steps"] = np.arange(rows), episodes, episodes * horizon
     table["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)
@@ -73,8 +73,9 @@ def synthetic_run(
     table["seconds"] = rng.uniform(0.9, 1.1, rows)
     best = int(table["loss"].idxmin()) if rows else -1
     judged = scores_from_iou(0.1, 0.1 + 0.3 * score, 0.4)
-    terms = {"loss": 50.0, "loss_density": 3.0, "loss_sdf": 2.0, "loss_contact": 0.0, "reward": 40.0 * score}
-    evaluation = terms | {
+    evaluation = dict.fromkeys(loss_columns(config), 2.0) | {
+        "loss": 50.0,
+        "reward": 40.0 * score,
         "iou": judged.iou_final,
         "score": judged.score,
         "score_printed": judged.score_printed,

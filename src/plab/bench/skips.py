@@ -59,11 +59,6 @@ CASES = (
     Case("flow", ("task=Move",)),
     Case("friction", ("task=Writer", "task.floor_friction=0")),
     Case("history", ("task=Move",), (REWARD,)),
-    Case(
-        "zero_weights",
-        ("task=TripleMove", "method.loss_weights.contact=0"),
-        (REWARD, GRADIENT),
-    ),
     Case("still_manipulators", ("task=Rope",), (GRADIENT, REWARD)),
     Case("adjoints", ("task=Torus",), (GRADIENT,), from_start=True),
     Case("launches", ("task=Move",), (FORWARD, GRADIENT), devices=("cuda",)),
@@ -173,8 +168,8 @@ def _alternate(calls: Sequence[Callable[[], object]], repeats: int) -> np.ndarra
 def _differences(a: Workload, b: Workload, gradient: bool) -> tuple[float, float]:
     """Largest difference of the weighted losses and of the gradients, relative to the largest component."""
     results = [load.simulator.rollout(load.actions, gradient=gradient) for load in (a, b)]
-    weights = a.cfg.method.loss_weights
-    losses = [r.step_terms @ [weights.density, weights.sdf, weights.contact] for r in results]
+    weights = [term.weight for term in a.simulator.terms]
+    losses = [r.step_terms @ weights for r in results]
     return (
         _relative(*losses),
         _relative(*(cast(np.ndarray, r.gradient) for r in results)) if gradient else 0.0,

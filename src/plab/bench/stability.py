@@ -31,6 +31,7 @@ from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
 from plab.command import answered
 from plab.config import ConfigError
+from plab.losses import make_terms
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
 from plab.suite import suite_tasks
@@ -65,7 +66,9 @@ def run_cases(cases: Sequence[Case], precision: str) -> Iterator[dict[str, objec
         ``norms``, those of the gradient with respect to each step's actions, shape [T].
     """
     for group in _groups(cases).values():
-        simulator = Simulator([group[0].scene] * min(BATCH, len(group)), precision=precision, skips=ANY_SCENE)
+        scenes = [group[0].scene] * min(BATCH, len(group))
+        terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": group[0].contact_weight})
+        simulator = Simulator(scenes, terms=terms, precision=precision, skips=ANY_SCENE)
         simulator.set_target(*_target(simulator))
         for at in range(0, len(group), simulator.batch):
             part = group[at : at + simulator.batch]
@@ -155,7 +158,6 @@ def _start(simulator: Simulator, cases: Sequence[Case]) -> None:
     """Put a batch of cases into their initial states."""
     simulator.set_scenes([case.scene for case in cases])
     simulator.set_contact([case.contact for case in cases])
-    simulator.set_loss_weights(10.0, 10.0, cases[0].contact_weight)
     state = simulator.state()
     for e, case in enumerate(cases):
         for name, value in case.state.items():

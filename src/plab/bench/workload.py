@@ -15,6 +15,7 @@ import taichi as ti
 
 from plab.config import Config, build_scene
 from plab.demonstrations import known_actions
+from plab.losses import make_terms
 from plab.objective import OBSERVED_PARTICLES, target_sdf
 from plab.sim import Simulator, Skips, State
 
@@ -121,14 +122,13 @@ def build(
     scene = build_scene(cfg)
     simulator = Simulator(
         [scene] * batch,
+        terms=make_terms(cfg.method.loss_weights, cfg.method.loss_terms),
         precision=cfg.sim.precision,
         device=cfg.sim.device,
         memory_mb=cfg.sim.memory_mb,
         skips=skips or Skips(),
     )
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
-    weights = cfg.method.loss_weights
-    simulator.set_loss_weights(weights.density, weights.sdf, weights.contact)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
     # Relative to its largest: with few particles all masses are small.
     distance = target_sdf(mass, threshold=SOLID * mass.max())

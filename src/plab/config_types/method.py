@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 from plab.config_errors import ConfigError
 from plab.config_types.ranges import at_least, folder_name, fraction, one_of, positive, share, vector, widths
-from plab.objective import LossWeights
+from plab.losses import check_terms
 
 __all__ = [
     "ALGORITHMS",
@@ -41,24 +40,27 @@ class MethodConfig:
         contact: Contact model of the rollouts, ``soft`` or ``hard``; the final evaluation always uses the
             hard one.
         softness: Decay rate alpha of the soft contact [1 / domain unit].
-        loss_weights: Weights of the step loss.
+        loss_weights: Weights of the step loss by the names of its terms; a term of weight 0 is left out.
+        loss_terms: Which term a weight's name stands for: a key of ``plab.losses.TERMS``, or a class of your
+            own as ``module:Class``.
     """
 
     name: str
     family: str
     contact: str
     softness: float
-    loss_weights: LossWeights
+    loss_weights: dict[str, float]
+    loss_terms: dict[str, str]
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         folder_name(f"{path}.name", self.name)
         one_of(f"{path}.contact", self.contact, CONTACTS)
         positive(f"{path}.softness", self.softness)
-        weights = dataclasses.asdict(self.loss_weights)
-        for name, weight in weights.items():
+        for name, weight in self.loss_weights.items():
             at_least(f"{path}.loss_weights.{name}", weight, 0, finite=True)
-        if not any(weights.values()):
+        check_terms(self.loss_weights, self.loss_terms)
+        if not any(self.loss_weights.values()):
             raise ConfigError(f"{path}.loss_weights are all 0: at least one must be positive")
 
 

@@ -162,7 +162,7 @@ class EpisodeBatch:
         """Build everything; the episodes start at :meth:`reset`.
 
         Args:
-            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss weights.
+            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
             contact: Contact model, ``hard`` or ``soft``.
 
         Raises:
@@ -189,7 +189,7 @@ class EpisodeBatch:
         judged = self.problem.initial_scores
         start, best = [one.iou_initial for one in judged], [one.iou_target_self for one in judged]
         self._scale = Constants(score_scale(start, best))
-        self._weights = Constants(self.problem.weights.numbers)
+        self._weights = Constants(self.problem.weights)
         self._initial_info = self._info()
         self._initial_loss = Constants(self._initial_info["loss"])
         self._initial_observation = self._observe()
@@ -295,9 +295,7 @@ class EpisodeBatch:
         score, printed = batch_scores(self._scale.like(iou), iou)
         return {
             "loss": total_loss(terms, self._weights.like(terms)),
-            "loss_density": terms[:, 0],
-            "loss_sdf": terms[:, 1],
-            "loss_contact": terms[:, 2],
+            **{f"loss_{name}": terms[:, k] for k, name in enumerate(self.problem.term_names)},
             "iou": iou,
             "score": score,
             "score_printed": printed,

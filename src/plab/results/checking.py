@@ -24,6 +24,7 @@ from plab.results.schema import (
     ResultsError,
     RunResult,
     config_hash,
+    loss_columns,
 )
 
 __all__ = ["Problem", "check", "problems"]
@@ -148,7 +149,7 @@ def _iterations(run: RunResult) -> Iterator[str]:
         if run.status == "finished":
             yield "it has no iterations"
         return
-    wanted = (*COLUMNS, *FAMILY_COLUMNS.get(run.config["method"]["family"], ()))
+    wanted = (*COLUMNS, *loss_columns(run.config), *FAMILY_COLUMNS.get(run.config["method"]["family"], ()))
     if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
@@ -185,7 +186,7 @@ def _best(run: RunResult) -> Iterator[str]:
 
 def _evaluation(run: RunResult) -> Iterator[str]:
     values = run.evaluation
-    if missing := [name for name in EVALUATION if name not in values]:
+    if missing := [name for name in (*EVALUATION, *loss_columns(run.config)) if name not in values]:
         yield f"evaluation lacks {', '.join(missing)}"
         return
     if endless := [name for name, value in values.items() if not np.isfinite(value)]:

@@ -30,6 +30,7 @@ __all__ = [
     "config_dict",
     "config_hash",
     "final_path",
+    "loss_columns",
     "member_name",
     "parse_member",
     "result_path",
@@ -45,10 +46,10 @@ PARTIAL_SUFFIX = ".partial.h5"
 ARCHIVE_SUFFIX = ".plab.zip"
 """Ends of the names of result files, of those of runs under way, and of archives."""
 
-_MEASURES = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
+_MEASURES = ("loss", "reward", "iou", "score")
 
 COLUMNS = ("iteration", "episodes", "steps", *_MEASURES, "seconds")
-"""Columns that the iterations of every method have."""
+"""Columns that the iterations of every method have, beside those of :func:`loss_columns`."""
 
 FAMILY_COLUMNS = {
     "trajectory": ("gradient_norm",),
@@ -61,7 +62,7 @@ MAY_BE_NAN = ("train_reward", "train_score")
 """Columns with entries for which there is no number: no episode of training had ended."""
 
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
-"""Scalars of the final evaluation."""
+"""Scalars of the final evaluation, beside those of :func:`loss_columns`."""
 
 _NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
@@ -129,6 +130,11 @@ def config_hash(cfg: Any) -> str:
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
     plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the columns of the terms of a configuration's loss: of those with a weight."""
+    return tuple(f"loss_{name}" for name, weight in config["method"]["loss_weights"].items() if weight)
 
 
 def result_path(cfg: Any) -> Path:

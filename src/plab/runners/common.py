@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "PolicyEpisode",
+    "episode_columns",
     "kept",
     "kept_batches",
     "measures",
@@ -33,22 +34,22 @@ __all__ = [
 
 Kept = TypeVar("Kept")
 
-COLUMNS = ("loss", "loss_density", "loss_sdf", "loss_contact", "reward", "iou", "score")
-"""Columns of the results that every method has: what an episode is measured by."""
+COLUMNS = ("loss", "reward", "iou", "score")
+"""Columns of the results that every method has: what an episode is measured by, beside the terms of its
+loss."""
 
 _LAST = ("iou", "score")
 """Columns that judge the last state; the others are sums over the steps."""
 
 
 def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
-    """Return the scalars of the final evaluation, :data:`COLUMNS` among them, of one environment."""
-    density, sdf, contact = result.terms[environment].sum(axis=0)
+    """Return the scalars of the final evaluation of one environment: those of :func:`episode_columns`, and
+    what else scores are made of."""
+    sums = zip(result.term_names, result.terms[environment].sum(axis=0), strict=True)
     judged = result.scores[environment]
     return {
         "loss": float(result.loss[environment].sum()),
-        "loss_density": float(density),
-        "loss_sdf": float(sdf),
-        "loss_contact": float(contact),
+        **{f"loss_{name}": float(total) for name, total in sums},
         "reward": float(result.reward[environment].sum()),
         "iou": judged.iou_final,
         "score": judged.score,
@@ -58,6 +59,12 @@ def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
     }
 
 
+def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of what an episode is measured by, for a loss of these terms."""
+    first, *rest = COLUMNS
+    return (first, *(f"loss_{name}" for name in term_names), *rest)
+
+
 @dataclass(frozen=True)
 class PolicyEpisode:
     """What an episode of a policy gave.
@@ -65,7 +72,7 @@ class PolicyEpisode:
     Attributes:
         observations: Observations before each step, shape [T, entry].
         actions: Actions, shape [T, A].
-        measures: Values of :data:`COLUMNS`.
+        measures: Values of :func:`episode_columns`.
     """
 
     observations: np.ndarray
@@ -81,13 +88,14 @@ def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarra
         policy: Maps observations, shape [1, entry], to actions, shape [1, A].
     """
     observation, _ = batch.reset()
-    observations, actions, sums = [], [], dict.fromkeys(COLUMNS, 0.0)
+    sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
+    observations, actions = [], []
     for _ in range(batch.horizon):
         observations.append(observation)
         actions.append(policy(observation))
         step = batch.step(actions[-1])
         observation, values = step.observation, step.info | {"reward": step.reward}
-        for name in COLUMNS:
+        for name in sums:
             sums[name] += float(values[name][0])
     last = {name: float(values[name][0]) for name in _LAST}
     return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
@@ -131,7 +139,8 @@ def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
         One batch per kind, in its initial state.
     """
     method = asdict(cfg.method)
-    parts = [asdict(cfg.task), asdict(cfg.sim), asdict(cfg.targets), method["loss_weights"], kinds]
+    loss = [method["loss_weights"], method["loss_terms"]]
+    parts = [asdict(cfg.task), asdict(cfg.sim), asdict(cfg.targets), loss, kinds]
 
     def build() -> list[EpisodeBatch]:
         return [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]

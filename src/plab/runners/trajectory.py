@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from plab.config_types import TrajectoryConfig
-from plab.problem import Episodes, Problem, build_scenes
+from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.progress import show_progress
 from plab.results import ResultsError
-from plab.runners.common import COLUMNS, kept, measures, simulation_errors
+from plab.runners.common import episode_columns, kept, measures, simulation_errors
 from plab.runners.jobs import Job, RunError, TogetherError, batch_title
 from plab.sim import DeviceError, Simulator
 
@@ -61,12 +61,13 @@ def run_trajectory(jobs: Sequence[Job], note: str = "") -> None:
 
 def make_problem(cfgs: Sequence[Config]) -> Problem:
     """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
-    scenes, sim = tuple(build_scenes(cfgs)), cfgs[0].sim
+    scenes, sim, method = tuple(build_scenes(cfgs)), cfgs[0].sim, cfgs[0].method
 
     def build() -> Simulator:
-        return Simulator(scenes, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
+        return build_simulator(scenes, cfgs[0])
 
-    key = scenes, sim.precision, sim.device, sim.memory_mb
+    loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
+    key = scenes, loss, sim.precision, sim.device, sim.memory_mb
     return Problem(cfgs, kept(key, build, check=Simulator.reset))
 
 
@@ -115,7 +116,7 @@ class _Sequence:
         # What the actions have cost: the rollouts, of an episode each, that led to them.
         row: dict[str, float] = {"iteration": self.iteration, "episodes": self.iteration}
         row["steps"] = self.iteration * len(tried)
-        row |= {name: measured[name] for name in COLUMNS}
+        row |= {name: measured[name] for name in episode_columns(episodes.term_names)}
         row["gradient_norm"] = float(np.linalg.norm(gradient))
         row["seconds"] = seconds + time.perf_counter() - start
         # Written so that the first loss beats the NaN that stands for none.

@@ -1,7 +1,9 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
+from plab.sim.forward import CONTACT_MODELS
+from plab.sim.recording import Recording
 from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
-from plab.sim.simulator import CONTACT_MODELS, Simulator
+from plab.sim.simulator import Simulator
 from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State
 
@@ -11,6 +13,7 @@ __all__ = [
     "PRECISIONS",
     "DeviceError",
     "Measures",
+    "Recording",
     "Rollout",
     "SimulationError",
     "Simulator",

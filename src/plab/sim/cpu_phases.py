@@ -8,17 +8,28 @@ import taichi as ti
 
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
-from plab.sim.loss_phases import LossPhases
 from plab.sim.pose_phases import PosePhases
-from plab.sim.storage import BLOCK, PLACES, SPREAD, STAGE, WORK
+from plab.sim.storage import BLOCK, CHUNKS, PLACES, SPREAD, STAGE, WORK
+from plab.sim.term_phases import TermPhases
 
 __all__ = ["BLOCK_NODES", "CpuPhases"]
 
 BLOCK_NODES = BLOCK**3
 
 
-class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
+class CpuPhases(TransferTiles, GridPhases, PosePhases, TermPhases):
     """All phases, for one chunk at a time."""
+
+    shares = CHUNKS
+
+    def allocate_adjoint(self) -> None:
+        """Allocate what only gradients need, once."""
+        if hasattr(self, "velocity_bar"):
+            return
+        super().allocate_adjoint()
+        # Shares of the chunks in the poses' adjoints under terms of distances.
+        chunks = self.chunks if self.spreads else 1
+        self.pose_part = ti.Vector.field(8, ti.f64, shape=(self.batch, chunks, max(1, self.manipulators)))
 
     # -- shares -------------------------------------------------------------------------------------
 
@@ -194,16 +205,16 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
                 )
             self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded(grid_index * STAGE))
 
-    # -- losses of one chunk ------------------------------------------------------------------------
+    # -- terms of the loss, one chunk ---------------------------------------------------------------
 
     @ti.func
     def scatter_mass_chunk(self, state: ti.template(), slot, e, c, stamp):
-        """Spread mass, and find the particle nearest to each manipulator."""
+        """Spread mass, sum the particles' terms, and tally their distances from the manipulators."""
         grid_index = e * self.chunks + c
-        search = self.weighs(2)
-        for m in ti.static(range(self.manipulators)):
-            self.contact_part[e, c, m] = ti.select(search, 1e9, 0.0)
-            self.contact_particle[e, c, m] = 0
+        for k, _column, term in ti.static(self.distance_terms):
+            for m in range(self.manipulators):
+                self.tally_part[k, e, c, m] = term.start()
+        part = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
             for lane in range(self.lanes_of(tile)):
@@ -212,24 +223,28 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
                 block, crossing = self.block_of(base)
                 self.mark(grid_index, block * 8 + crossing, stamp)
                 self.scatter_mass(grid_index, base, fx)
-                if search:
-                    self.find_nearest(e, c, tile * self.lanes + lane, x)
+                if ti.static(len(self.particle_terms) > 0):
+                    part += self.particle_measures(e, x, self.vector(state, source + 3, lane))
+                self.tally_distances(e, c, tile * self.lanes + lane, x)
+        self.particle_part[e, c] = part
 
     @ti.func
-    def find_nearest(self, e, c, particle, x):
-        """Note a particle of a chunk where it is nearer to a manipulator than those before."""
-        for shape, start, stop in ti.static(self.runs):
-            if ti.static(self.moves(shape)):
-                for m in range(start, stop):
-                    d = self.end_distance(shape, e, m, x)
-                    if d < self.contact_part[e, c, m]:
-                        self.contact_part[e, c, m] = d
-                        self.contact_particle[e, c, m] = particle
+    def tally_distances(self, e, c, particle, x):
+        """Add a particle of a chunk to the tallies of its distances."""
+        if ti.static(len(self.distance_terms) > 0):
+            for shape, start, stop in ti.static(self.runs):
+                if ti.static(self.moves(shape)):
+                    for m in range(start, stop):
+                        d = self.end_distance(shape, e, m, x)
+                        for k, _column, term in ti.static(self.distance_terms):
+                            tally = self.tally_part[k, e, c, m]
+                            self.tally_part[k, e, c, m] = term.add(tally, d, particle)
 
     @ti.func
-    def grid_loss_chunk(self, e, c):
-        """Loss terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
-        part = ti.Vector.zero(ti.f64, 4)
+    def node_terms_chunk(self, e, c):
+        """Sum the terms of a share of the blocks; leaves mass and the loss's slope at the nodes."""
+        part = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
+        last = ti.static(len(self.node_terms))
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
             holders = self.block_chunks[e * self.blocks + block]
@@ -237,45 +252,45 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, LossPhases):
                 i = self.node_of_block(block, r)
                 node = self.linear(i)
                 mass = self.take(self.momentum, e, node, holders)[3]
-                density, sdf, slope, overlap = self.node_loss(e, i, mass)
-                part[0] += density
-                part[1] += sdf
-                part[2] += overlap
-                part[3] = ti.max(part[3], ti.cast(mass, ti.f64))
+                values, slope = self.node_measures(e, i, mass)
+                peak = ti.max(part[last], values[last])
+                part += values
+                part[last] = peak
                 self.velocity[e * self.nodes + node] = ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
-        self.loss_part[e, c] = part
+        self.node_part[e, c] = part
 
     @ti.func
-    def join_losses(self, e, terms: ti.template(), at):
-        """Join the chunks' parts into the measures; the nearest particles go to chunk 0's entries."""
-        part = ti.Vector.zero(ti.f64, 4)
-        for c in range(self.chunks):
-            share = self.loss_part[e, c]
-            peak = ti.max(part[3], share[3])
-            part += share
-            part[3] = peak
-            for m in ti.static(range(self.manipulators)):
-                if self.contact_part[e, c, m] < self.contact_part[e, 0, m]:
-                    self.contact_part[e, 0, m] = self.contact_part[e, c, m]
-                    self.contact_particle[e, 0, m] = self.contact_particle[e, c, m]
-        for m in ti.static(range(self.manipulators)):
-            if ti.static(self.motions[m] == "static"):
-                self.contact_part[e, 0, m] = 0.0
-        terms[at] = self.target_sum[e] + part[0]
-        terms[at + 1] = part[1]
-        terms[at + 2] = self.contact_term(e)
-        terms[at + 3] = part[2]
-        terms[at + 4] = part[3]
-        terms[at + 5] = ti.cast(self.fault[e], ti.f64)
-
-    @ti.func
-    def loss_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
-        """Add the gradient of the density and SDF terms to the particles' position adjoints."""
+    def particle_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
+        """Add the gradient of the terms of nodes and particles to the particles' adjoints."""
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(slot, e, tile)
             entry = self.tile_entry(0, e, tile)
             for lane in range(self.lanes_of(tile)):
-                base, fx = self.stencil(self.vector(state, source, lane))
-                slope = self.mass_slope(self.velocity, e, base, fx)
-                for i in ti.static(range(3)):
-                    bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
+                self.add_particle_gradient(state, source, bar, entry, lane, e)
+
+    @ti.func
+    def distance_gradient_chunk(self, state: ti.template(), slot, bar: ti.template(), e, c):
+        """Add the gradient of terms that look at all particles' distances to their adjoints, and to the
+        chunk's share in the poses'."""
+        for m in range(self.manipulators):
+            self.pose_part[e, c, m] = ti.Vector.zero(ti.f64, 8)
+        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
+            source = self.tile_entry(slot, e, tile)
+            entry = self.tile_entry(0, e, tile)
+            for lane in range(self.lanes_of(tile)):
+                x = self.vector(state, source, lane)
+                for shape, start, stop in ti.static(self.runs):
+                    if ti.static(self.acts(shape)):
+                        for m in range(start, stop):
+                            x_bar, pose_bar = self.spread_gradient(shape, e, m, tile * self.lanes + lane, x)
+                            # Plainly: += on a field is an atomic.
+                            self.pose_part[e, c, m] = self.pose_part[e, c, m] + pose_bar
+                            for i in ti.static(range(3)):
+                                bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
+
+    @ti.func
+    def join_pose_gradients(self, e):
+        """Add the chunks' shares to the poses' adjoints."""
+        for c in range(self.chunks):
+            for m in range(self.manipulators):
+                self.pose_bar[e, m] += self.pose_part[e, c, m]

@@ -14,10 +14,10 @@ import sys
 
 import taichi as ti
 
-from plab.sim.cuda_phases import NEAREST_GROUPS
+from plab.sim.cuda_phases import DISTANCE_GROUPS
 from plab.sim.cuda_threads import RESIDENT_BLOCK, ThreadPhases
 from plab.sim.cuda_warp import NODE_BITS, WARP, WARP_BLOCK
-from plab.sim.storage import MEASURES, STATE
+from plab.sim.storage import STATE
 
 __all__ = ["CudaEngine"]
 
@@ -92,7 +92,7 @@ class CudaEngine(ThreadPhases):
             self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp)
 
     def losses(self, state: ti.Ndarray, slot: int, terms: ti.Ndarray, at: int, stamp: int) -> None:
-        """Measures (:data:`MEASURES`) of all environments, written to ``terms`` from entry ``at``."""
+        """Measures of all environments, written to ``terms`` from entry ``at``."""
         self.losses_kernel(state, slot, terms, at, stamp)
 
     def step_adjoint(
@@ -229,26 +229,30 @@ class CudaEngine(ThreadPhases):
         """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
         self.block_count[0] = 0
         for e in range(self.batch):
-            self.loss_part[e, 0] = ti.Vector.zero(ti.f64, 4)
+            self.node_part[e, 0] = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
+            self.particle_part[e, 0] = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
         for q in range(self.particle_threads):
-            e, tile, _entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
+            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
             run, first, _rank, _total, doublings = self.run_of(node, node >= 0, q % WARP)
             if first:
                 self.mark_shared(e, base, stamp)
             self.scatter_mass_run(e, base, fx, run, first, doublings)
-            if node >= 0 and self.weighs(2):
-                self.note_distances(e, tile * self.lanes + lane, x)
+            particle = tile * self.lanes + lane
+            self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
-                self.loss_thread(w, w + turn * self.node_threads)
-        for q in range(self.pose_threads * NEAREST_GROUPS):
-            for m in ti.static(range(self.manipulators)):
-                if ti.static(self.motions[m] != "static"):
-                    if self.weighs(2) and q // NEAREST_GROUPS % max(1, self.manipulators) == m:
-                        self.scan_group(q // (NEAREST_GROUPS * self.manipulators), m, q % NEAREST_GROUPS)
+                self.node_terms_thread(w, w + turn * self.node_threads)
+        if ti.static(len(self.distance_terms) > 0):
+            for q in range(self.pose_threads * DISTANCE_GROUPS):
+                for m in ti.static(range(self.manipulators)):
+                    if ti.static(self.motions[m] != "static"):
+                        if q // DISTANCE_GROUPS % max(1, self.manipulators) == m:
+                            self.tally_group(
+                                q // (DISTANCE_GROUPS * self.manipulators), m, q % DISTANCE_GROUPS
+                            )
         for e in range(self.batch):
-            self.join_losses(e, terms, at + MEASURES * e)
+            self.join_measures(e, terms, at + ti.static(self.measures) * e)
 
     @ti.kernel
     def loss_gradient_kernel(
@@ -260,14 +264,14 @@ class CudaEngine(ThreadPhases):
             e, particle = self.particle_of(q)
             if particle < self.particles:
                 tile = particle // self.lanes
+                entry = self.tile_entry(slot, e, tile)
                 lane = particle % self.lanes
-                entry = self.tile_entry(0, e, tile)
-                base, fx = self.stencil(self.vector(state, self.tile_entry(slot, e, tile), lane))
-                slope = self.mass_slope(self.velocity, e, base, fx)
-                for i in ti.static(range(3)):
-                    bar[entry + i][lane] = bar[entry + i][lane] + slope[i]
+                self.add_particle_gradient(state, entry, bar, self.tile_entry(0, e, tile), lane, e)
+        if ti.static(self.spreads):
+            for q in range(self.particle_threads):
+                self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
-            self.contact_gradient(state, slot, bar, e)
+            self.nearest_gradient(state, slot, bar, e)
 
     @ti.kernel
     def substep_adjoint_kernel(
@@ -348,9 +352,8 @@ class CudaEngine(ThreadPhases):
             for turn in range(self.turns_of(w, self.active_nodes())):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 i = self.node_of_block(block, r)
-                index = self.tensor_index(e, i)
-                if index >= 0:
-                    out[index] = self.node4(self.velocity, e * self.nodes + self.linear(i))[0]
+                if self.in_tensor(i - 1):
+                    out[self.entry(e, i - 1)] = self.node4(self.velocity, e * self.nodes + self.linear(i))[0]
 
     @ti.kernel
     def copy_slot(

@@ -2,9 +2,12 @@
 
 Transfers keep their sums in registers, where the CPU's keep them in memory for LLVM to vectorise; poses are
 advanced by one thread per manipulator; frame adjoints are kept per substep, so that the poses' adjoints
-take one launch per environment step; the nearest particles are found without atomics, so ties never depend
-on timing.
+take one launch per environment step; distances are tallied without atomics, so that sums and ties never
+depend on timing.
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import taichi as ti
 
@@ -28,27 +31,24 @@ from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
 from plab.sim.transfer import spline, spline_slope
 
-__all__ = ["NEAREST_GROUPS", "CudaPhases"]
+__all__ = ["DISTANCE_GROUPS", "CudaPhases"]
 
-NEAREST_GROUPS = 128
-"""Threads per environment and manipulator in the search for the nearest particle."""
-
-FAR = 1e9
-"""Distance of the nearest particle before any was looked at."""
+DISTANCE_GROUPS = 128
+"""Threads per environment and manipulator that tally distances."""
 
 
 class CudaPhases(OrderPhases, PosePhases):
     """Phases that differ from the CPU's."""
 
-    def _allocate(self) -> None:
-        super()._allocate()
+    shares = DISTANCE_GROUPS
+
+    def attach(self, terms: Sequence[Any]) -> None:
+        """Take over the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
+        super().attach(terms)
         threads = self.batch * self.tiles * self.lanes
-        moving = any(self.moves(shape) for shape in self.shapes)
-        # Distances of all particles, written and scanned once per loss; static manipulators leave theirs out.
+        moving = self.distance_terms and any(self.moves(shape) for shape in self.shapes)
+        # Distances of all particles, written and tallied once per loss; static manipulators leave theirs out.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
-        groups = self.batch * max(1, self.manipulators) * NEAREST_GROUPS
-        self.group_distance = ti.field(self.real, shape=groups)
-        self.group_particle = ti.field(ti.i32, shape=groups)
 
     def allocate_adjoint(self) -> None:
         """Allocate what only gradients need, once."""
@@ -353,7 +353,7 @@ class CudaPhases(OrderPhases, PosePhases):
             self.frame_part[e * self.substeps + s, m, i] = 0.0
         self.end_share[e, s, m], self.start_share[e, s, m] = self.frame_shares(e, m, s, frame)
 
-    # -- losses -------------------------------------------------------------------------------------
+    # -- terms of the loss --------------------------------------------------------------------------
 
     @ti.func
     def note_distances(self, e, particle, x):
@@ -365,49 +365,12 @@ class CudaPhases(OrderPhases, PosePhases):
                     self.distance[at] = self.end_distance(shape, e, m, x)
 
     @ti.func
-    def scan_group(self, e, m, group):
-        """Nearest particle to a manipulator among every ``NEAREST_GROUPS``-th; of several the first."""
+    def tally_group(self, e, m, group):
+        """Tally the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
-        nearest = ti.cast(FAR, self.real)
-        chosen = 0
-        for r in range((self.particles - group + NEAREST_GROUPS - 1) // NEAREST_GROUPS):
-            particle = group + r * NEAREST_GROUPS
-            d = self.distance[first + particle]
-            if d < nearest:
-                nearest = d
-                chosen = particle
-        at = (e * self.manipulators + m) * NEAREST_GROUPS + group
-        self.group_distance[at] = nearest
-        self.group_particle[at] = chosen
-
-    @ti.func
-    def join_groups(self, e, m):
-        """Nearest particle to a manipulator; of several the first."""
-        first = (e * self.manipulators + m) * NEAREST_GROUPS
-        nearest = ti.cast(FAR, self.real)
-        chosen = 0
-        for group in range(NEAREST_GROUPS):
-            d = self.group_distance[first + group]
-            particle = self.group_particle[first + group]
-            if d < nearest or (d == nearest and particle < chosen):
-                nearest = d
-                chosen = particle
-        self.contact_part[e, 0, m] = nearest
-        self.contact_particle[e, 0, m] = chosen
-
-    @ti.func
-    def join_losses(self, e, terms: ti.template(), at):
-        """Measures of an environment, and its nearest particles."""
-        for m in ti.static(range(self.manipulators)):
-            if ti.static(self.motions[m] == "static"):
-                self.contact_part[e, 0, m] = 0.0
-            elif self.weighs(2):
-                self.join_groups(e, m)
-            else:
-                self.contact_part[e, 0, m] = 0.0
-        terms[at] = self.target_sum[e] + self.loss_part[e, 0][0]
-        terms[at + 1] = self.loss_part[e, 0][1]
-        terms[at + 2] = self.contact_term(e)
-        terms[at + 3] = self.loss_part[e, 0][2]
-        terms[at + 4] = self.loss_part[e, 0][3]
-        terms[at + 5] = ti.cast(self.fault[e], ti.f64)
+        for k, _column, term in ti.static(self.distance_terms):
+            tally = term.start()
+            for r in range((self.particles - group + DISTANCE_GROUPS - 1) // DISTANCE_GROUPS):
+                particle = group + r * DISTANCE_GROUPS
+                tally = term.add(tally, self.distance[first + particle], particle)
+            self.tally_part[k, e, group, m] = tally

@@ -151,27 +151,62 @@ class ThreadPhases(CudaPhases):
             self.material_particle_adjoint(state, source, bar, entry, a_bar, lane, e)
 
     @ti.func
-    def loss_thread(self, w, q):
-        """Loss terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
+    def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):
+        """Terms and distances of a particle of a thread's tile; all lanes of a warp take part."""
+        if ti.static(len(self.particle_terms) > 0):
+            values = self.particle_measures(e, x, self.vector(state, entry + 3, lane))
+            for k in ti.static(range(len(self.particle_terms))):
+                share = ti.select(counts, values[k], 0.0)
+                # All lanes of a warp have particles of the same environment.
+                total = self.sum_of_warp(share)
+                if w % WARP == 0:
+                    ti.atomic_add(self.particle_part[e, 0][k], total)
+        if ti.static(len(self.distance_terms) > 0):
+            if counts:
+                self.note_distances(e, particle, x)
+
+    @ti.func
+    def node_terms_thread(self, w, q):
+        """Terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
         stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         mass = self.take_nodes(self.momentum, stage, w, e, block, r)[3]
-        density, sdf, slope, overlap = self.node_loss(e, self.node_of_block(block, r), mass)
+        part, slope = self.node_measures(e, self.node_of_block(block, r), mass)
         self.put_nodes(self.velocity, stage, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
-        part = ti.Vector(
-            [ti.cast(density, ti.f64), ti.cast(sdf, ti.f64), ti.cast(overlap, ti.f64), ti.cast(mass, ti.f64)]
-        )
+        last = ti.static(len(self.node_terms))
         # All lanes of a warp have nodes of the same environment.
         for k in ti.static(range(RUN_BITS)):
-            for c in ti.static(range(3)):
-                part[c] += self.wide_from_above(part[c], 1 << k)
-            part[3] = ti.max(part[3], self.wide_from_above(part[3], 1 << k))
+            part[last] = ti.max(part[last], self.wide_from_above(part[last], 1 << k))
+        for c in ti.static(range(len(self.node_terms))):
+            part[c] = self.sum_of_warp(part[c])
         if w % WARP == 0:
-            for c in ti.static(range(3)):
-                ti.atomic_add(self.loss_part[e, 0][c], part[c])
+            for c in ti.static(range(len(self.node_terms))):
+                ti.atomic_add(self.node_part[e, 0][c], part[c])
             # Most are below a peak seen already.
-            if part[3] > self.loss_part[e, 0][3]:
-                ti.atomic_max(self.loss_part[e, 0][3], part[3])
+            if part[last] > self.node_part[e, 0][last]:
+                ti.atomic_max(self.node_part[e, 0][last], part[last])
+
+    @ti.func
+    def distance_gradient_thread(self, state: ti.template(), slot, bar: ti.template(), q):
+        """Add the gradient of terms that look at all particles' distances to the adjoint of thread q's
+        particle, and to the poses'; all lanes of a warp take part."""
+        e, particle = self.particle_of(q)
+        tile = particle // self.lanes
+        lane = particle % self.lanes
+        x = self.vector(state, self.tile_entry(slot, e, tile), lane)
+        entry = self.tile_entry(0, e, tile)
+        for shape, start, stop in ti.static(self.runs):
+            if ti.static(self.acts(shape)):
+                for m in range(start, stop):
+                    x_bar, pose_bar = self.spread_gradient(shape, e, m, particle, x)
+                    counts = particle < self.particles
+                    if counts:
+                        for i in ti.static(range(3)):
+                            bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
+                    for i in ti.static(range(8)):
+                        total = self.sum_of_warp(ti.select(counts, pose_bar[i], 0.0))
+                        if q % WARP == 0:
+                            ti.atomic_add(self.pose_bar[e, m][i], total)
 
     @ti.func
     def gather_thread(self, state: ti.template(), before, after, q, time):

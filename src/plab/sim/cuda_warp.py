@@ -9,9 +9,9 @@ belongs together meets in shared memory.
 import taichi as ti
 
 from plab.sim.grid_phases import GridPhases
-from plab.sim.loss_phases import LossPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import BLOCK_BITS
+from plab.sim.term_phases import TermPhases
 from plab.sim.transfer import spline
 
 __all__ = [
@@ -54,7 +54,7 @@ def packed(a, b):
     return low | (ti.cast(ti.bit_cast(b, ti.i32), ti.i64) << 32)
 
 
-class WarpPhases(LossPhases, GridPhases, ParticlePhases):
+class WarpPhases(TermPhases, GridPhases, ParticlePhases):
     """Scatter by runs, and access to the grid by warps.
 
     Grids that particles gather from (velocity and the momentum's adjoint) hold float32 in pairs, each read at
@@ -189,6 +189,14 @@ class WarpPhases(LossPhases, GridPhases, ParticlePhases):
         high = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), ti.cast(bits >> 32, ti.i32), offset)
         joined = (ti.cast(high, ti.i64) << 32) | ti.cast(ti.cast(low, ti.u32), ti.i64)
         return ti.bit_cast(joined, ti.f64)
+
+    @ti.func
+    def sum_of_warp(self, value):
+        """Sum of the lanes' float64 values, in the warp's first lane."""
+        out = value
+        for k in ti.static(range(RUN_BITS)):
+            out += self.wide_from_above(out, 1 << k)
+        return out
 
     @ti.func
     def from_lane_above(self, value, offset):

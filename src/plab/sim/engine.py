@@ -9,7 +9,7 @@ is one launch over all environments.
 import taichi as ti
 
 from plab.sim.cpu_phases import BLOCK_NODES, CpuPhases
-from plab.sim.storage import MEASURES, STATE
+from plab.sim.storage import STATE
 from plab.sim.teams import TeamChoice
 
 __all__ = ["CpuEngine"]
@@ -70,7 +70,7 @@ class CpuEngine(CpuPhases):
         few grid nodes."""
         return rank * self.chunks // size
 
-    # -- losses of one environment ------------------------------------------------------------------
+    # -- terms of the loss, one environment ---------------------------------------------------------
 
     @ti.func
     def losses_of_team(
@@ -84,10 +84,28 @@ class CpuEngine(CpuPhases):
             self.collect_blocks(e, stamp)
         self.barrier(team, size)
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-            self.grid_loss_chunk(e, c)
+            self.node_terms_chunk(e, c)
         self.barrier(team, size)
         if rank == 0:
-            self.join_losses(e, terms, at)
+            self.join_measures(e, terms, at)
+        self.barrier(team, size)
+
+    @ti.func
+    def loss_gradient_of_team(
+        self, state: ti.template(), slot, bar: ti.template(), e, team, rank, size, contact
+    ):
+        """Add the gradient of one environment's loss to the adjoints of its particles and poses; to those of
+        the poses alone without ``contact``."""
+        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
+            if contact:
+                self.particle_gradient_chunk(state, slot, bar, e, c)
+            if ti.static(self.spreads):
+                self.distance_gradient_chunk(state, slot, bar, e, c)
+        self.barrier(team, size)
+        if rank == 0:
+            self.nearest_gradient(state, slot, bar, e)
+            if ti.static(self.spreads):
+                self.join_pose_gradients(e)
         self.barrier(team, size)
 
     # -- kernels ------------------------------------------------------------------------------------
@@ -143,7 +161,7 @@ class CpuEngine(CpuPhases):
         at: ti.i32,
         stamp: ti.i32,
     ):
-        """Measures (:data:`MEASURES`) of all environments, written to ``terms`` from entry ``at``."""
+        """Measures of all environments, written to ``terms`` from entry ``at``."""
         teams = ti.min(self.batch, self.threads // size)
         for team in range(self.threads):
             self.arrivals[team * PADDING] = 0
@@ -153,7 +171,8 @@ class CpuEngine(CpuPhases):
                 rank = q // SPLIT % size
                 for turn in range((self.batch - team + teams - 1) // teams):
                     e = team + turn * teams
-                    self.losses_of_team(state, slot, e, team, rank, size, stamp, terms, at + MEASURES * e)
+                    entry = at + ti.static(self.measures) * e
+                    self.losses_of_team(state, slot, e, team, rank, size, stamp, terms, entry)
 
     @ti.kernel
     def step_adjoint_kernel(
@@ -191,14 +210,9 @@ class CpuEngine(CpuPhases):
                     if rank == 0:
                         self.advance_manipulators(e, actions, poses, t, t, t + 1)
                     self.barrier(team, size)
-                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, at + MEASURES * e)
-                    if contact:
-                        for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                            self.loss_gradient_chunk(state, end, bar, e, c)
-                    self.barrier(team, size)
-                    if rank == 0:
-                        self.contact_gradient(state, end, bar, e)
-                    self.barrier(team, size)
+                    entry = at + ti.static(self.measures) * e
+                    self.losses_of_team(state, end, e, team, rank, size, stamp, terms, entry)
+                    self.loss_gradient_of_team(state, end, bar, e, team, rank, size, contact)
                     for back in range(self.substeps):
                         s = self.substeps - 1 - back
                         now = stamp + 1 + back
@@ -220,6 +234,15 @@ class CpuEngine(CpuPhases):
                             self.barrier(team, size)
 
     @ti.kernel
+    def loss_gradient_kernel(
+        self, state: ti.types.ndarray(ndim=1), slot: ti.i32, bar: ti.types.ndarray(ndim=1)
+    ):
+        """Add the gradient of the losses just computed to the adjoints of particles and poses."""
+        self.arrivals[0] = 0
+        for e in range(self.batch):
+            self.loss_gradient_of_team(state, slot, bar, e, 0, 0, 1, 1)
+
+    @ti.kernel
     def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):
         """Place all manipulators at slot ``slot`` of the pose history."""
         for e in range(self.batch):
@@ -232,9 +255,8 @@ class CpuEngine(CpuPhases):
             for entry in range(e * self.blocks, e * self.blocks + self.block_count[e]):
                 for r in range(BLOCK_NODES):
                     i = self.node_of_block(self.block_list[entry], r)
-                    index = self.tensor_index(e, i)
-                    if index >= 0:
-                        out[index] = self.velocity[e * self.nodes + self.linear(i)][0]
+                    if self.in_tensor(i - 1):
+                        out[self.entry(e, i - 1)] = self.velocity[e * self.nodes + self.linear(i)][0]
 
     @ti.kernel
     def copy_slot(

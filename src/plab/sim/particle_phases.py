@@ -84,17 +84,19 @@ class ParticlePhases(Storage):
     def observe(
         self,
         state: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
         order: ti.types.ndarray(ndim=1),
         stride: ti.i32,
         out: ti.types.ndarray(ndim=1),
     ):
-        """Write position and velocity of every ``stride``-th particle, as ``order`` numbers them."""
+        """Write position and velocity of every ``stride``-th particle of a time slot, as ``order`` numbers
+        them."""
         for q in range(self.batch * self.tiles * self.lanes):
             e = q // (self.tiles * self.lanes)
             place = q - e * (self.tiles * self.lanes)
             number = order[q]
             if place < self.particles and number % stride == 0:
-                entry = self.tile_entry(0, e, place // self.lanes)
+                entry = self.tile_entry(slot, e, place // self.lanes)
                 row = e * ((self.particles + stride - 1) // stride) + number // stride
                 for i in ti.static(range(6)):
                     out[row * 6 + i] = state[entry + i][place % self.lanes]

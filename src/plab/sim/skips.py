@@ -24,7 +24,6 @@ class Skips:
         flow: Plastic flow of particles that do not yield; on the CPU of tiles in which none does.
         friction: Friction of manipulators or floor that have none in any environment.
         history: Keeping all states where no gradient is asked for.
-        zero_weights: The SDF and contact terms of the loss where their weight is 0.
         still_manipulators: Distances from, and adjoints of, manipulators that cannot move.
         adjoints: Particles' adjoints in the environment steps before a moving manipulator touches the body of
             any environment: they do not reach an action.
@@ -41,7 +40,6 @@ class Skips:
     flow: bool = True
     friction: bool = True
     history: bool = True
-    zero_weights: bool = True
     still_manipulators: bool = True
     adjoints: bool = True
     launches: bool = True

@@ -37,10 +37,10 @@ class Measures:
     """What a state is judged by; arrays, or CUDA tensors where the caller asked for them.
 
     Attributes:
-        terms: Unweighted loss terms (density, SDF, contact), shape [batch, 3]; SDF and contact are 0 where
-            their weight is.
+        terms: Unweighted loss terms, in the order of :attr:`Simulator.terms`, shape [batch, term].
         iou: Soft IoU of the mass tensor and the target, as :func:`plab.objective.soft_iou`, shape [batch];
-            NaN before :meth:`Simulator.set_target`.
+            NaN before :meth:`Simulator.set_target`, and where the overlap with the target is not among the
+            terms.
     """
 
     terms: Any
@@ -52,8 +52,9 @@ class Rollout:
     """What a rollout of T environment steps gives.
 
     Attributes:
-        initial_terms: Unweighted loss terms (density, SDF, contact) of the initial state, shape [batch, 3].
-        step_terms: The same after each environment step, shape [batch, T, 3].
+        initial_terms: Unweighted loss terms of the initial state, in the order of :attr:`Simulator.terms`,
+            shape [batch, term].
+        step_terms: The same after each environment step, shape [batch, T, term].
         initial_iou: Soft IoU of the initial mass tensor and the target, shape [batch].
         step_iou: The same after each environment step, shape [batch, T].
         gradient: Gradient of the weighted trajectory loss (sum over steps) with respect to the actions, shape

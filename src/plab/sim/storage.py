@@ -33,7 +33,6 @@ __all__ = [
     "CHUNKS",
     "FRAME_ADJOINT",
     "INDEX_MASK",
-    "MEASURES",
     "PLACES",
     "SPREAD",
     "STAGE",
@@ -45,10 +44,6 @@ __all__ = [
 
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9)."""
-
-MEASURES = 6
-"""Entries per environment of what a state is judged by: density, SDF and contact term, overlap, peak, and the
-fault: the number of the substep in which the state broke, from 1 on, or 0."""
 
 BLOCK_BITS = 2
 BLOCK = 1 << BLOCK_BITS
@@ -195,7 +190,6 @@ class Storage:
         self.minimal_gap = ti.field(ti.f64, shape=(b, m))
         # Decay rate of the soft contact model; 0 is the hard one.
         self.alpha = ti.field(real, shape=b)
-        self.loss_weights = ti.Vector.field(3, real, shape=())
         # Poses of one environment step, and what contact needs of them.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
         self.frame_centre = ti.Vector.field(3, real, shape=(b, self.substeps, m))
@@ -213,13 +207,6 @@ class Storage:
         self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
         self._allocate_blocks(grids)
-        self.target = ti.field(real, shape=b * self.n**3)
-        self.target_sdf = ti.field(real, shape=b * self.n**3)
-        self.target_sum = ti.field(ti.f64, shape=b)
-        # Density, SDF, overlap (sum of mass times target mass) and peak (largest mass).
-        self.loss_part = ti.Vector.field(4, ti.f64, shape=(b, self.chunks))
-        self.contact_part = ti.field(real, shape=(b, self.chunks, m))
-        self.contact_particle = ti.field(ti.i32, shape=(b, self.chunks, m))
         self.once = ti.field(ti.i32, shape=())
         self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
@@ -267,7 +254,7 @@ class Storage:
         self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
-        """Write everything in which environments may differ, targets excepted."""
+        """Write everything in which environments may differ, terms of the loss excepted."""
         numpy_real = np.float32 if self.real == ti.f32 else np.float64
         self.fill_material(scenes)
         if self.manipulators == 0:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import taichi as ti
 
 from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
-from plab.sim.storage import MEASURES
 
 __all__ = ["Tape"]
 
@@ -76,7 +76,8 @@ class Tape:
         slot_bytes, slots_per_step = self._particles.slot_bytes, self._slots_per_step
         self._engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
-        fixed = held_bytes(self._engine, self._particles, self._particles.order) + slot_bytes
+        engine = self._engine
+        fixed = held_bytes(engine, *engine.terms, self._particles, self._particles.order) + slot_bytes
         if self._engine.sorts:
             # The orders of all steps, and the adjoint's other half.
             fixed += 4 * steps * self._particles.order.places + slot_bytes
@@ -132,6 +133,7 @@ class Tape:
         terms: ti.Ndarray | None,
         steps: int,
         length: int | None,
+        after: Callable[[int, ti.Ndarray, int], None] | None = None,
     ) -> None:
         """Run all steps from the current state and leave the last one there.
 
@@ -142,6 +144,8 @@ class Tape:
                 :meth:`backward`, which computes them anyway, is to do that.
             steps: Environment steps T.
             length: What :meth:`plan` has returned, or None to keep nothing.
+            after: Called after each step with its number, and array and time slot of the state that it has
+                led to.
         """
         particles = self._particles
         self._length = length or steps
@@ -153,19 +157,20 @@ class Tape:
             k, begins = t // self._length, t % self._length == 0
             if begins and length is not None and steps > length:
                 self._engine.copy_slot(particles.current, 0, self._checkpoints, k)
-            after = self._entry(t)
             if k == last:
                 if begins:
                     self._engine.copy_slot(particles.current, 0, self._history[0], 0)
                 self._keep_step(t, actions, poses, known=False)
-                if terms is not None:
-                    history, slot = self._place(t)
-                    particles.losses(terms, after, history, slot + self._engine.substeps)
+                history, slot = self._place(t)
+                state, slot = history, slot + self._engine.substeps
             else:
                 moves = self._moves if length is not None else None
                 particles.step(poses, actions, t, entries=(t, t + 1), moves=moves)
-                if terms is not None:
-                    particles.losses(terms, after)
+                state, slot = particles.current, 0
+            if terms is not None:
+                particles.losses(terms, self._entry(t), state, slot)
+            if after is not None:
+                after(t, state, slot)
         if length is not None:
             history, slot = self._place(steps - 1)
             self._engine.copy_slot(history, slot + self._engine.substeps, particles.current, 0)
@@ -187,10 +192,16 @@ class Tape:
 
     def _entry(self, t: int) -> int:
         """First entry of the measures after step t."""
-        return (t + 1) * self._engine.batch * MEASURES
+        return (t + 1) * self._engine.batch * self._engine.measures
 
     def backward(
-        self, actions: ti.Ndarray, poses: ti.Ndarray, terms: ti.Ndarray, steps: int, contact_free: int
+        self,
+        actions: ti.Ndarray,
+        poses: ti.Ndarray,
+        terms: ti.Ndarray,
+        steps: int,
+        contact_free: int,
+        add: Callable[[int, ti.Ndarray, int, ti.Ndarray], None] | None = None,
     ) -> ti.Ndarray:
         """Go back through the steps that :meth:`forward` has run with a length.
 
@@ -200,6 +211,8 @@ class Tape:
             terms: Measures after each step are written to it, from the second entry.
             steps: Environment steps T.
             contact_free: Steps at the start through which particles' adjoints need not be followed.
+            add: Called before each step with its number, array and time slot of the state that it has led to,
+                and that state's adjoint, to which it may add.
 
         Returns:
             Adjoint of the actions, laid out like these.
@@ -216,6 +229,8 @@ class Tape:
             if k < last and (t + 1) % self._length == 0:
                 self._recompute(k, actions, poses)
             history, slot = self._place(t)
+            if add is not None:
+                add(t, history, slot + engine.substeps, self.bar)
             engine.step_adjoint(
                 history,
                 self.bar,

@@ -47,7 +47,8 @@ def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
 def _kind(cfg: Config, scene: Scene) -> list[Any]:
     """Return what has to be the same in runs that come one after the other or, in one batch, together."""
     method = asdict(cfg.method)
-    kind = [cfg.task.name, cfg.method.family, asdict(cfg.sim), asdict(cfg.targets), method["loss_weights"]]
+    loss = [method["loss_weights"], method["loss_terms"]]
+    kind = [cfg.task.name, cfg.method.family, asdict(cfg.sim), asdict(cfg.targets), loss]
     if cfg.method.family not in BATCHING:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other.

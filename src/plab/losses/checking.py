@@ -1,0 +1,100 @@
+"""Whether a term's gradient is that of its measure, by central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from plab.losses.term import Term
+from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.sim import Simulator, State
+
+__all__ = ["check_gradient"]
+
+STEP = 1e-6
+"""Half the way of a central difference, along directions of unit variance."""
+
+DISTURBANCE = 0.02
+"""Standard deviation of how far manipulators are moved from where the scene has them [domain units]."""
+
+
+def check_gradient(
+    term: Term, scenes: Sequence[Scene], *, device: str = "cpu", directions: int = 4, seed: int = 0
+) -> dict[str, float]:
+    """Compare a term's gradient with central differences of its measure, in float64 at a disturbed state.
+
+    The targets are random, particles move, manipulators are moved and turned. Where a term has a kink, such
+    as where mass and target mass are equal, a difference across it is no derivative; random states are not
+    close to any.
+
+    Args:
+        term: A new term, of any kind of :mod:`plab.losses.term`.
+        scenes: Scenes as for :class:`plab.sim.Simulator`; small ones do.
+        device: ``cpu`` or ``cuda``.
+        directions: Random directions per part of the state.
+        seed: Seed of all that is random.
+
+    Returns:
+        Largest error by part of the state: positions ``x``, velocities ``v`` and ``poses``, of these what can
+        change in a simulation. Relative to the largest derivative along a direction; 0 where the term does
+        not depend on the part.
+
+    Raises:
+        ValueError: If the measure does not depend on the state at all: there is nothing to check.
+    """
+    term.weight = term.weight or 1.0
+    rng = np.random.default_rng(seed)
+    simulator = Simulator(scenes, terms=(term,), precision="float64", device=device)
+    shape = (simulator.batch, *[simulator.grid_size] * 3)
+    simulator.set_target(scenes[0].particle_mass * rng.random(shape), rng.random(shape))
+    start = _disturbed(simulator, rng)
+    simulator.set_state(start)
+    gradient = simulator.loss_gradient()
+    slopes: dict[str, list[tuple[float, float]]] = {}
+    for part in ("x", "v", "poses"):
+        for _ in range(directions):
+            way = rng.normal(size=getattr(start, part).shape)
+            if part == "poses":
+                way *= _free(scenes[0])
+            ends = [_loss(simulator, start, part, sign * STEP * way) for sign in (1, -1)]
+            pair = (ends[0] - ends[1]) / (2 * STEP), float((getattr(gradient, part) * way).sum())
+            slopes.setdefault(part, []).append(pair)
+    largest = max(abs(slope) for pairs in slopes.values() for pair in pairs for slope in pair)
+    if largest == 0.0:
+        raise ValueError(
+            f"{type(term).__name__} does not change with the state: there is no gradient to check"
+        )
+    errors = {}
+    for part, pairs in slopes.items():
+        scale = max(abs(slope) for pair in pairs for slope in pair)
+        errors[part] = max(abs(a - b) for a, b in pairs) / scale if scale else 0.0
+    return errors
+
+
+def _free(scene: Scene) -> np.ndarray:
+    """Which of the manipulators' 8 numbers each can change, 1 or 0, shape [manipulator, 8]."""
+    motions = [MANIPULATOR_SHAPES[m.shape].motion for m in scene.manipulators]
+    rows = [
+        [motion != "static"] * 3 + [motion in ("roll", "grip", "rigid")] * 4 + [motion == "grip"]
+        for motion in motions
+    ]
+    return np.array(rows, float)
+
+
+def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:
+    """The start, with particles that move, and manipulators moved and turned."""
+    rest = simulator.state()
+    poses = rest.poses.copy()
+    poses[..., :3] += rng.normal(scale=DISTURBANCE, size=poses[..., :3].shape)
+    poses[..., 3:7] += rng.normal(scale=0.1, size=poses[..., 3:7].shape)
+    poses[..., 3:7] /= np.linalg.norm(poses[..., 3:7], axis=-1, keepdims=True)
+    return replace(rest, v=rng.normal(size=rest.v.shape), poses=poses)
+
+
+def _loss(simulator: Simulator, start: State, part: str, shift: np.ndarray) -> float:
+    """Weighted loss of all environments with one part of the state shifted."""
+    simulator.set_state(replace(start, **{part: getattr(start, part) + shift}))
+    weights = [term.weight for term in simulator.terms]
+    return float((simulator.losses() @ weights).sum())

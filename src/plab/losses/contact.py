@@ -1,0 +1,116 @@
+"""How far the moving manipulators are from the body: three terms of the distances d_p of all particles p.
+
+* ``nearest``: ``D^2``, D the distance of the nearest particle, and its gradient.
+* ``all``: the same measure; as gradient ``2 D sum grad d_p`` over all particles outside. No function has it.
+* ``soft``: ``D^2``, D the mean of the d_p with weights ``1 / (1 + 1e4 d_p^2)``, and its gradient.
+
+Distances are 0 inside a manipulator. Each term is summed over the moving manipulators.
+"""
+
+import taichi as ti
+
+from plab.losses.term import DistanceTerm
+
+__all__ = ["AllContact", "NearestContact", "SoftContact"]
+
+FAR = 1e9
+"""Distance of the nearest particle before any was looked at [domain units]."""
+
+SHARPNESS = 1e4
+"""How fast the soft minimum's weights fall with the distance [1 / domain units^2], as in the PlasticineLab
+release."""
+
+
+class NearestContact(DistanceTerm):
+    """Squared distance to the nearest particle; of several at the same distance the first."""
+
+    name = "contact"
+    label = "squared distances of the moving manipulators to the nearest particle"
+    unit = "domain units^2"
+    nearest_only = True
+
+    @ti.func
+    def start(self):
+        """Far away, and no particle."""
+        return ti.Vector([FAR, 0.0], ti.f64)
+
+    @ti.func
+    def add(self, tally, d, particle):
+        """The nearer one."""
+        out = tally
+        if ti.cast(d, ti.f64) < tally[0]:
+            out = ti.Vector([ti.cast(d, ti.f64), ti.cast(particle, ti.f64)])
+        return out
+
+    @ti.func
+    def join(self, tally, other):
+        """The nearer one."""
+        out = tally
+        if other[0] < tally[0] or (other[0] == tally[0] and other[1] < tally[1]):
+            out = other
+        return out
+
+    @ti.func
+    def measure(self, tally):
+        """D^2."""
+        nearest = ti.max(tally[0], 0.0)
+        return nearest * nearest
+
+    @ti.func
+    def slope(self, tally, d, particle):
+        """2 D for the nearest particle, 0 for the others."""
+        out = 0.0 * tally[0]
+        if ti.cast(particle, ti.f64) == tally[1]:
+            out = 2.0 * ti.max(tally[0], 0.0)
+        return out
+
+
+class AllContact(NearestContact):
+    """The nearest distance, with the adjoint of the nearest particle given to every particle outside.
+
+    The PlasticineLab release differentiates an atomic minimum as if it were an addition, which does this. It
+    guides a manipulator towards the whole body, ten thousand times as strongly as the gradient would.
+    """
+
+    label = f"{NearestContact.label}; gradient summed over all particles"
+    nearest_only = False
+
+    @ti.func
+    def slope(self, tally, d, particle):
+        """2 D for all particles outside."""
+        out = 0.0 * tally[0]
+        if d > 0.0:
+            out = 2.0 * ti.max(tally[0], 0.0)
+        return out
+
+
+class SoftContact(DistanceTerm):
+    """Square of a weighted mean of the distances, in which near particles count most."""
+
+    name = "contact"
+    label = "squared soft minima of the moving manipulators' distances to the particles"
+    unit = "domain units^2"
+
+    @ti.func
+    def add(self, tally, d, particle):
+        """Sums of the weights, and of the weights times the distances."""
+        outside = ti.max(ti.cast(d, ti.f64), 0.0)
+        w = 1.0 / (1.0 + SHARPNESS * outside * outside)
+        return tally + ti.Vector([w, w * outside])
+
+    @ti.func
+    def measure(self, tally):
+        """D^2."""
+        mean = tally[1] / tally[0]
+        return mean * mean
+
+    @ti.func
+    def slope(self, tally, d, particle):
+        """2 D dD/dd, with dD/dd = (w + w' (d - D)) / sum w."""
+        out = 0.0 * tally[0]
+        if d > 0.0:
+            outside = ti.cast(d, ti.f64)
+            mean = tally[1] / tally[0]
+            w = 1.0 / (1.0 + SHARPNESS * outside * outside)
+            out = 2.0 * mean * (w - 2.0 * SHARPNESS * outside * w * w * (outside - mean)) / tally[0]
+        return out

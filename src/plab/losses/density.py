@@ -1,0 +1,48 @@
+"""How much mass is where the target has none, and the reverse: ``sum |S - S*|``."""
+
+import numpy as np
+import taichi as ti
+
+from plab.losses.term import NodeTerm
+
+__all__ = ["Density"]
+
+
+class Density(NodeTerm):
+    """Sum over the grid of the distance between mass S and target mass S*, as in the paper."""
+
+    name = "density"
+    label = "sum over the grid of |mass - target mass|"
+    unit = "mass"
+
+    def attach(self, sim) -> None:
+        """Share the target's mass tensor, and keep its sum."""
+        super().attach(sim)
+        self.target = sim.reference("mass")
+        self.total = ti.field(ti.f64, shape=sim.batch)
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Sum the targets' masses: what empty environments miss."""
+        self.total.from_numpy(mass.sum(axis=(1, 2, 3)))
+
+    @ti.func
+    def empty(self, e):
+        """The target's mass."""
+        return self.total[e]
+
+    @ti.func
+    def measure(self, e, node, mass):
+        """|S - S*| - S*."""
+        target = self.target[self.sim.entry(e, node)]
+        return ti.abs(mass - target) - target
+
+    @ti.func
+    def slope(self, e, node, mass):
+        """Sign of S - S*; 0 where they are equal."""
+        difference = mass - self.target[self.sim.entry(e, node)]
+        sign = 0.0 * mass
+        if difference > 0.0:
+            sign = 1.0
+        elif difference < 0.0:
+            sign = -1.0
+        return sign

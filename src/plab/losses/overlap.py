@@ -1,0 +1,48 @@
+"""How well mass and target overlap: what scores are made of. Measured, but no part of the loss."""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from plab.losses.term import NodeTerm
+from plab.sim.tensors import Constants
+
+__all__ = ["Overlap"]
+
+
+class Overlap(NodeTerm):
+    """Sum over the grid of mass times target mass, and from it the soft IoU."""
+
+    name = "overlap"
+    label = "sum over the grid of mass times target mass"
+    unit = "mass^2"
+    weighted = False
+
+    def attach(self, sim) -> None:
+        """Share the target's mass tensor; without a target there is no IoU, it is NaN."""
+        super().attach(sim)
+        self.target = sim.reference("mass")
+        self._scale = Constants(np.full((2, sim.batch), np.nan))
+        self._total = sim.mass * sim.particles
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Keep the sums and the peaks of the targets."""
+        self._scale = Constants([mass.sum(axis=(1, 2, 3)), mass.max(axis=(1, 2, 3))])
+
+    @ti.func
+    def measure(self, e, node, mass):
+        """S S*."""
+        return self.target[self.sim.entry(e, node)] * mass
+
+    def iou(self, overlap: Any, peak: Any) -> Any:
+        """Return soft IoUs with the targets, as :func:`plab.objective.soft_iou` defines them.
+
+        Args:
+            overlap: This term's measure, shape [..., batch]; an array or a CUDA tensor.
+            peak: Largest mass of a node, likewise.
+        """
+        target_sum, target_peak = self._scale.like(overlap)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            both = overlap / (peak * target_peak)
+            return both / (self._total / peak + target_sum / target_peak - both)

@@ -1,0 +1,30 @@
+"""How far mass is from the target: ``sum sdf* S``."""
+
+import taichi as ti
+
+from plab.losses.term import NodeTerm
+
+__all__ = ["Sdf"]
+
+
+class Sdf(NodeTerm):
+    """Sum over the grid of mass times distance to the target, as in the paper."""
+
+    name = "sdf"
+    label = "sum over the grid of mass times distance to the target"
+    unit = "mass x domain units"
+
+    def attach(self, sim) -> None:
+        """Share the distances to the target."""
+        super().attach(sim)
+        self.target_sdf = sim.reference("sdf")
+
+    @ti.func
+    def measure(self, e, node, mass):
+        """sdf* S."""
+        return self.target_sdf[self.sim.entry(e, node)] * mass
+
+    @ti.func
+    def slope(self, e, node, mass):
+        """sdf*."""
+        return self.target_sdf[self.sim.entry(e, node)]

@@ -1,0 +1,128 @@
+"""What a term of the loss is: three kinds, by what they are a function of.
+
+A term is a class with a few functions that Taichi compiles into the simulator's kernels, for the CPU and for
+CUDA alike. It knows a state, not how the simulator works: where the mass tensor's nodes are, where particles
+are and how fast, how far they are from manipulators. The simulator does the sums, forward and back.
+"""
+
+import numpy as np
+import taichi as ti
+
+__all__ = ["DistanceTerm", "NodeTerm", "ParticleTerm", "Term"]
+
+
+class Term:
+    """A term of the loss; the kinds below say which functions it has.
+
+    Attributes:
+        name: Name of its weight; ``loss_<name>`` is its column in results and its entry in ``info``.
+        label: What it measures, for reports.
+        unit: Unit of the measure, for reports.
+        weight: Weight in the loss; with 0 the term is not compiled.
+        weighted: Whether it is part of the loss; if not, it is measured only, and has no gradient.
+        sim: The simulator's kernels, after :meth:`attach`: numbers such as ``batch``, ``particles``, ``n``,
+            ``dx``, ``mass`` (of a particle) and ``real``, Taichi's type of the simulation's numbers.
+    """
+
+    name: str = ""
+    label: str = ""
+    unit: str = ""
+    weight: float = 0.0
+    weighted: bool = True
+
+    def attach(self, sim) -> None:
+        """Become part of a simulator: the place to allocate fields. Called once."""
+        self.sim = sim
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Take note of the targets.
+
+        Args:
+            mass: Target mass tensors as the simulation holds them, shape [batch, n, n, n], float64.
+            sdf: Distance of each node to the target [domain units], same shape.
+        """
+
+
+class NodeTerm(Term):
+    """A sum over the nodes of the mass tensor, of a function of each node's mass."""
+
+    @ti.func
+    def empty(self, e):
+        """Value for an environment without any mass, float64."""
+        return ti.cast(0.0, ti.f64)
+
+    @ti.func
+    def measure(self, e, node, mass):
+        """What a node adds to the value of an empty one.
+
+        Args:
+            e: Environment.
+            node: Index of the node along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry
+                in fields of n^3 numbers per environment.
+            mass: Its mass, positive.
+        """
+        return 0.0 * mass
+
+    @ti.func
+    def slope(self, e, node, mass):
+        """Derivative of :meth:`measure` by the mass."""
+        return 0.0 * mass
+
+
+class ParticleTerm(Term):
+    """A sum over the particles, of a function of each one's position and velocity."""
+
+    @ti.func
+    def measure(self, e, x, v):
+        """What a particle adds.
+
+        Args:
+            e: Environment.
+            x: Position [domain units], 3-vector.
+            v: Velocity, 3-vector.
+        """
+        return 0.0 * x[0]
+
+    @ti.func
+    def gradient(self, e, x, v):
+        """Derivatives of :meth:`measure` by position and velocity, two 3-vectors."""
+        return 0.0 * x, 0.0 * v
+
+
+class DistanceTerm(Term):
+    """A sum over the moving manipulators, of a function of their signed distances from all particles.
+
+    What is kept of a manipulator's distances while particles are looked at one after the other is a pair of
+    float64, the tally; tallies of parts of the particles are joined.
+
+    Attributes:
+        nearest_only: Whether the derivative by a distance is 0 for all particles but one, whose number is the
+            tally's second entry.
+    """
+
+    nearest_only: bool = False
+
+    @ti.func
+    def start(self):
+        """Tally of no particle."""
+        return ti.Vector([0.0, 0.0], ti.f64)
+
+    @ti.func
+    def add(self, tally, d, particle):
+        """Tally with one more particle, at distance ``d`` [domain units], negative inside the manipulator."""
+        return tally
+
+    @ti.func
+    def join(self, tally, other):
+        """Tally of two parts of the particles; the result must not depend on which is which."""
+        return tally + other
+
+    @ti.func
+    def measure(self, tally):
+        """What a manipulator adds, float64."""
+        return 0.0 * tally[0]
+
+    @ti.func
+    def slope(self, tally, d, particle):
+        """Derivative of :meth:`measure` by the distance of a particle, float64."""
+        return 0.0 * tally[0]

@@ -1,0 +1,377 @@
+"""What a state offers to terms of a loss, and how they are summed: mass tensor, particles, distances from the
+manipulators; and the way back from their slopes to the adjoints of particles and poses.
+
+The terms themselves are elsewhere (:mod:`plab.losses`): each is an object with a few functions, which are
+compiled into the kernels here.
+
+The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to
+the layer below the domain counts at the face's node, so that the tensor holds all mass.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import taichi as ti
+
+from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
+from plab.sim.shapes import gap_slope, signed_distance
+from plab.sim.storage import Storage
+from plab.sim.transfer import spline, spline_slope
+
+__all__ = ["EXTRA_MEASURES", "TermPhases"]
+
+EXTRA_MEASURES = 2
+"""Measures of a state after its terms: the largest mass of a node, and the fault: the number of the substep
+in which the state broke, from 1 on, or 0."""
+
+vec4 = ti.types.vector(4, ti.f64)
+vec8 = ti.types.vector(8, ti.f64)
+
+
+class TermPhases(Storage):
+    """The mass tensor, and sums of terms.
+
+    Attributes:
+        shares: Parts of the particles that distances are tallied in before they are joined.
+        terms: The terms, in the order of their measures.
+        references: Numbers per node of the targets that terms have asked for, by name.
+    """
+
+    shares: int
+    terms: tuple[Any, ...] = ()
+
+    def attach(self, terms: Sequence[Any]) -> None:
+        """Take over the terms, before the first kernel is compiled.
+
+        Args:
+            terms: Terms as in :mod:`plab.losses.term`, not attached before; those of weight 0 are left out.
+        """
+        weighted = [t for t in terms if t.weighted and t.weight != 0.0]
+        # Those that are measured only come last.
+        self.terms = (*weighted, *(t for t in terms if not t.weighted))
+        self.references: dict[str, ti.Field] = {}
+        self.node_terms = self._with("empty")
+        self.particle_terms = self._with("gradient")
+        self.distance_terms = self._with("nearest_only")
+        self.term_weights = ti.field(self.real, shape=max(1, len(self.terms)))
+        # Sums over nodes and the largest mass; sums over particles; tallies of distances.
+        parts, m = (self.batch, self.chunks), max(1, self.manipulators)
+        sums, tallies = max(1, len(self.particle_terms)), max(1, len(self.distance_terms))
+        self.node_part = ti.Vector.field(len(self.node_terms) + 1, ti.f64, shape=parts)
+        self.particle_part = ti.Vector.field(sums, ti.f64, shape=parts)
+        self.tally_part = ti.Vector.field(2, ti.f64, shape=(tallies, self.batch, self.shares, m))
+        self.tally = ti.Vector.field(2, ti.f64, shape=(tallies, self.batch, m))
+        for term in self.terms:
+            term.attach(self)
+
+    def _with(self, hook: str) -> tuple[tuple[int, int, Any], ...]:
+        """Terms of the kind with a hook: number among their kind, column among the measures, term."""
+        kind = [(column, term) for column, term in enumerate(self.terms) if hasattr(term, hook)]
+        return tuple((number, *pair) for number, pair in enumerate(kind))
+
+    @property
+    def measures(self) -> int:
+        """Numbers that a state is measured by: the terms', and :data:`EXTRA_MEASURES`."""
+        return len(self.terms) + EXTRA_MEASURES
+
+    def reference(self, name: str) -> ti.Field:
+        """Field of n^3 numbers per environment with the targets' ``mass`` or ``sdf``, shared by all terms
+        that ask."""
+        if name not in self.references:
+            self.references[name] = ti.field(self.real, shape=self.batch * self.n**3)
+        return self.references[name]
+
+    # -- mass tensor --------------------------------------------------------------------------------
+
+    @ti.func
+    def folded_node(self, base, i: ti.template(), j: ti.template(), k: ti.template()):
+        """Array index along each axis of a stencil's node in the mass tensor's sense."""
+        return ti.max(base + ti.Vector([i, j, k]), 1)
+
+    @ti.func
+    def scatter_mass(self, grid_index, base, fx):
+        """Add one particle's mass to its 27 nodes, where one thread owns the grid."""
+        w = spline(fx)
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                for k in ti.static(range(3)):
+                    at = self.folded_node(base, i, j, k)
+                    node = grid_index * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
+                    share = self.mass * w[i][0] * w[j][1] * w[k][2]
+                    self.momentum[node][3] = self.momentum[node][3] + share
+
+    @ti.func
+    def entry(self, e, node):
+        """Entry of a node of the mass tensor in fields of n^3 numbers per environment."""
+        return ((e * self.n + node[0]) * self.n + node[1]) * self.n + node[2]
+
+    @ti.func
+    def in_tensor(self, node):
+        """Whether the mass tensor has a node."""
+        return node.min() >= 0 and node.max() < self.n
+
+    @ti.func
+    def node_slope(self, grid: ti.template(), node):
+        """The loss's slope at a node."""
+        return grid[node][3]
+
+    @ti.func
+    def slope_at(self, slopes: ti.template(), e, at, dense: ti.template()):
+        """Slope at a node by its array index: from a grid, or from n^3 numbers per environment
+        (``dense``)."""
+        out = ti.cast(0.0, self.real)
+        if ti.static(dense):
+            out = ti.cast(slopes[self.entry(e, at - 1)], self.real)
+        else:
+            node = e * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
+            out = self.node_slope(slopes, node)
+        return out
+
+    @ti.func
+    def mass_slope(self, slopes: ti.template(), e, base, fx, dense: ti.template()):
+        """Gradient with respect to one particle's position of what the mass tensor's slopes are those of."""
+        w = spline(fx)
+        dw = spline_slope(fx)
+        out = fx * 0.0
+        for i in ti.static(range(3)):
+            for j in ti.static(range(3)):
+                for k in ti.static(range(3)):
+                    at = self.folded_node(base, i, j, k)
+                    out += self.slope_at(slopes, e, at, dense) * ti.Vector(
+                        [
+                            dw[i][0] * w[j][1] * w[k][2],
+                            w[i][0] * dw[j][1] * w[k][2],
+                            w[i][0] * w[j][1] * dw[k][2],
+                        ]
+                    )
+        return (self.mass * self.inv_dx) * out
+
+    # -- terms of nodes and particles ---------------------------------------------------------------
+
+    @ti.func
+    def node_measures(self, e, i, mass):
+        """What a node adds to the terms of the mass tensor, and its mass; and the loss's slope there.
+
+        Args:
+            e: Environment.
+            i: Array index of the node.
+            mass: Its mass.
+        """
+        values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
+        slope = 0.0 * mass
+        node = i - 1
+        # Written so that NaN is not taken for an empty node.
+        if self.in_tensor(node) and not (mass <= 0.0):
+            for k, column, term in ti.static(self.node_terms):
+                values[k] = ti.cast(term.measure(e, node, mass), ti.f64)
+                if ti.static(term.weighted):
+                    slope += self.term_weights[column] * term.slope(e, node, mass)
+        values[ti.static(len(self.node_terms))] = ti.cast(mass, ti.f64)
+        return values, slope
+
+    @ti.func
+    def particle_measures(self, e, x, v):
+        """What a particle adds to the terms of the particles."""
+        values = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
+        for k, _column, term in ti.static(self.particle_terms):
+            values[k] = ti.cast(term.measure(e, x, v), ti.f64)
+        return values
+
+    @ti.func
+    def particle_gradient(self, e, base, fx, x, v):
+        """Derivatives of the weighted terms of nodes and particles by a particle's position and velocity."""
+        x_bar = x * 0.0
+        v_bar = x * 0.0
+        if ti.static(len(self.node_terms) > 0):
+            x_bar = self.mass_slope(self.velocity, e, base, fx, False)
+        for _k, column, term in ti.static(self.particle_terms):
+            along_x, along_v = term.gradient(e, x, v)
+            x_bar += self.term_weights[column] * along_x
+            v_bar += self.term_weights[column] * along_v
+        return x_bar, v_bar
+
+    @ti.func
+    def add_particle_gradient(self, state: ti.template(), entry, bar: ti.template(), target, lane, e):
+        """Add the gradient of the terms of nodes and particles to a particle's adjoint."""
+        x = self.vector(state, entry, lane)
+        v = self.vector(state, entry + 3, lane)
+        base, fx = self.stencil(x)
+        x_bar, v_bar = self.particle_gradient(e, base, fx, x, v)
+        for i in ti.static(range(3)):
+            bar[target + i][lane] = bar[target + i][lane] + x_bar[i]
+            if ti.static(len(self.particle_terms) > 0):
+                bar[target + 3 + i][lane] = bar[target + 3 + i][lane] + v_bar[i]
+
+    # -- terms of distances -------------------------------------------------------------------------
+
+    @ti.func
+    def pose_rotation(self, e, m):
+        """Rotation matrix of a manipulator at the end of the environment step, 3x3 float64."""
+        pose = self.pose[e, self.substeps, m]
+        return rotation_matrix(vec4(pose[3], pose[4], pose[5], pose[6]))
+
+    @ti.func
+    def local_point(self, shape: ti.template(), e, m, x):
+        """A world point in the manipulator's frame at the end of the environment step."""
+        pose = self.pose[e, self.substeps, m]
+        offset = ti.cast(x, ti.f64) - ti.Vector([pose[0], pose[1], pose[2]])
+        if ti.static(self.rotated(shape)):
+            offset = self.pose_rotation(e, m).transpose() @ offset
+        return ti.cast(offset, self.real)
+
+    @ti.func
+    def end_distance(self, shape: ti.template(), e, m, x):
+        """Distance of a world point at the end of the environment step."""
+        gap = ti.cast(self.pose[e, self.substeps, m][7], self.real)
+        d, _n = signed_distance(shape, self.local_point(shape, e, m, x), self.size[e, m], gap)
+        return d
+
+    @ti.func
+    def distance_adjoint(self, k: ti.template(), shape: ti.template(), e, m, particle, x):
+        """Adjoints of a particle's position and of a manipulator's pose (8-vector) under the k-th term of
+        distances, weighted."""
+        _number, column, term = ti.static(self.distance_terms[k])
+        pose = self.pose[e, self.substeps, m]
+        gap = ti.cast(pose[7], self.real)
+        p = self.local_point(shape, e, m, x)
+        d, n = signed_distance(shape, p, self.size[e, m], gap)
+        n64 = ti.cast(n, ti.f64)
+        d_bar = ti.cast(self.term_weights[column], ti.f64) * term.slope(self.tally[k, e, m], d, particle)
+        x_bar = d_bar * n64
+        if ti.static(self.rotated(shape)):
+            x_bar = self.pose_rotation(e, m) @ x_bar
+        pose_bar = vec8(0.0)
+        for i in ti.static(range(3)):
+            pose_bar[i] = -x_bar[i]
+        if ti.static(self.turns(shape)):
+            offset = ti.cast(x, ti.f64) - ti.Vector([pose[0], pose[1], pose[2]])
+            q_bar = rotation_matrix_adjoint(
+                vec4(pose[3], pose[4], pose[5], pose[6]), d_bar * offset.outer_product(n64)
+            )
+            for i in ti.static(range(4)):
+                pose_bar[3 + i] = q_bar[i]
+        if ti.static(shape == "Chopsticks"):
+            pose_bar[7] = ti.cast(gap_slope(shape, p), ti.f64) * d_bar * n64[0]
+        return ti.cast(x_bar, self.real), pose_bar
+
+    @ti.func
+    def nearest_gradient(self, state: ti.template(), slot, bar: ti.template(), e):
+        """Add the gradient of terms that look at the nearest particle alone to its adjoint and the poses'."""
+        for k, _column, term in ti.static(self.distance_terms):
+            if ti.static(term.nearest_only):
+                for shape, start, stop in ti.static(self.runs):
+                    if ti.static(self.acts(shape)):
+                        for m in range(start, stop):
+                            particle = ti.cast(self.tally[k, e, m][1], ti.i32)
+                            tile = particle // self.lanes
+                            lane = particle - tile * self.lanes
+                            x = self.vector(state, self.tile_entry(slot, e, tile), lane)
+                            x_bar, pose_bar = self.distance_adjoint(k, shape, e, m, particle, x)
+                            entry = self.tile_entry(0, e, tile)
+                            for i in ti.static(range(3)):
+                                bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
+                            self.pose_bar[e, m] += pose_bar
+
+    @ti.func
+    def spread_gradient(self, shape: ti.template(), e, m, particle, x):
+        """Adjoints of a particle's position and a manipulator's pose under terms that look at all
+        particles."""
+        x_bar = x * 0.0
+        pose_bar = vec8(0.0)
+        for k, _column, term in ti.static(self.distance_terms):
+            if ti.static(not term.nearest_only):
+                along_x, along_pose = self.distance_adjoint(k, shape, e, m, particle, x)
+                x_bar += along_x
+                pose_bar += along_pose
+        return x_bar, pose_bar
+
+    def acts(self, shape: str) -> bool:
+        """Whether a shape's distances count in the loss: where an action can move it; decided while
+        compiling."""
+        return self.motions[self.shapes.index(shape)] != "static"
+
+    @property
+    def spreads(self) -> bool:
+        """Whether a term of distances has a gradient for more than the nearest particle."""
+        return any(not term.nearest_only for _k, _column, term in self.distance_terms)
+
+    # -- all terms ----------------------------------------------------------------------------------
+
+    @ti.func
+    def join_measures(self, e, terms: ti.template(), at):
+        """Join the parts of an environment's sums and tallies, and write its measures from entry ``at``."""
+        part = self.node_part[e, 0]
+        sums = self.particle_part[e, 0]
+        last = ti.static(len(self.node_terms))
+        for c in range(1, self.chunks):
+            share = self.node_part[e, c]
+            peak = ti.max(part[last], share[last])
+            part += share
+            part[last] = peak
+            sums += self.particle_part[e, c]
+        for k, column, term in ti.static(self.node_terms):
+            terms[at + column] = term.empty(e) + part[k]
+        for k, column, _term in ti.static(self.particle_terms):
+            terms[at + column] = sums[k]
+        for k, column, term in ti.static(self.distance_terms):
+            total = ti.cast(0.0, ti.f64)
+            for m in ti.static(range(self.manipulators)):
+                if ti.static(self.motions[m] != "static"):
+                    tally = self.tally_part[k, e, 0, m]
+                    for c in range(1, self.shares):
+                        tally = term.join(tally, self.tally_part[k, e, c, m])
+                    self.tally[k, e, m] = tally
+                    total += term.measure(tally)
+            terms[at + column] = total
+        terms[at + ti.static(len(self.terms))] = part[last]
+        terms[at + ti.static(len(self.terms) + 1)] = ti.cast(self.fault[e], ti.f64)
+
+    # -- derivatives that others have computed ------------------------------------------------------
+
+    @ti.kernel
+    def add_cotangents(
+        self,
+        bar: ti.types.ndarray(ndim=1),
+        order: ti.types.ndarray(ndim=1),
+        given: ti.types.ndarray(ndim=1),
+        first: ti.i32,
+    ):
+        """Add derivatives by positions (``first`` is 0) or velocities (3), numbered as ``order`` says, to the
+        particles' adjoints."""
+        for q in range(self.batch * self.tiles * self.lanes):
+            e = q // (self.tiles * self.lanes)
+            place = q - e * (self.tiles * self.lanes)
+            if place < self.particles:
+                entry = self.tile_entry(0, e, place // self.lanes) + first
+                row = (e * self.particles + order[q]) * 3
+                for i in ti.static(range(3)):
+                    lane = place % self.lanes
+                    bar[entry + i][lane] = bar[entry + i][lane] + ti.cast(given[row + i], self.real)
+
+    @ti.kernel
+    def add_mass_cotangents(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        slot: ti.i32,
+        bar: ti.types.ndarray(ndim=1),
+        given: ti.types.ndarray(ndim=1),
+    ):
+        """Add derivatives by the mass tensors, n^3 per environment, to the particles' adjoints."""
+        for q in range(self.batch * self.tiles * self.lanes):
+            e = q // (self.tiles * self.lanes)
+            place = q - e * (self.tiles * self.lanes)
+            if place < self.particles:
+                lane = place % self.lanes
+                x = self.vector(state, self.tile_entry(slot, e, place // self.lanes), lane)
+                base, fx = self.stencil(x)
+                x_bar = self.mass_slope(given, e, base, fx, True)
+                entry = self.tile_entry(0, e, place // self.lanes)
+                for i in ti.static(range(3)):
+                    bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
+
+    @ti.kernel
+    def add_pose_cotangents(self, given: ti.types.ndarray(ndim=1)):
+        """Add derivatives by the poses, 8 per manipulator, to the poses' adjoints."""
+        for e, m in self.pose_bar:
+            for i in ti.static(range(8)):
+                self.pose_bar[e, m][i] += ti.cast(given[(e * self.manipulators + m) * 8 + i], ti.f64)
