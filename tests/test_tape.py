@@ -27,6 +27,7 @@ class Numbers:
         self.order = self
         self.device, self.sorts, self.substeps, self.batch, self.places = "cpu", sorts, SUBSTEPS, 1, 1
         self.slot_entries = self.slot_bytes = 1
+        self.terms, self.measures = (), 2
         self.current, self.numbers = self.array(1), self.array(1)
         self.pose_bar = self.frame_bar = self.material_bar = self.array(1)
         self.seen: list[tuple[int, list[int]]] = []

@@ -95,6 +95,7 @@ class Problem:
         simulator: Their simulator, in its initial state.
         term_names: Names of the terms of the loss; those of weight 0 are left out.
         weights: Their weights, shape [term].
+        labels: What they measure, with unit, by their columns in results.
         initial_mass: Mass tensors of the initial states, shape [batch, n, n, n].
         target_mass: Mass tensors of the targets, shape [batch, n, n, n].
         initial_scores: How close the initial states are.
@@ -122,6 +123,7 @@ class Problem:
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
+        self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
         self.target_mass = _targets([cfgs[first[kind]] for kind in kinds], self.scenes, self.simulator)
         # Distances to equal targets are equal.
         distances = {kind: _distance(self.target_mass[k]) for kind, k in first.items()}

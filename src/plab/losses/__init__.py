@@ -54,9 +54,9 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
     for name, place in check_terms(weights, choices).items():
         if weights[name] == 0.0:
             continue
-        kind = load_object(place, f"method.loss_terms.{name}")
-        if not (isinstance(kind, type) and issubclass(kind, Term)):
-            raise ConfigError(f"method.loss_terms.{name}: {place} is no class of plab.losses.term")
+        kind = load_object(place, type)
+        if not issubclass(kind, Term):
+            raise ConfigError(f"method.loss_terms.{name}: '{place}' is no term of plab.losses.term")
         term = kind()
         term.name, term.weight = name, float(weights[name])
         terms.append(term)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pandas as pd
 
@@ -9,10 +11,13 @@ from plab.report.costs import PHASES
 from plab.report.figures import Drawing, grid, legend
 from plab.report.methods import method
 from plab.results import ResultsError, RunResult
+from plab.results.schema import loss_columns
 
 __all__ = ["actions", "facts", "loss_terms", "measures", "times"]
 
-_TERMS = {"density": "#0072B2", "sdf": "#D55E00", "contact": "#009E73"}
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+"""Colours of the terms, in their order; Okabe and Ito's, which people with any colour vision can tell
+apart."""
 
 
 def loss_terms(run: RunResult) -> Drawing:
@@ -22,8 +27,10 @@ def loss_terms(run: RunResult) -> Drawing:
     figure, axes = grid(1, 1, width=6.4, height=2.4)
     panel = axes[0, 0]
     panel.plot(table["episodes"] + 1, table["loss"], color="black", label="loss")
-    for name, colour in _TERMS.items():
-        values = weights[name] * table[f"loss_{name}"]
+    columns = loss_columns(run.config)
+    for column, colour in zip(columns, itertools.cycle(_COLOURS), strict=False):
+        name = column.removeprefix("loss_")
+        values = weights[name] * table[column]
         if (values > 0).any():
             panel.plot(
                 table["episodes"] + 1,
@@ -40,7 +47,13 @@ def loss_terms(run: RunResult) -> Drawing:
     panel.set_xlabel("episodes")
     panel.set_ylabel("summed over the steps")
     legend(figure)
-    return Drawing("loss_terms", figure, ["Trajectory loss and its weighted terms; dotted: the best row."])
+    terms = [
+        f"{column.removeprefix('loss_')}: {run.labels[column]}" for column in columns if column in run.labels
+    ]
+    what = f" Terms: {'; '.join(terms)}." if terms else ""
+    return Drawing(
+        "loss_terms", figure, [f"Trajectory loss and its weighted terms; dotted: the best row.{what}"]
+    )
 
 
 def measures(run: RunResult) -> Drawing:

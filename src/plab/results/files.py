@@ -104,6 +104,8 @@ def read(path: str | Path) -> RunResult:
             best_iteration=int(best["iteration"]),
             best_loss=float(best["loss"]),
             evaluation=attributes(file, "evaluation"),
+            # Files of plab 0.1 have none.
+            labels=attributes(file, "labels") if "labels" in file else {},
             masses=masses,
             resume=_read_tree(file["resume"]) if "resume" in file else None,
             path=path,
@@ -140,7 +142,7 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
         file.attrs["config_hash"] = result.config_hash
         file.attrs["status"] = result.status
         file.attrs["message"] = result.message
-        for name in ("provenance", "wall_time", "evaluation"):
+        for name in ("provenance", "wall_time", "evaluation", "labels"):
             file.create_group(name).attrs.update(getattr(result, name))
         table = file.create_group("iterations")
         table.attrs["columns"] = list(result.iterations.columns)

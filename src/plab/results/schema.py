@@ -96,6 +96,7 @@ class RunResult:
         best_iteration: Iteration that ran them, -1 if none has.
         best_loss: Their trajectory loss in the contact model of the rollouts.
         evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
+        labels: What the columns of the loss's terms measure, with unit, by column.
         masses: Mass tensors by name (``initial``, ``final``, ``target``), each of shape [n, n, n].
         resume: Nested state from which the run goes on: arrays, numbers, strings; None in finished files.
         path: File this was read from.
@@ -112,6 +113,7 @@ class RunResult:
     best_iteration: int = -1
     best_loss: float = float("nan")
     evaluation: dict[str, float] = dataclasses.field(default_factory=dict)
+    labels: dict[str, str] = dataclasses.field(default_factory=dict)
     masses: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     resume: dict[str, Any] | None = None
     path: Path | None = None

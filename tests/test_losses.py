@@ -1,0 +1,369 @@
+"""Terms of the loss: their measures against plain formulas, their gradients against differences, and that a
+term is one file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import taichi as ti
+import torch
+
+import reference_mpm as reference
+from plab.config import ConfigError, load_config
+from plab.envs.core import EpisodeBatch
+from plab.losses import TERMS, check_gradient, make_terms
+from plab.losses.term import DistanceTerm, ParticleTerm
+from plab.objective import soft_iou
+from plab.results import load, read
+from plab.scene import MANIPULATOR_SHAPES
+from plab.sim import SimulationError, Simulator
+from plab.torch import simulate
+from suite import KINDS, batch, scene
+
+ROOT = Path(__file__).resolve().parents[1]
+OWN = ROOT / "examples" / "own_loss"
+SCENES = [scene(KINDS), scene(("Sphere", "Chopsticks"))]
+COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+
+physics = pytest.mark.physics
+
+
+class Kinetic(ParticleTerm):
+    """Kinetic energy, and how high it is."""
+
+    @ti.func
+    def measure(self, e, x, v):
+        """Square of the velocity, times the height."""
+        return 0.5 * v.dot(v) * x[1]
+
+    @ti.func
+    def gradient(self, e, x, v):
+        """By position and velocity."""
+        return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
+
+
+class Close(DistanceTerm):
+    """How many particles are close to a manipulator, smoothly counted."""
+
+    @ti.func
+    def add(self, tally, d, particle):
+        """One more share."""
+        wide = ti.cast(d, ti.f64)
+        return tally + ti.Vector([ti.exp(-wide * wide / 0.02), 0.0])
+
+    @ti.func
+    def measure(self, tally):
+        """The logarithm of the number."""
+        return ti.log(1.0 + tally[0])
+
+    @ti.func
+    def slope(self, tally, d, particle):
+        """By the distance."""
+        wide = ti.cast(d, ti.f64)
+        return -2.0 * wide / 0.02 * ti.exp(-wide * wide / 0.02) / (1.0 + tally[0])
+
+
+def moved(simulator: Simulator, seed: int = 0) -> None:
+    """Advance by a step of random actions, with random targets."""
+    rng = np.random.default_rng(seed)
+    shape = (simulator.batch, *[simulator.grid_size] * 3)
+    simulator.set_target(simulator.scenes[0].particle_mass * rng.random(shape), rng.random(shape))
+    simulator.step(rng.uniform(-1.0, 1.0, (simulator.batch, simulator.action_dim)))
+
+
+def distances(simulator: Simulator, e: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances of all particles from the moving manipulators, and normals: [manipulator, particle(, 3)]."""
+    state, tools = simulator.state(), simulator.scenes[e].manipulators
+    x = torch.tensor(state.x[e])
+    pairs = [
+        reference.signed_distance(tool, torch.tensor(pose), x)
+        for tool, pose in zip(tools, state.poses[e], strict=True)
+        if MANIPULATOR_SHAPES[tool.shape].motion != "static"
+    ]
+    return np.stack([d.numpy() for d, _ in pairs]), np.stack([n.numpy() for _, n in pairs])
+
+
+# ---------------------------------------------------------------------------------------------------
+# gradients
+
+
+@physics
+@pytest.mark.parametrize("name", [name for name in TERMS if name != "all"])
+def test_gradients_of_terms_are_those_of_their_measures(name: str, device: str) -> None:
+    (term, _overlap) = make_terms({"any": 1.0}, {"any": name})
+    errors = check_gradient(term, SCENES, device=device)
+    assert max(errors.values()) < 1e-6, errors
+
+
+@physics
+@pytest.mark.parametrize("kind", [Kinetic, Close])
+def test_gradients_of_terms_of_ones_own(kind: type, device: str) -> None:
+    errors = check_gradient(kind(), SCENES, device=device)
+    assert max(errors.values()) < 1e-6, errors
+
+
+@physics
+def test_a_wrong_gradient_is_noticed(device: str) -> None:
+    class Wrong(Kinetic):
+        @ti.func
+        def gradient(self, e, x, v):
+            return x * 0.0, v
+
+    errors = check_gradient(Wrong(), SCENES, device=device)
+    assert errors["x"] > 0.5 and errors["v"] > 0.1 and errors["poses"] < 1e-6
+
+
+@physics
+def test_the_summed_gradient_is_no_gradient_and_what_it_is_said_to_be(device: str) -> None:
+    """2 w D sum of grad d_p over the particles outside, and D as its measure."""
+    (term, _overlap) = make_terms({"contact": 1.0}, {"contact": "all"})
+    assert check_gradient(term, SCENES, device=device)["x"] > 0.5
+    terms = make_terms({"contact": 3.0}, {"contact": "all"})
+    simulator = Simulator(SCENES, terms=terms, precision="float64", device=device)
+    moved(simulator)
+    gradient, measured = simulator.loss_gradient(), simulator.losses()[:, 0]
+    for e in range(len(SCENES)):
+        d, normals = distances(simulator, e)
+        nearest = np.maximum(d.min(axis=1), 0.0)
+        assert measured[e] == pytest.approx((nearest**2).sum(), rel=1e-9)
+        want = (6.0 * nearest[:, None] * (d > 0))[..., None] * normals
+        np.testing.assert_allclose(gradient.x[e], want.sum(axis=0), atol=1e-9 * np.abs(want).max())
+        # Manipulators are pulled the other way.
+        moving = [m.shape != "Cylinder" for m in SCENES[e].manipulators]
+        np.testing.assert_allclose(
+            gradient.poses[e, moving, :3], -want.sum(axis=1), atol=1e-9 * np.abs(want).sum()
+        )
+
+
+# ----------------------------------------------------------------------------------------------------
+# measures
+
+
+@physics
+def test_measures_are_the_formulas(device: str) -> None:
+    weights, choices = {"density": 1.0, "near": 1.0, "soft": 1.0, "energy": 1.0}, {"near": "nearest"}
+    terms = make_terms(weights, choices | {"energy": f"{__name__}:Kinetic"})
+    simulator = Simulator(SCENES, terms=terms, precision="float64", device=device)
+    moved(simulator)
+    measured, mass, state = simulator.measure(), simulator.mass_tensor(), simulator.state()
+    rng = np.random.default_rng(0)
+    target = SCENES[0].particle_mass * rng.random(mass.shape)
+    for e in range(len(SCENES)):
+        d = np.maximum(distances(simulator, e)[0], 0.0)
+        w = 1.0 / (1.0 + 1e4 * d**2)
+        want = [
+            np.abs(mass[e] - target[e]).sum(),
+            (d.min(axis=1) ** 2).sum(),
+            (((w * d).sum(axis=1) / w.sum(axis=1)) ** 2).sum(),
+            (0.5 * (state.v[e] ** 2).sum(axis=1) * state.x[e, :, 1]).sum(),
+        ]
+        np.testing.assert_allclose(measured.terms[e], want, rtol=1e-9)
+        assert measured.iou[e] == pytest.approx(soft_iou(mass[e], target[e]), rel=1e-9)
+
+
+@physics
+def test_the_gradient_of_a_rollout_with_a_soft_minimum(device: str) -> None:
+    terms = make_terms({"contact": 1.0}, {"contact": "soft"})
+    simulator = Simulator(SCENES, terms=terms, precision="float64", device=device)
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-0.9, 0.9, (2, 2, simulator.action_dim))
+    way = rng.normal(size=u.shape)
+    slope = (simulator.rollout(u).gradient * way).sum()
+    ends = [simulator.rollout(u + s * way, gradient=False).step_terms.sum() for s in (1e-5, -1e-5)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
+
+
+@physics
+def test_terms_do_not_depend_on_threads_or_batch() -> None:
+    """Bit for bit on the CPU, with terms of all three kinds."""
+    weights = {"density": 10.0, "contact": 1.0, "energy": 2.0, "soft": 1.0}
+    choices = {"contact": "all", "energy": f"{__name__}:Kinetic"}
+    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 2, 25))
+    results = []
+    for threads, count in ((1, 2), (2, 2), (2, 1)):
+        simulator = Simulator(SCENES[:count], terms=make_terms(weights, choices), threads=threads)
+        shape = (count, *[simulator.grid_size] * 3)
+        simulator.set_target(np.zeros(shape), np.zeros(shape))
+        results.append(simulator.rollout(u[:count]))
+    for other in results[1:]:
+        for name in ("step_terms", "gradient"):
+            want, got = getattr(results[0], name), getattr(other, name)
+            np.testing.assert_array_equal(got, want[: len(got)])
+
+
+# ------------------------------------------------------------------------------------- terms that are not
+# there
+
+
+@physics
+def test_a_term_of_weight_0_is_not_there() -> None:
+    simulator = Simulator(SCENES, terms=make_terms({"density": 0.0, "contact": 2.0}))
+    assert [term.name for term in simulator.terms] == ["contact"]
+    assert simulator.losses().shape == (2, 1) and list(simulator._engine.references) == ["mass"]
+    with pytest.raises(ValueError, match="built without a term 'density'; it has: contact"):
+        simulator.set_weights({"density": 1.0})
+    without = Simulator(SCENES)
+    assert without.measure().terms.shape == (2, 0) and np.isnan(without.measure().iou).all()
+    with pytest.raises(ValueError, match="there is no loss to differentiate"):
+        without.rollout(np.zeros((2, 1, 25)))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (["+method.loss_weights.hight=1"], "method.loss_weights.hight: there is no term 'hight'"),
+        (["method.loss_terms.contact=sofd"], "method.loss_weights.contact: there is no term 'sofd'; .*soft"),
+        (["+method.loss_terms.points=soft"], "method.loss_terms.points has no weight"),
+        (["method.loss_weights={density:0}"], "method.loss_weights are all 0"),
+    ],
+)
+def test_terms_that_do_not_exist_are_named(overrides: list[str], line: str) -> None:
+    with pytest.raises(ConfigError, match=line):
+        load_config(overrides)
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        ("no_module:Term", "no_module"),
+        ("plab.losses.density:Dense", "Dense"),
+        ("plab.objective:Scores", "'plab.objective:Scores' is no term of plab.losses.term"),
+    ],
+)
+def test_classes_that_are_no_terms_are_named(place: str, line: str) -> None:
+    with pytest.raises(ConfigError, match=line):
+        make_terms({"own": 1.0}, {"own": place})
+
+
+# ------------------------------------------------------------------------------------------- a term of one's
+# own
+
+
+@physics
+@pytest.mark.parametrize("words", [["method=adam_height", "method.iterations=2"], ["method=ppo"]])
+def test_a_term_of_ones_own_is_a_file_and_a_weight(tmp_path: Path, words: list[str]) -> None:
+    if words == ["method=ppo"]:
+        words = [
+            *words,
+            *("+method.loss_weights.height=20", "+method.loss_terms.height=height_map:HeightMap"),
+            *(
+                "method.episodes=4",
+                "method.evaluate_every=2",
+                "method.steps_per_update=6",
+                "method.minibatches=2",
+            ),
+        ]
+    command = [sys.executable, "-m", "plab.run", "--config-dir", str(OWN / "conf"), "task=RollingPin"]
+    done = subprocess.run(
+        [*command, *COARSE, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    run = read(load(tmp_path / "results")["path"][0])
+    columns = ["loss_density", "loss_sdf", "loss_contact", "loss_height"]
+    assert [name for name in run.iterations if name.startswith("loss_")] == columns
+    total = run.iterations[columns].to_numpy() @ [10.0, 10.0, 1.0, 20.0]
+    np.testing.assert_allclose(run.iterations["loss"], total, rtol=1e-6)
+    assert run.labels["loss_height"].endswith("height above a surface [mass x domain units]")
+    assert (run.iterations["loss_height"] > 0).all()
+    check = [sys.executable, "-m", "plab.results", "check", "results"]
+    assert subprocess.run(check, cwd=tmp_path, check=False, capture_output=True).returncode == 0
+
+
+@physics
+def test_environments_have_terms_of_ones_own() -> None:
+    cfg = load_config(["task=RollingPin", "method=adam_height", *COARSE], config_dir=OWN / "conf")
+    env = EpisodeBatch([cfg])
+    env.reset()
+    info = env.step(np.zeros((1, 3))).info
+    named = ["loss_density", "loss_sdf", "loss_contact", "loss_height"]
+    assert [name for name in info if name.startswith("loss_")] == named
+    assert info["loss"] == pytest.approx(
+        info["loss_height"] * 20 + sum(info[n] for n in named[:2]) * 10, rel=1e-2
+    )
+
+
+# -------------------------------------------------------------------------------- functions of others, by
+# PyTorch
+
+
+@physics
+@pytest.mark.parametrize("every_step", [True, False])
+def test_functions_of_states_are_differentiated(every_step: bool, device: str) -> None:
+    """By actions, initial positions and material, against central differences."""
+    simulator = Simulator(SCENES, precision="float64", device=device, full_gradient=True)
+    rng = np.random.default_rng(0)
+    values = {
+        "u": torch.tensor(rng.uniform(-0.9, 0.9, (2, 3, simulator.action_dim)), requires_grad=True),
+        "x": torch.tensor(simulator.state().x, requires_grad=True),
+        "material": torch.tensor([[5000.0, 0.2, 50.0]] * 2, dtype=torch.float64, requires_grad=True),
+    }
+    random = torch.Generator().manual_seed(0)
+    masks: list[torch.Tensor] = []
+
+    def function(u: torch.Tensor, x: torch.Tensor, material: torch.Tensor) -> torch.Tensor:
+        states = simulate(simulator, u, x=x, material=material, every_step=every_step)
+        if not masks:
+            masks.extend(torch.rand(part.shape, generator=random, dtype=torch.float64) for part in states)
+        x_mask, v_mask, pose_mask, mass_mask = masks
+        total = (states.x**2 * x_mask).sum() + 1e-2 * (states.v * v_mask).sum()
+        return total + (states.poses * pose_mask).sum() + 1e3 * (states.mass * mass_mask).sum()
+
+    gradients = torch.autograd.grad(function(**values), list(values.values()))
+    widths = {"u": 1e-5, "x": 1e-6, "material": torch.tensor([1e-2, 1e-6, 1e-4], dtype=torch.float64)}
+    for (name, value), gradient in zip(values.items(), gradients, strict=True):
+        way = torch.tensor(rng.normal(size=value.shape)) * widths[name]
+        with torch.no_grad():
+            ends = [function(**(values | {name: value + sign * way})) for sign in (1, -1)]
+        want, got = float(ends[0] - ends[1]) / 2, float((gradient * way).sum())
+        assert got == pytest.approx(want, rel=2e-6), name
+
+
+@physics
+def test_the_way_back_is_refused_once_it_is_gone(device: str) -> None:
+    simulator = Simulator(SCENES, device=device)
+    u = torch.zeros((2, 2, simulator.action_dim), requires_grad=True)
+    states = simulate(simulator, u, every_step=False)
+    assert states.x.shape == (2, 1, simulator.particle_count, 3) and states.mass.shape[:2] == (2, 1)
+    np.testing.assert_allclose(states.mass[:, 0].detach(), simulator.mass_tensor(), atol=1e-9)
+    simulator.reset()
+    with pytest.raises(RuntimeError, match="pull back before the simulator runs again"):
+        states.x.sum().backward()
+    with pytest.raises(TypeError, match="'y' is no part of a state: x, v, C, F, poses"):
+        simulate(simulator, u, y=u)
+    with pytest.raises(RuntimeError, match="full_gradient=True"):
+        simulate(simulator, u, x=states.x[:, 0].detach().requires_grad_()).v.sum().backward()
+    recording = simulator.record(np.zeros((2, 1, simulator.action_dim)))
+    with pytest.raises(ValueError, match=r"derivatives by v have shape \(2, 1\)"):
+        recording.pullback(v=np.zeros((2, 1)))
+
+
+@physics
+def test_functions_of_states_agree_with_the_terms() -> None:
+    """The SDF term, once compiled in and once as a function of the mass tensor."""
+    terms = make_terms({"sdf": 5.0})
+    simulator = Simulator(batch()[:2], terms=terms, precision="float64")
+    sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
+    simulator.set_target(np.zeros_like(sdf), sdf)
+    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 3, simulator.action_dim))
+    want = simulator.rollout(u)
+    tensor = torch.tensor(u, requires_grad=True)
+    loss = 5.0 * (simulate(simulator, tensor).mass * torch.tensor(sdf)[:, None]).sum()
+    loss.backward()
+    assert float(loss) == pytest.approx(5.0 * want.step_terms.sum(), rel=1e-12)
+    np.testing.assert_allclose(tensor.grad, want.gradient, atol=1e-12 * np.abs(want.gradient).max())
+    # The terms' own weights are as they were.
+    np.testing.assert_array_equal(simulator.rollout(u).gradient, want.gradient)
+
+
+@physics
+def test_a_state_that_breaks_is_an_error(device: str) -> None:
+    simulator = Simulator(SCENES, device=device)
+    state = simulator.state()
+    state.v[0, 0] = 1e9
+    simulator.set_initial_state(state)
+    with pytest.raises(SimulationError, match="environment 0"):
+        simulator.record(np.zeros((2, 1, simulator.action_dim)))
