@@ -150,7 +150,7 @@ def test_observation_and_info_are_those_of_the_objective(env: PlabEnv) -> None:
         np.testing.assert_array_equal(observed, observation(state.x[0], state.v[0], poses).astype(np.float32))
         terms = problem.simulator.losses()[0]
         assert [info["loss_density"], info["loss_sdf"], info["loss_contact"]] == list(terms)
-        assert info["loss"] == total_loss(terms, problem.weights.numbers)
+        assert info["loss"] == total_loss(terms, problem.weights)
     final = problem.scores(problem.simulator.mass_tensor())[0]
     assert 0.01 < final.iou_final < final.iou_target_self
     assert info["iou"] == pytest.approx(final.iou_final, abs=1e-6)

@@ -7,7 +7,7 @@ from typing import Any
 
 from plab.config_errors import ConfigError
 from plab.config_types.ranges import at_least, folder_name, fraction, one_of, positive, share, vector, widths
-from plab.losses import check_terms
+from plab.losses.registry import check_terms
 
 __all__ = [
     "ALGORITHMS",

@@ -10,26 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from plab.config_errors import ConfigError, pick
+from plab.config_errors import ConfigError
+from plab.losses.registry import TERMS, check_terms
 from plab.plugins import load_object
 
 if TYPE_CHECKING:
     from plab.losses.checking import check_gradient
     from plab.losses.term import Term
 
-__all__ = ["TERMS", "check_gradient", "check_terms", "make_terms"]
-
-TERMS = {
-    "density": "plab.losses.density:Density",
-    "sdf": "plab.losses.sdf:Sdf",
-    "nearest": "plab.losses.contact:NearestContact",
-    "all": "plab.losses.contact:AllContact",
-    "soft": "plab.losses.contact:SoftContact",
-}
-"""Terms by name, as ``module:Class``."""
-
-CHOICES = {"contact": "nearest"}
-"""Which term a weight's name stands for where it is none of :data:`TERMS` and nothing else is said."""
+__all__ = ["TERMS", "check_gradient", "make_terms"]
 
 
 def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> tuple[Term, ...]:
@@ -61,28 +50,6 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
         term.name, term.weight = name, float(weights[name])
         terms.append(term)
     return (*terms, Overlap())
-
-
-def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the place, ``module:Class``, of each weight's term; nothing is imported.
-
-    Raises:
-        ConfigError: If a name stands for no term, or a choice for no weight.
-    """
-    chosen = CHOICES | dict(choices or {})
-    for name in choices or {}:
-        if name not in weights:
-            raise ConfigError(f"method.loss_terms.{name} has no weight; {pick(name, list(weights))}")
-    places = {}
-    for name in weights:
-        term = chosen.get(name, name)
-        if term not in TERMS and ":" not in term:
-            raise ConfigError(
-                f"method.loss_weights.{name}: there is no term '{term}'; {pick(term, list(TERMS))}, or set "
-                f"method.loss_terms.{name}=module:Class"
-            )
-        places[name] = TERMS.get(term, term)
-    return places
 
 
 def __getattr__(name: str) -> Any:
