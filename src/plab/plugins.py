@@ -1,0 +1,100 @@
+"""Objects that a configuration names as ``module:NAME``, plab's own and those of files outside it.
+
+A module is looked for where Python looks, then in the config folder of the command line (``--config-dir``)
+and in the folder above it. So a method or anything else of one's own is a Python file there, and what is
+recorded of it is this text alone, which is the same on every computer.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from plab.config_errors import ConfigError
+
+__all__ = ["load_object", "passed_on", "search_in"]
+
+Kind = TypeVar("Kind")
+
+
+def search_in(config_dir: str | Path) -> None:
+    """Let modules be found in a config folder and in the folder above it, too, for the rest of the process.
+
+    Args:
+        config_dir: Folder with YAML files of the user's own.
+    """
+    folder = Path(config_dir).resolve()
+    # Last, so that nothing of Python's or plab's is hidden by a file of the user's.
+    sys.path += [path for path in (str(folder), str(folder.parent)) if path not in sys.path]
+
+
+@contextmanager
+def passed_on() -> Iterator[None]:
+    """Let processes that are started inside the ``with`` block find the modules that this one finds."""
+    before = os.environ.get("PYTHONPATH")
+    # What comes with Python is left out: the other process may be one of another version.
+    own = [path for path in sys.path if path and not path.startswith((sys.prefix, sys.base_prefix))]
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys([*own, *filter(None, [before])]))
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONPATH"]
+        else:
+            os.environ["PYTHONPATH"] = before
+
+
+def load_object(text: str, kind: type[Kind]) -> Kind:
+    """Return what a text names.
+
+    Args:
+        text: Module and name in it, as ``module:NAME``.
+        kind: What it has to be an instance of; ``type`` for classes.
+
+    Raises:
+        plab.config.ConfigError: If the text is no such text, there is no such module or name, the module
+            cannot be imported, or the object is of another kind; one line.
+    """
+    module_name, _, name = text.partition(":")
+    if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
+        raise _error(f"'{text}' does not name an object: write module:NAME")
+    module = _module(text, module_name)
+    if not hasattr(module, name):
+        raise _error(f"'{text}': {module.__file__} has no {name}")
+    found = getattr(module, name)
+    if not isinstance(found, kind):
+        raise _error(f"'{text}' has to be a {kind.__name__}, and is a {type(found).__name__}")
+    return found
+
+
+def _module(text: str, name: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        missing = str(error.name)
+        if name == missing or name.startswith(f"{missing}."):
+            places = "in the config folder, the folder above it, the working directory or PYTHONPATH"
+            raise _error(f"'{text}': there is no module {missing} {places}") from None
+        raise _error(f"'{text}': module {name} needs {missing}, which is not installed") from None
+    except SyntaxError as error:
+        raise _error(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
+    except Exception as error:
+        # Of the module's own code: where it went wrong is what its author needs.
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{last.filename}, line {last.lineno}"
+        raise _error(f"'{text}': {where}: {type(error).__name__}: {error}") from error
+
+
+def _error(message: str) -> ConfigError:
+    # Imported here: with it comes Hydra, which readers of results do without.
+    from plab.config_errors import ConfigError
+
+    return ConfigError(message)
