@@ -53,16 +53,21 @@ COARSE = (
 OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")
 """Updates begin in the second batch of episodes, and the buffer remembers the last four episodes."""
 
+OWN = Path(__file__).resolve().parents[1] / "examples" / "own_rl" / "conf"
+
 METHODS = {
     "sac": OFF_POLICY,
     "td3": OFF_POLICY,
+    # From outside plab.
+    "tqc": OFF_POLICY,
     # Updates of 10 transitions end within episodes of 4 steps.
     "ppo": ("method.steps_per_update=10", "method.minibatches=2", "method.epochs=2"),
 }
 
 
 def make_config(folder: Path, method: str, *overrides: str) -> Config:
-    return load_config([*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides])
+    words = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides]
+    return load_config(words, OWN if method == "tqc" else None)
 
 
 def run(cfg: Config) -> RunResult:
@@ -146,7 +151,7 @@ def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunRes
 
 
 def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
-    for method in ("sac", "td3"):
+    for method in ("sac", "td3", "tqc"):
         rows = finished[method].iterations
         assert rows["episodes"].tolist() == [0, 6, 12, 16]
         assert rows["steps"].tolist() == [0, 24, 48, 64]
@@ -291,6 +296,7 @@ def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, fin
     cfg = make_config(tmp_path, method)
     partial = result_path(cfg).with_suffix(".partial.h5")
     arguments = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={tmp_path}"]
+    arguments += ["--config-dir", str(OWN)] if method == "tqc" else []
     command = [sys.executable, "-m", "plab.run", *arguments]
     process = subprocess.Popen(command)
     try:
@@ -418,7 +424,17 @@ def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size
 
 
 def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
-    assert {make_config(tmp_path, method).method.algorithm for method in METHODS} == set(FAMILIES["rl"].rules)
+    algorithms = {make_config(tmp_path, method).method.algorithm for method in METHODS}
+    assert algorithms == {*FAMILIES["rl"].rules, "tqc"}
+
+
+def test_a_policy_from_outside_needs_its_module(finished: dict[str, RunResult], monkeypatch) -> None:
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if "own_rl" not in path])
+    monkeypatch.delitem(sys.modules, "tqc")
+    with pytest.raises(ResultsError, match=r"\.policy\.npz: 'tqc:FAMILY': there is no module tqc"):
+        load_policy(finished["tqc"].path)
+    monkeypatch.undo()
+    load_policy(finished["tqc"].path)
 
 
 # ---------------------------------------------------------------- learning, speed

@@ -305,18 +305,20 @@ def _typed_method(method: DictConfig) -> DictConfig:
         root = OmegaConf.create({"method": OmegaConf.structured(wanted)})
         root.merge_with({"method": method})
         return root.method
-    if not issubclass(cast(type, chosen), record.config_type()):
-        raise ConfigError(f"method.family '{method.family}' needs the keys of {wanted.__name__}")
+    if not issubclass(cast(type, chosen), wanted):
+        has, needs = cast(type, chosen).__name__, wanted.__name__
+        raise ConfigError(f"method has the keys of {has}: with its family or algorithm go those of {needs}")
     return method
 
 
 def _choose_profile(method: DictConfig) -> None:
     """Put the chosen profile's values where they are referred to, and forget the profiles."""
-    if "profiles" not in method:
+    if "profiles" not in method or (method.profile is None and not method.profiles):
         return
     if method.profile not in method.profiles:
         names = [str(name) for name in method.profiles]
-        raise ConfigError(f"method.profile '{method.profile}' does not exist; {pick(method.profile, names)}")
+        chosen = str(method.profile)
+        raise ConfigError(f"method.profile '{chosen}' does not exist; {pick(chosen, names)}")
     OmegaConf.resolve(method)
     method.profiles = {}
 

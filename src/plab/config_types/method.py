@@ -134,7 +134,7 @@ class RlConfig(MethodConfig):
 
     Attributes:
         algorithm: Learning algorithm, one of the family's: ``sac``, ``td3`` or ``ppo``.
-        profile: Which of the profiles gives the values that are not overridden.
+        profile: Which of the profiles gives the values that are not overridden; None: there are none.
         episodes: Episodes of training.
         num_envs: Environments simulated together.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
@@ -148,7 +148,7 @@ class RlConfig(MethodConfig):
     """
 
     algorithm: str
-    profile: str
+    profile: str | None
     episodes: int
     num_envs: int
     evaluate_every: int
