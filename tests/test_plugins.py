@@ -7,11 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from plab.config import ConfigError, load_config
+from plab.config import ConfigError, MethodConfig, load_config
 from plab.families import FAMILIES, Family, family, known_family
 from plab.plugins import load_object, passed_on, search_in
+from plab.results import check, read, result_path
+from plab.runners import Runner, run_batch
+from plab.sweep.plan import plan
+
+COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 NEVER = """# A method whose module is {module}.
 name: never
@@ -91,6 +97,59 @@ def test_a_method_without_a_family_is_said(folder: Path) -> None:
         load_config(["method=never"], folder)
 
 
+OPTIMISER = """
+from dataclasses import replace
+
+import torch
+
+from plab.families import FAMILIES, Rule
+
+
+def rprop(parameter, method):
+    return torch.optim.Rprop([parameter], lr=method.lr)
+
+
+FAMILY = replace(FAMILIES["trajectory"], rules={"rprop": Rule(rprop)})
+"""
+
+RPROP = """# Adam's numbers, another update.
+defaults:
+  - adam
+  - _self_
+name: rprop
+family: zz_rprop:FAMILY
+optimizer: rprop
+"""
+
+
+@pytest.mark.physics
+def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folder: Path) -> None:
+    (folder.parent / "zz_rprop.py").write_text(OPTIMISER)
+    (folder / "method" / "rprop.yaml").write_text(RPROP)
+    words = ["method=rprop", *COARSE, "method.iterations=3", "progress=false", f"results_dir={folder}"]
+    cfgs = [load_config([*words, f"seed={seed}"], folder) for seed in (0, 1)]
+    with pytest.raises(ConfigError, match=r"method\.optimizer 'adam' does not exist; choose from: rprop"):
+        load_config([*words, "method.optimizer=adam"], folder)
+    assert plan(cfgs) == [cfgs]
+    assert [one.status for one in run_batch(cfgs)] == ["finished"] * 2
+    results = [read(result_path(cfg)) for cfg in cfgs]
+    assert [result.provenance["batch"] for result in results] == [2, 2]
+    assert all(np.ptp(result.iterations["loss"]) > 0 for result in results)
+    assert [found for _, found in check(folder)] == [None, None]
+
+
+@pytest.mark.physics
+def test_a_runner_that_is_none_is_said(folder: Path) -> None:
+    wrong = "from plab.families import *\nFAMILY = Family('', 'plab.config_types:ApgConfig', dict)\n"
+    (folder / "zz_wrong.py").write_text(wrong)
+    cfg = load_config(["method=apg", f"results_dir={folder}"])
+    cfg.method.family = "zz_wrong:FAMILY"
+    search_in(folder)
+    (ended,) = run_batch([cfg])
+    assert ended.status == "refused"
+    assert ended.message == "the runner of method.family 'zz_wrong:FAMILY' is no plab.runners.Runner"
+
+
 def test_family_and_keys_have_to_fit() -> None:
     with pytest.raises(ConfigError, match=r"method has the keys of TrajectoryConfig: .* those of ApgConfig"):
         load_config(["method=adam", "method.family=apg"])
@@ -99,9 +158,6 @@ def test_family_and_keys_have_to_fit() -> None:
 
 
 def test_everything_that_a_record_names_is_there() -> None:
-    from plab.config_types import MethodConfig
-    from plab.runners import Runner
-
     for record in FAMILIES.values():
         assert isinstance(record, Family) and issubclass(record.runner_type(), Runner)
         assert set(record.may_be_nan) <= set(record.columns)

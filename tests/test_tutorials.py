@@ -153,10 +153,11 @@ def test_an_interrupted_search_goes_on(tmp_path, monkeypatch):
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("launcher", ["batch", "batch_joblib"])
+@pytest.mark.parametrize("launcher", ["batch", "batch_joblib", "batch_submitit_local"])
 def test_a_sweep_over_a_method_of_ones_own(tmp_path, launcher):
-    if launcher == "batch_joblib":
-        pytest.importorskip("joblib")
+    """In this process, and in others, which have to find the module, too."""
+    if launcher != "batch":
+        pytest.importorskip(launcher.split("_")[1])
     done = plab(tmp_path, "plab.run", "-m", *SEARCH, "seed=0,1", f"hydra/launcher={launcher}")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"

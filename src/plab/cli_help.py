@@ -65,6 +65,10 @@ def help_text(config_dir: str | None = None) -> str:
     for method in (name for name, _ in schemas() if name in choices("method")):
         parts.append(f"  of method={method}; what has no value here takes the profile's:")
         parts += _keys(folder / "method" / f"{method}.yaml", "method.")
+    for name, path in choices("method", config_dir).items():
+        if name not in choices("method"):
+            parts.append(f"  of method={name}:")
+            parts += _keys(path, "method.")
     parts.append("  and those of the task; here of Rope:")
     parts += _keys(folder / "task" / "Rope.yaml", "task.")
     return "\n".join(parts)
