@@ -140,7 +140,7 @@ class Runner:
         """
         self.tracks = [Track(job, number) for number, job in enumerate(jobs)]
         self.cache, self._note = cache, note
-        self._columns = family(jobs[0].cfg.method.family).columns
+        self._family = family(jobs[0].cfg.method.family)
         self._clock = _Clock(self.tracks)
 
     # ------------------------------------------------------------------------------------------------ hooks
@@ -251,7 +251,8 @@ class Runner:
             raise
         for track in self.tracks:
             result = track.job.run.result
-            result.provenance["batch"] = len(self.tracks)
+            if self._family.batching:
+                result.provenance["batch"] = len(self.tracks)
             self.start(track, result.resume)
 
     def _optimise(self) -> None:
@@ -277,7 +278,7 @@ class Runner:
             if step.seconds is None:
                 step = replace(step, seconds=time.perf_counter() - start)
             try:
-                rows.append(track.record(step, self._columns, keep=self.KEEP_ALL))
+                rows.append(track.record(step, self._family.columns, keep=self.KEEP_ALL))
             except ResultsError as error:
                 track.job.fail(error)
             start = time.perf_counter()
@@ -285,11 +286,14 @@ class Runner:
 
     def _conclude(self) -> None:
         """Run the best actions in the hard contact model, and finish the files."""
+        for track in (one for one in self.tracks if one.job.open):
+            try:
+                self.conclude(track)
+            except ResultsError as error:
+                track.job.fail(error)
         left = [track for track in self.tracks if track.job.open]
         if not left:
             return
-        for track in left:
-            self.conclude(track)
         best = self.actions_at_rest()
         for track in left:
             best[track.number] = track.best_actions
