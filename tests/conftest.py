@@ -11,6 +11,7 @@ import pytest
 
 from plab.checks import cuda_is_usable
 from plab.config import Config
+from plab.reuse import SimulatorCache
 from plab.tally import Outcome
 from refusals import ending, refusal, snapshot
 from scheduling import pytest_xdist_make_scheduler  # noqa: F401
@@ -50,11 +51,11 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 
     configs: list[Config] = []
 
-    def collect(cfg: Config) -> float:
+    def collect(cfg: Config, cache: SimulatorCache | None = None) -> float:
         configs.append(cfg)
         return 0.5
 
-    def collect_batch(cfgs: list[Config], note: str) -> list[Outcome]:
+    def collect_batch(cfgs: list[Config], note: str, cache: SimulatorCache) -> list[Outcome]:
         return [outcome(cfg, "finished", collect(cfg)) for cfg in cfgs]
 
     monkeypatch.setattr("plab.runners.run_config", collect)

@@ -20,10 +20,9 @@ from pathlib import Path
 
 import toy_runner
 from plab.config import Config, load_config
+from plab.families import FAMILIES
 from plab.results import read, result_path
 from plab.run import main
-from plab.runners import RUNNERS
-from plab.sweep import carry
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SWEEP = ("method=adam,gd", "seed=0,1,2", "checkpoint_seconds=0", "hydra.launcher.batch_size=2")
@@ -31,8 +30,7 @@ SWEEP = ("method=adam,gd", "seed=0,1,2", "checkpoint_seconds=0", "hydra.launcher
 
 def loop(rounds: int, processes: int) -> Counter[str]:
     """Run the rounds; returns how often what happened. Raises AssertionError if something is wrong."""
-    assert carry.runners.RUNNERS is RUNNERS
-    RUNNERS["trajectory"] = "toy_runner:run_toy"
+    FAMILIES["trajectory"] = toy_runner.toy_family("trajectory")
     toy_runner.PAUSE = 0.01
     count: Counter[str] = Counter()
     folder = Path(tempfile.mkdtemp(prefix="kill_loop_"))

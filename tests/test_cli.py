@@ -13,6 +13,7 @@ import pytest
 from plab.checks import cuda_is_usable
 from plab.config import Config, choices
 from plab.results import ResultsError
+from plab.reuse import SimulatorCache
 from plab.run import main
 from plab.runners import RunError
 
@@ -185,7 +186,7 @@ def test_a_sweep_goes_on_after_a_refused_job(seen, capsys):
     [(ResultsError("the disk is full"), 2), (RunError("iteration 3: the loss is not finite"), 1)],
 )
 def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code):
-    def fail(cfg: Config) -> float:
+    def fail(cfg: Config, cache: SimulatorCache) -> float:
         raise error
 
     monkeypatch.setattr("plab.runners.run_config", fail)
@@ -194,7 +195,7 @@ def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code):
 
 
 def test_ctrl_c(monkeypatch, capsys):
-    def interrupt(cfg: Config) -> float:
+    def interrupt(cfg: Config, cache: SimulatorCache) -> float:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("plab.runners.run_config", interrupt)
@@ -204,7 +205,7 @@ def test_ctrl_c(monkeypatch, capsys):
 
 @pytest.mark.parametrize("error", [RuntimeError, ValueError, OSError, KeyError])
 def test_a_bug_keeps_its_traceback(monkeypatch, error):
-    def fail(cfg: Config) -> float:
+    def fail(cfg: Config, cache: SimulatorCache) -> float:
         raise error("a bug")
 
     monkeypatch.setattr("plab.runners.run_config", fail)

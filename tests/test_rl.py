@@ -19,13 +19,15 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from plab.bench import rl as bench
 from plab.config import Config, ConfigError, load_config
 from plab.envs.core import EpisodeBatch
+from plab.families import FAMILIES
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
+from plab.reuse import SimulatorCache
 from plab.runners import RunError, rl, run_config
-from plab.runners.common import episode_columns, kept_batches, policy_episode
+from plab.runners.common import episode_columns, policy_episode, shared_batches
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.replay import EpisodeReplay
-from plab.runners.rl_models import ALGORITHMS, LinearDecay, cycle_steps
+from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
 from plab.sim import SimulationError
 
@@ -53,16 +55,21 @@ OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])
 
+OWN = Path(__file__).resolve().parents[1] / "examples" / "own_rl" / "conf"
+
 METHODS = {
     "sac": OFF_POLICY,
     "td3": OFF_POLICY,
+    # From outside plab.
+    "tqc": OFF_POLICY,
     # Updates of 10 transitions end within episodes of 4 steps.
     "ppo": ("method.steps_per_update=10", "method.minibatches=2", "method.epochs=2"),
 }
 
 
 def make_config(folder: Path, method: str, *overrides: str) -> Config:
-    return load_config([*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides])
+    words = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides]
+    return load_config(words, OWN if method == "tqc" else None)
 
 
 def run(cfg: Config) -> RunResult:
@@ -146,7 +153,7 @@ def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunRes
 
 
 def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
-    for method in ("sac", "td3"):
+    for method in ("sac", "td3", "tqc"):
         rows = finished[method].iterations
         assert rows["episodes"].tolist() == [0, 6, 12, 16]
         assert rows["steps"].tolist() == [0, 24, 48, 64]
@@ -196,7 +203,7 @@ def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
 
 
 def trainer_of(cfg: Config, folder: Path) -> Trainer:
-    batch, _ = kept_batches(cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
+    batch, _ = shared_batches(SimulatorCache(), cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
     return Trainer(cfg, batch, folder / "replay", None)
 
 
@@ -217,7 +224,7 @@ def test_an_update_is_the_unit_of_ppo_a_batch_of_episodes_that_of_the_others(tmp
 
 def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseException) -> None:
     """Let the run break off in the training that follows some evaluations."""
-    looked, intact = rl.Evaluator.episode, Trainer.note_step
+    looked, intact = rl.RlRunner.episode, Trainer.note_step
     counts = {"evaluations": 0, "steps": 0}
 
     def episode(self, trainer):
@@ -230,7 +237,7 @@ def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseEx
             raise error
         return intact(self, actions, infos)
 
-    monkeypatch.setattr(rl.Evaluator, "episode", episode)
+    monkeypatch.setattr(rl.RlRunner, "episode", episode)
     monkeypatch.setattr(Trainer, "note_step", note_step)
 
 
@@ -278,7 +285,7 @@ def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
 ) -> None:
     cfg = make_config(tmp_path, "sac")
     with monkeypatch.context() as patch:
-        patch.setattr(rl.Evaluator, "judge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+        patch.setattr(rl.RlRunner, "judge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             run_config(cfg)
     assert not result_path(cfg).with_suffix(".replay").exists()
@@ -291,6 +298,7 @@ def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, fin
     cfg = make_config(tmp_path, method)
     partial = result_path(cfg).with_suffix(".partial.h5")
     arguments = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={tmp_path}"]
+    arguments += ["--config-dir", str(OWN)] if method == "tqc" else []
     command = [sys.executable, "-m", "plab.run", *arguments]
     process = subprocess.Popen(command)
     try:
@@ -342,7 +350,7 @@ def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> Non
 
 
 def test_what_is_not_installed_is_said_before_anything_is_built(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(rl, "kept_batches", None)
+    monkeypatch.setattr(rl, "shared_batches", None)
     monkeypatch.setattr("plab.checks.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"TensorBoard: pip install 'plab\[tensorboard\]'"):
         run_config(make_config(tmp_path, "ppo", "method.tensorboard=true"))
@@ -418,7 +426,17 @@ def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size
 
 
 def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
-    assert {make_config(tmp_path, method).method.algorithm for method in METHODS} == set(ALGORITHMS)
+    algorithms = {make_config(tmp_path, method).method.algorithm for method in METHODS}
+    assert algorithms == {*FAMILIES["rl"].rules, "tqc"}
+
+
+def test_a_policy_from_outside_needs_its_module(finished: dict[str, RunResult], monkeypatch) -> None:
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if "own_rl" not in path])
+    monkeypatch.delitem(sys.modules, "tqc")
+    with pytest.raises(ResultsError, match=r"\.policy\.npz: 'tqc:FAMILY': there is no module tqc"):
+        load_policy(finished["tqc"].path)
+    monkeypatch.undo()
+    load_policy(finished["tqc"].path)
 
 
 # ---------------------------------------------------------------- learning, speed

@@ -13,10 +13,10 @@ import pytest
 
 import toy_runner
 from plab.config import Config, load_config
+from plab.families import FAMILIES
 from plab.locks import acquire
 from plab.results import RunFile, config_hash, read, result_path
 from plab.run import main
-from plab.runners import RUNNERS
 from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
@@ -32,8 +32,8 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 @pytest.fixture
 def toy(monkeypatch) -> Callable[..., list[Config]]:
     """Let the toy runner do the work; returns a function that composes runs."""
-    for family in RUNNERS:
-        monkeypatch.setitem(RUNNERS, family, "toy_runner:run_toy")
+    for family in FAMILIES:
+        monkeypatch.setitem(FAMILIES, family, toy_runner.toy_family(family))
 
     def configs(*overrides: str, seeds: tuple[int, ...] = (0, 1, 2)) -> list[Config]:
         return [load_config([*COARSE, f"seed={seed}", *overrides]) for seed in seeds]
@@ -228,9 +228,9 @@ def test_what_another_process_leaves_behind_is_taken_up(toy, monkeypatch, capsys
 _SWEEP = """
 import sys
 import toy_runner
+from plab.families import FAMILIES
 from plab.run import main
-from plab.runners import RUNNERS
-RUNNERS["trajectory"] = "toy_runner:run_toy"
+FAMILIES["trajectory"] = toy_runner.toy_family("trajectory")
 toy_runner.PAUSE = 0.02
 sys.exit(main(sys.argv[1:]))
 """

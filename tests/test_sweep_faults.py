@@ -12,9 +12,9 @@ import pytest
 
 import toy_runner
 from plab.config import Config, load_config
+from plab.families import FAMILIES
 from plab.results import SCHEMA_VERSION, read, result_path
 from plab.run import main
-from plab.runners import RUNNERS
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -25,7 +25,7 @@ HERE = Path(__file__).parent
 def wanted(tmp_path: Path, monkeypatch) -> list[Config]:
     """Three runs of the toy runner, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(RUNNERS, "trajectory", "toy_runner:run_toy")
+    monkeypatch.setitem(FAMILIES, "trajectory", toy_runner.toy_family("trajectory"))
     return [load_config([*COARSE, f"seed={seed}", "checkpoint_seconds=0"]) for seed in range(3)]
 
 

@@ -13,12 +13,14 @@ import pandas as pd
 import pytest
 
 from plab.config import Config, load_config
+from plab.families import FAMILIES
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import RunResult, read, result_path
+from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_config, trajectory
-from plab.runners.common import measures
-from plab.runners.trajectory import ActionSequence, make_problem
+from plab.runners.common import measures, shared_problem
+from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
 
 pytestmark = pytest.mark.physics
@@ -128,7 +130,7 @@ def test_adam_is_adam(method) -> None:
         np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("optimizer", sorted(trajectory.OPTIMIZERS))
+@pytest.mark.parametrize("optimizer", sorted(FAMILIES["trajectory"].rules))
 def test_restored_actions_go_on_alike(method, optimizer: str) -> None:
     method = replace(method, optimizer=optimizer)
     rng = np.random.default_rng(0)
@@ -169,7 +171,7 @@ def test_best_actions_are_kept(tmp_path: Path) -> None:
     assert result.best_iteration == best
     assert result.best_loss == result.iterations["loss"][best]
     assert np.abs(result.best_actions).max() <= 1.0
-    problem = make_problem([cfg])
+    problem = shared_problem(SimulatorCache(), [cfg])
     problem.simulator.set_contact("soft", cfg.method.softness)
     again = problem.rollout(result.best_actions[None], gradient=True)
     assert again.loss.sum() == result.best_loss
@@ -193,7 +195,7 @@ def test_gd_runs(tmp_path: Path) -> None:
 def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monkeypatch, capsys) -> None:
     cfg = make_config(Path(finished.config["results_dir"]))
     before = finished.path.stat().st_mtime_ns
-    monkeypatch.setattr(trajectory, "make_problem", None)
+    monkeypatch.setattr(trajectory, "shared_problem", None)
     assert run_config(cfg) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out

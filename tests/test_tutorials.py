@@ -12,12 +12,15 @@ from typing import Any
 
 import pytest
 
-from plab.results import load
+from plab.config import load_config
+from plab.results import RunFile, RunResult, load, read
+from plab.runners import run_config
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
+RL = ROOT / "examples" / "own_rl"
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 # Run in a copy of plab that has the disc: the gradient must be what differences are.
@@ -89,26 +92,75 @@ def test_the_yield_stress_is_found_again():
 
 
 @pytest.mark.parametrize("excerpt", [*blocks("own_method.md", "python"), *blocks("own_method.md", "yaml")])
-def test_excerpts_are_from_the_method(excerpt):
-    files = (METHOD / "random_search.py", METHOD / "conf" / "method" / "random_search.yaml")
-    assert any(excerpt in file.read_text(encoding="utf-8") for file in files)
+def test_excerpts_are_from_the_methods(excerpt):
+    files = [path for folder in (METHOD, RL) for path in folder.rglob("*.*")]
+    assert any(
+        excerpt in file.read_text(encoding="utf-8") for file in files if file.suffix in (".py", ".yaml")
+    )
+
+
+def plab(folder: Path, *words: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run one of plab's command lines in a folder, perhaps with another one where modules are found."""
+    found = [str(path)] if path else []
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*found, str(SRC)])}
+    command = [sys.executable, "-m", *words]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+SEARCH = ("--config-dir", str(METHOD / "conf"), "method=random_search", *COARSE, "method.iterations=4")
 
 
 @pytest.mark.physics
 def test_a_method_of_ones_own(tmp_path):
-    def search(*words: str) -> subprocess.CompletedProcess[str]:
-        script = [sys.executable, str(METHOD / "random_search.py"), "--config-dir", str(METHOD / "conf")]
-        command = [*script, "method=random_search", *COARSE, "method.iterations=4", *words]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-
-    first = search()
+    first = plab(tmp_path, "plab.run", *SEARCH)
     assert (first.returncode, first.stderr) == (0, "")
-    table = load(tmp_path / "results")
-    assert table[["method", "status", "iterations"]].values.tolist() == [["random_search", "finished", 4]]
-    check = [sys.executable, "-m", "plab.results", "check", "results"]
-    assert subprocess.run(check, cwd=tmp_path, check=False, capture_output=True).returncode == 0
-    refused = search("method.spread=0")
+    table = load(tmp_path / "results", keys=["method.family"])
+    columns = ["method", "status", "iterations", "method.family"]
+    assert table[columns].values.tolist() == [["random_search", "finished", 4, "random_search:FAMILY"]]
+    # Whoever reads the results may have the module or not.
+    for path in (None, METHOD):
+        assert plab(tmp_path, "plab.results", "check", "results", path=path).returncode == 0
+    seen = plab(tmp_path, "plab.status", "results", "method=random_search", "--csv")
+    assert seen.returncode == 0 and "random_search" in seen.stdout
+    refused = plab(tmp_path, "plab.run", *SEARCH, "method.spread=0")
     assert refused.returncode == 2 and refused.stderr == "plab: method.spread must be positive, not 0\n"
+
+
+@pytest.mark.physics
+def test_an_interrupted_search_goes_on(tmp_path, monkeypatch):
+    def result(folder: str) -> RunResult:
+        run_config(
+            load_config([*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"], SEARCH[1])
+        )
+        (path,) = (tmp_path / folder).rglob("*.h5")
+        return read(path)
+
+    whole, intact, calls = result("whole"), RunFile.record, iter(range(100))
+
+    def record(self, *arguments, **changes):
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        intact(self, *arguments, **changes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFile, "record", record)
+        with pytest.raises(KeyboardInterrupt):
+            result("parts")
+    parts = result("parts")
+    assert parts.provenance["resumed"] == 1
+    assert parts.iterations["loss"].tolist() == whole.iterations["loss"].tolist()
+    assert parts.evaluation == whole.evaluation
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("launcher", ["batch", "batch_joblib", "batch_submitit_local"])
+def test_a_sweep_over_a_method_of_ones_own(tmp_path, launcher):
+    """In this process, and in others, which have to find the module, too."""
+    if launcher != "batch":
+        pytest.importorskip(launcher.split("_")[1])
+    done = plab(tmp_path, "plab.run", "-m", *SEARCH, "seed=0,1", f"hydra/launcher={launcher}")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
 
 
 # -------------------------------------------------------------------------------------------- own manipulator

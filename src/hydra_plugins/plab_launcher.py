@@ -94,6 +94,7 @@ class BatchLauncher(Launcher):
         self, overrides: dict[str, Sequence[str]]
     ) -> Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]:
         """Return what hands batches to the inner launcher, one job each; ``overrides`` are by result file."""
+        from plab.plugins import passed_on
         from plab.results import result_path
         from plab.sweep.carry import BatchTask, look_up
 
@@ -109,7 +110,8 @@ class BatchLauncher(Launcher):
             runs, name = sum(len(batch) for batch in batches), type(inner).__name__
             print(f"{runs} runs go to {name} in {len(batches)} jobs", flush=True)
             try:
-                returns = inner.launch(jobs, initial_job_idx=0)
+                with passed_on():
+                    returns = inner.launch(jobs, initial_job_idx=0)
                 outcomes = [one for job in returns for one in job.return_value]
             except Exception as error:
                 # A job's process was killed, say, or the queue refused the jobs: the files know how far they

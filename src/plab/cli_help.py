@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
+from plab.families import schemas
 
 __all__ = ["help_text"]
 
@@ -60,9 +61,14 @@ def help_text(config_dir: str | None = None) -> str:
     parts += _keys(folder / "config.yaml", "")
     parts += _keys(folder / "sim" / "fast.yaml", "sim.")
     parts += _keys(folder / "method" / "adam.yaml", "method.")
-    for method in ("sac", "td3", "ppo", "apg"):
+    # Each has keys of its own; those of adam are the default's, above.
+    for method in (name for name, _ in schemas() if name in choices("method")):
         parts.append(f"  of method={method}; what has no value here takes the profile's:")
         parts += _keys(folder / "method" / f"{method}.yaml", "method.")
+    for name, path in choices("method", config_dir).items():
+        if name not in choices("method"):
+            parts.append(f"  of method={name}:")
+            parts += _keys(path, "method.")
     parts.append("  and those of the task; here of Rope:")
     parts += _keys(folder / "task" / "Rope.yaml", "task.")
     return "\n".join(parts)

@@ -23,7 +23,6 @@ from plab.config_errors import COMPOSE_ERRORS, ConfigError, explain, pick
 from plab.config_types import (
     CONTACTS,
     DEVICES,
-    OPTIMIZERS,
     PRECISIONS,
     ApgConfig,
     BodyConfig,
@@ -38,6 +37,8 @@ from plab.config_types import (
     Td3Config,
     TrajectoryConfig,
 )
+from plab.families import family, schemas
+from plab.plugins import search_in
 from plab.random_variant import draw_variant
 from plab.scene import Scene, vector3
 from plab.suite import conf_folder
@@ -48,7 +49,6 @@ __all__ = [
     "DEVICES",
     "EXPERIMENT",
     "GROUPS",
-    "OPTIMIZERS",
     "PRECISIONS",
     "ApgConfig",
     "BodyConfig",
@@ -78,16 +78,17 @@ GROUPS = ("task", "method", "sim")
 EXPERIMENT = "experiment"
 """Group of files that preset any keys and sweeps over them; added by ``+experiment=``."""
 
-ConfigStore.instance().store(name="plab_schema", node=Config)
+
+@dataclasses.dataclass
+class _Composed(Config):
+    """A configuration as Hydra composes it: of which type the method is, its YAML says."""
+
+    method: Any
+
+
+ConfigStore.instance().store(name="plab_schema", node=_Composed)
 # A group of its own, so that `method=` offers real methods only.
-_METHOD_SCHEMAS = {
-    "trajectory": TrajectoryConfig,
-    "apg": ApgConfig,
-    "sac": SacConfig,
-    "td3": Td3Config,
-    "ppo": PpoConfig,
-}
-for _name, _schema in _METHOD_SCHEMAS.items():
+for _name, _schema in schemas():
     ConfigStore.instance().store(group="schema/method", name=_name, node=_schema)
 
 
@@ -172,7 +173,8 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
 
     Args:
         overrides: As on the command line.
-        config_dir: Folder with files of the user's own, in subfolders named like the groups.
+        config_dir: Folder with files of the user's own, in subfolders named like the groups; modules that
+            they name are found there from now on, see :mod:`plab.plugins`.
 
     Raises:
         ConfigError: If a key is to be removed, a group is not given exactly one choice, or the folder does
@@ -181,6 +183,7 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
     """
     if config_dir is not None:
         _check_config_dir(config_dir)
+        search_in(config_dir)
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, text = override.key_or_group, str(override.input_line)
         if not key:
@@ -216,6 +219,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         ConfigError: If a value is missing, of the wrong type or out of range.
     """
     try:
+        composed.method = _typed_method(composed.method)
         _reject_unknown(composed, "")
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
@@ -223,9 +227,10 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         _choose_learning_rate(composed.method)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
-        cfg = cast(Config, OmegaConf.to_object(composed))
+        parts = vars(OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
+    cfg = Config(**parts)
     cfg.check()
     return cfg
 
@@ -284,13 +289,36 @@ def build_scene(cfg: Config) -> Scene:
 # ---------------------------------------------------------------------------------------------------- details
 
 
+def _typed_method(method: DictConfig) -> DictConfig:
+    """Return the section ``method`` with the types of its family, unless its YAML has chosen them.
+
+    Raises:
+        ConfigError: If there is no such family, or the section is of the type of another one.
+        omegaconf.errors.OmegaConfBaseException: If a key or a value does not fit.
+    """
+    if not isinstance(method, DictConfig) or "family" not in method:
+        raise ConfigError("method.family has no value: name the family, or its module:NAME")
+    record, rule = family(str(method.family)), method.get("algorithm")
+    wanted, chosen = record.config_type(rule), OmegaConf.get_type(method)
+    if not dataclasses.is_dataclass(chosen):
+        # Below a root, so that what is wrong is named method.<key>.
+        root = OmegaConf.create({"method": OmegaConf.structured(wanted)})
+        root.merge_with({"method": method})
+        return root.method
+    if not issubclass(cast(type, chosen), wanted):
+        has, needs = cast(type, chosen).__name__, wanted.__name__
+        raise ConfigError(f"method has the keys of {has}: with its family or algorithm go those of {needs}")
+    return method
+
+
 def _choose_profile(method: DictConfig) -> None:
     """Put the chosen profile's values where they are referred to, and forget the profiles."""
-    if "profiles" not in method:
+    if "profiles" not in method or (method.profile is None and not method.profiles):
         return
     if method.profile not in method.profiles:
         names = [str(name) for name in method.profiles]
-        raise ConfigError(f"method.profile '{method.profile}' does not exist; {pick(method.profile, names)}")
+        chosen = str(method.profile)
+        raise ConfigError(f"method.profile '{chosen}' does not exist; {pick(chosen, names)}")
     OmegaConf.resolve(method)
     method.profiles = {}
 

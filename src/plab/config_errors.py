@@ -107,8 +107,10 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
 
 
 def _paths(node: object, prefix: str = "") -> Iterator[str]:
-    """Dotted paths of all keys of dataclass nodes below a node."""
-    if not isinstance(node, DictConfig) or not dataclasses.is_dataclass(OmegaConf.get_type(node)):
+    """Dotted paths of all keys of dataclass nodes below a node, and of a method that has no type yet."""
+    if not isinstance(node, DictConfig):
+        return
+    if prefix != "method." and not dataclasses.is_dataclass(OmegaConf.get_type(node)):
         return
     for key in map(str, node):
         if key != "hydra":

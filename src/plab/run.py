@@ -27,6 +27,7 @@ from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
+from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
 from plab.targets import TargetError
@@ -84,10 +85,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _job(tally: Tally) -> TaskFunction:
     """Return what Hydra calls with the configuration of a single run, or of a job of another launcher."""
 
+    # Launchers other than plab's may do one job after the other in this process.
+    cache = SimulatorCache()
+
     def job(composed: DictConfig) -> float:
         tally.started = True
         try:
-            return _run(composed)
+            return _run(composed, cache)
         except Refusal as refusal:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 # It has to get out of the job's process.
@@ -101,7 +105,7 @@ def _job(tally: Tally) -> TaskFunction:
     return job
 
 
-def _run(composed: DictConfig) -> float:
+def _run(composed: DictConfig, cache: SimulatorCache) -> float:
     """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
     # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
@@ -114,7 +118,7 @@ def _run(composed: DictConfig) -> float:
     except _CONFIG_ERRORS as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
     try:
-        return run_config(cfg)
+        return run_config(cfg, cache)
     except (RunBusyError, RunError) as error:
         raise Refusal(str(error), EXIT_BROKE_OFF) from error
     except USER_ERRORS as error:

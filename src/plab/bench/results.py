@@ -27,10 +27,11 @@ from plab.arguments import positive, to_write
 from plab.bench.table import report
 from plab.command import answered
 from plab.config import load_config
+from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
-from plab.results.schema import COLUMNS, FAMILY_COLUMNS, loss_columns
+from plab.results.schema import COLUMNS, loss_columns
 from plab.selection import Selection
 from plab.status import survey
 from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
@@ -64,7 +65,7 @@ def synthetic_run(
         np.arange(rows) if "iterations" in method else np.linspace(0, method["episodes"], rows).astype(int)
     )
     curve = score * (1.0 - np.exp(-3.0 * np.arange(rows) / max(rows - 1, 1)))
-    columns = (*COLUMNS, *loss_columns(config), *FAMILY_COLUMNS[method["family"]])
+    columns = (*COLUMNS, *loss_columns(config), *family(method["family"]).columns)
     table = pd.DataFrame({name: rng.uniform(0.0, 1.0, rows) for name in columns})
     table["iteration"], table["episodes"], table["steps"] = np.arange(rows), episodes, episodes * horizon
     table["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)

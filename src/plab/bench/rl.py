@@ -29,8 +29,9 @@ from plab.arguments import positive, to_write
 from plab.bench.table import report
 from plab.command import answered
 from plab.config import Config, PpoConfig, load_config
-from plab.config_types import ALGORITHMS, OffPolicyConfig, RlConfig
+from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
+from plab.families import FAMILIES
 from plab.runners.common import torch_settings
 from plab.runners.rl_trainer import Trainer
 
@@ -133,7 +134,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
     )
-    parser.add_argument("--methods", nargs="+", choices=ALGORITHMS, default=["ppo", "sac"], help="methods")
+    methods = tuple(FAMILIES["rl"].rules)
+    parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
     parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")

@@ -5,10 +5,8 @@ leave out.
 """
 
 from plab.config_types.method import (
-    ALGORITHMS,
     CONTACTS,
     DEVICES,
-    OPTIMIZERS,
     ApgConfig,
     MethodConfig,
     OffPolicyConfig,
@@ -29,10 +27,8 @@ from plab.config_types.task import (
 )
 
 __all__ = [
-    "ALGORITHMS",
     "CONTACTS",
     "DEVICES",
-    "OPTIMIZERS",
     "PRECISIONS",
     "ApgConfig",
     "BodyConfig",

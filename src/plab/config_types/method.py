@@ -7,13 +7,12 @@ from typing import Any
 
 from plab.config_errors import ConfigError
 from plab.config_types.ranges import at_least, folder_name, fraction, one_of, positive, share, vector, widths
+from plab.families import family
 from plab.losses.registry import check_terms
 
 __all__ = [
-    "ALGORITHMS",
     "CONTACTS",
     "DEVICES",
-    "OPTIMIZERS",
     "ApgConfig",
     "MethodConfig",
     "OffPolicyConfig",
@@ -26,8 +25,6 @@ __all__ = [
 
 DEVICES = ("cpu", "cuda")
 CONTACTS = ("soft", "hard")
-OPTIMIZERS = ("adam", "gd")
-ALGORITHMS = ("sac", "td3", "ppo")
 
 
 @dataclass
@@ -36,7 +33,8 @@ class MethodConfig:
 
     Attributes:
         name: Name of the method in results and reports.
-        family: Runner that carries it out, a key of ``plab.runners.RUNNERS``.
+        family: Family that it belongs to: a key of ``plab.families.FAMILIES``, or the ``module:NAME`` of a
+            :class:`plab.families.Family` outside plab.
         contact: Contact model of the rollouts, ``soft`` or ``hard``; the final evaluation always uses the
             hard one.
         softness: Decay rate alpha of the soft contact [1 / domain unit].
@@ -69,7 +67,7 @@ class TrajectoryConfig(MethodConfig):
     """Open-loop optimisation of the action sequence through the differentiable simulator.
 
     Attributes:
-        optimizer: Update rule, ``adam`` or ``gd``.
+        optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
         lr_by_task: Learning rates by task. Empty in a run's configuration: what was used is in ``lr``.
         betas: Decay rates of adam's two moment estimates.
@@ -93,7 +91,7 @@ class TrajectoryConfig(MethodConfig):
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        one_of(f"{path}.optimizer", self.optimizer, OPTIMIZERS)
+        one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
         positive(f"{path}.lr", self.lr)
         vector(f"{path}.betas", self.betas, 2)
         for beta in self.betas:
@@ -137,8 +135,8 @@ class RlConfig(MethodConfig):
     """What the reinforcement-learning methods have in common.
 
     Attributes:
-        algorithm: A key of ``plab.runners.rl_models.ALGORITHMS``.
-        profile: Which of the profiles gives the values that are not overridden.
+        algorithm: Learning algorithm, one of the family's: ``sac``, ``td3`` or ``ppo``.
+        profile: Which of the profiles gives the values that are not overridden; None: there are none.
         episodes: Episodes of training.
         num_envs: Environments simulated together.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
@@ -152,7 +150,7 @@ class RlConfig(MethodConfig):
     """
 
     algorithm: str
-    profile: str
+    profile: str | None
     episodes: int
     num_envs: int
     evaluate_every: int
@@ -167,7 +165,7 @@ class RlConfig(MethodConfig):
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        one_of(f"{path}.algorithm", self.algorithm, ALGORITHMS)
+        one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
         for name in ("episodes", "num_envs", "evaluate_every", "torch_threads"):
             at_least(f"{path}.{name}", getattr(self, name), 1)
         one_of(f"{path}.torch_device", self.torch_device, DEVICES)

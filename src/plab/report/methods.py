@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from plab.families import FAMILIES, GRADIENT, RL
 from plab.suite import PAPER_METHODS
 
 __all__ = ["GRADIENT", "RL", "Method", "method", "ordered"]
-
-RL, GRADIENT = "RL", "gradient"
-"""Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +18,8 @@ class Method:
     Attributes:
         name: Name in results and configuration.
         label: Name for readers.
-        kind: :data:`RL` or :data:`GRADIENT`; empty for a method that plab does not know.
+        kind: :data:`plab.families.RL` or :data:`plab.families.GRADIENT`; empty for a method that is not
+            plab's.
         colour: Colour of its curves.
         dashes: Line style, for those who do not see the colour.
     """
@@ -37,22 +36,18 @@ class Method:
         return "#FFFFFF" if self.colour == "#000000" else self.colour
 
 
-# Okabe and Ito's palette, which people with any colour vision can tell apart.
-_KNOWN = (
-    Method("sac", "SAC", RL, "#0072B2"),
-    Method("td3", "TD3", RL, "#56B4E9", "--"),
-    Method("ppo", "PPO", RL, "#009E73", "-."),
-    Method("adam", "Adam", GRADIENT, "#D55E00"),
-    Method("gd", "GD", GRADIENT, "#E69F00", "--"),
-    Method("adam_h", "Adam-H", GRADIENT, "#CC79A7", "-."),
-    Method("apg", "APG", GRADIENT, "#000000", ":"),
-)
-_BY_NAME = {known.name: known for known in _KNOWN}
+_LOOKS = {
+    name: Method(name, look.label, family.kind, look.colour, look.dashes)
+    for family in FAMILIES.values()
+    for name, look in family.methods.items()
+}
+# In the order of the paper, then those that it does not have.
+_KNOWN = tuple(_LOOKS[name] for name in dict.fromkeys((*PAPER_METHODS, *_LOOKS)))
 
 
 def method(name: str) -> Method:
     """Return how a method appears; one that plab does not know is grey and belongs to no kind."""
-    return _BY_NAME.get(name) or Method(name, name, "", "#777777", ":")
+    return _LOOKS.get(name) or Method(name, name, "", "#777777", ":")
 
 
 def ordered(present: Iterable[str]) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from plab.families import known_family
 from plab.objective import scores_from_iou
 from plab.results.files import explained, read
 from plab.results.loading import run_files
@@ -17,8 +18,6 @@ from plab.results.schema import (
     ARCHIVE_SUFFIX,
     COLUMNS,
     EVALUATION,
-    FAMILY_COLUMNS,
-    MAY_BE_NAN,
     PARTIAL_SUFFIX,
     STATUSES,
     ResultsError,
@@ -149,14 +148,17 @@ def _iterations(run: RunResult) -> Iterator[str]:
         if run.status == "finished":
             yield "it has no iterations"
         return
-    wanted = (*COLUMNS, *loss_columns(run.config), *FAMILY_COLUMNS.get(run.config["method"]["family"], ()))
+    family, common = known_family(run.config["method"]["family"]), (*COLUMNS, *loss_columns(run.config))
+    wanted = common if family is None else (*common, *family.columns)
+    # What further columns mean that a family outside plab has, only its record says.
+    may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
     if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
     if strange := [name for name in table if table[name].dtype.kind not in "iuf"]:
         yield f"iterations are not numbers: {', '.join(map(str, strange))}"
         return
-    if endless := [n for n in table if n not in MAY_BE_NAN and not np.isfinite(table[n]).all()]:
+    if endless := [n for n in table if n not in may_be_nan and not np.isfinite(table[n]).all()]:
         yield f"iterations are not finite: {', '.join(map(str, endless))}"
     if not np.array_equal(table["iteration"], np.arange(len(table))):
         yield "iterations are not numbered 0, 1, 2, ..."

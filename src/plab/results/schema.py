@@ -17,8 +17,6 @@ __all__ = [
     "ARCHIVE_SUFFIX",
     "COLUMNS",
     "EVALUATION",
-    "FAMILY_COLUMNS",
-    "MAY_BE_NAN",
     "PARTIAL_SUFFIX",
     "SCHEMA_VERSION",
     "STATUSES",
@@ -49,17 +47,8 @@ ARCHIVE_SUFFIX = ".plab.zip"
 _MEASURES = ("loss", "reward", "iou", "score")
 
 COLUMNS = ("iteration", "episodes", "steps", *_MEASURES, "seconds")
-"""Columns that the iterations of every method have, beside those of :func:`loss_columns`."""
-
-FAMILY_COLUMNS = {
-    "trajectory": ("gradient_norm",),
-    "apg": ("gradient_norm",),
-    "rl": ("train_reward", "train_score"),
-}
-"""Further columns by ``method.family``."""
-
-MAY_BE_NAN = ("train_reward", "train_score")
-"""Columns with entries for which there is no number: no episode of training had ended."""
+"""Columns that the iterations of every method have, beside those of :func:`loss_columns`;
+:mod:`plab.families` has those of a family."""
 
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation, beside those of :func:`loss_columns`."""

@@ -1,8 +1,8 @@
 """Runners: one per family of methods; each turns configurations into result files.
 
-A family is one entry of :data:`RUNNERS`. Its module is imported when it is needed, so that an open-loop
-method does not import a reinforcement-learning library. Runs are carried out in batches; a single run is a
-batch of one.
+:mod:`plab.families` says which runner a family has. Its module is imported when it is needed, so that an
+open-loop method does not import a reinforcement-learning library. Runs are carried out in batches; a single
+run is a batch of one.
 """
 
 from __future__ import annotations
@@ -10,43 +10,28 @@ from __future__ import annotations
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from importlib import import_module
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
+from plab.config_errors import ConfigError
+from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile
+from plab.reuse import SimulatorCache
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
+from plab.runners.runner import Runner, Step, Track
 from plab.tally import Outcome
 
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["BATCHING", "RUNNERS", "Job", "RunError", "Runner", "run_batch", "run_config"]
-
-RUNNERS = {
-    "trajectory": "plab.runners.trajectory:run_trajectory",
-    "rl": "plab.runners.rl:run_rl",
-    "apg": "plab.runners.apg:run_apg",
-}
-"""Family of methods (``method.family``) to the :class:`Runner` of it, as ``module:name``."""
-
-BATCHING = ("trajectory",)
-"""Families whose runs can share a simulator; the others batch the environments of one run."""
+__all__ = ["Job", "RunError", "Runner", "SimulatorCache", "Step", "Track", "run_batch", "run_config"]
 
 
-class Runner(Protocol):
-    """A function that takes runs from where their files stand to the end, and finishes the files.
-
-    A run that breaks off is noted in its job and does not disturb the others.
-    """
-
-    def __call__(self, jobs: Sequence[Job], note: str = "") -> None: ...
-
-
-def run_config(cfg: Config) -> float:
+def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
     """Run one configuration, unless its result is there already.
 
     Args:
         cfg: The composed and checked configuration.
+        cache: Simulators of earlier runs, for whoever runs several; None: a new one.
 
     Returns:
         Score of the final evaluation, in [0, 1].
@@ -58,7 +43,7 @@ def run_config(cfg: Config) -> float:
     job = Job(cfg, RunFile(cfg))
     before = job.run.finished
     if not before:
-        _carry_out([job])
+        _carry_out([job], "", cache or SimulatorCache())
     if job.error is not None:
         raise job.error
     score = job.run.result.evaluation["score"]
@@ -66,7 +51,7 @@ def run_config(cfg: Config) -> float:
     return score
 
 
-def run_batch(cfgs: Sequence[Config], note: str = "") -> list[Outcome]:
+def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
     """Run configurations that fit together; see :func:`plab.sweep.plan`.
 
     Runs that have finished before, or that another process computes, are left out.
@@ -74,6 +59,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "") -> list[Outcome]:
     Args:
         cfgs: The composed and checked configurations.
         note: How far the sweep has come, shown before the progress.
+        cache: Simulators of earlier batches, for whoever runs several; None: a new one.
 
     Returns:
         How each run ended, in the order of ``cfgs``.
@@ -89,7 +75,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "") -> list[Outcome]:
             ended[number] = outcome(cfg, "refused", message=str(error))
     before = {number for number, job in jobs.items() if job.run.finished}
     if todo := [job for number, job in jobs.items() if number not in before]:
-        _carry_out(todo, note)
+        _carry_out(todo, note, cache or SimulatorCache())
         _print_bugs(todo)
     for number, job in jobs.items():
         ended[number] = one = _outcome(job, "before" if number in before else "finished")
@@ -114,11 +100,11 @@ def _print_bugs(jobs: Sequence[Job]) -> None:
             traceback.print_exception(error)
 
 
-def _carry_out(jobs: Sequence[Job], note: str = "") -> None:
+def _carry_out(jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
     """Run jobs to their ends; afterwards each has finished or has an error, and holds no lock."""
     halves: list[Sequence[Job]] = []
     try:
-        _runner(jobs[0].cfg.method.family)(jobs, note)
+        _runner(jobs[0].cfg.method.family)(jobs, note, cache).run()
     except KeyboardInterrupt:
         for job in jobs:
             if job.open:
@@ -138,12 +124,11 @@ def _carry_out(jobs: Sequence[Job], note: str = "") -> None:
                 job.run.release()
     # Not in the handler: there the error still refers to the simulator that was too large.
     for half in halves:
-        _carry_out(half, note)
+        _carry_out(half, note, cache)
 
 
-def _runner(family: str) -> Runner:
-    try:
-        module, name = RUNNERS[family].split(":")
-    except KeyError:
-        raise RunError(f"method.family '{family}' is not one of {', '.join(RUNNERS)}") from None
-    return getattr(import_module(module), name)
+def _runner(name: str) -> type[Runner]:
+    kind = family(name).runner_type()
+    if not issubclass(kind, Runner):
+        raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
+    return kind

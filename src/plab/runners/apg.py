@@ -11,55 +11,51 @@ from __future__ import annotations
 
 import io
 import itertools
-import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import torch
 
 from plab.config_types import ApgConfig
-from plab.progress import show_progress
-from plab.results import RunFile
-from plab.runners.common import kept_batches, measures, policy_episode, simulation_errors, torch_settings
-from plab.runners.jobs import Job, title
+from plab.runners.common import policy_episode, shared_batches, torch_settings
+from plab.runners.runner import Runner, Step, Track
 from plab.torch import rollout
 
-if TYPE_CHECKING:
-    from plab.config import Config
-    from plab.envs.core import EpisodeBatch
-
-__all__ = ["PolicyTraining", "run_apg"]
+__all__ = ["ApgRunner", "PolicyTraining"]
 
 
-def run_apg(jobs: Sequence[Job], note: str = "") -> None:
-    """Train a policy network, evaluate the best actions in the hard contact model, finish the file.
+class ApgRunner(Runner):
+    """Trains a policy network; each iteration is an episode of it, and the same actions with gradient."""
 
-    Args:
-        jobs: One job; ``cfg.method`` is a :class:`plab.config.ApgConfig`. What an earlier process left in its
-            file is taken up.
-        note: Shown before the progress.
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self._method.torch_threads)
 
-    Raises:
-        plab.runners.RunError: If the loss, the gradient or the state stops being finite.
-    """
-    (job,) = jobs
-    cfg, run, method = job.cfg, job.run, job.cfg.method_as(ApgConfig)
-    with torch_settings(method.torch_threads), simulation_errors():
-        with run.phase("build"):
-            (episode,) = kept_batches(cfg, (1, method.contact))
-            sizes = episode.observation_space.shape[0], episode.action_space.shape[0]
-            training = PolicyTraining(method, *sizes, cfg.seed)
-            if run.result.resume is not None:
-                training.restore(run.result.resume)
-        _optimise(cfg, episode, training, run, note)
-        problem = episode.problem
-        with run.phase("evaluate"):
-            problem.simulator.set_contact("hard")
-            best = cast(np.ndarray, run.result.best_actions)
-            judged = problem.rollout(best[None], gradient=False)
-    masses = {"initial": problem.initial_mass[0], "target": problem.target_mass[0]}
-    run.finish(measures(judged), masses | {"final": cast(np.ndarray, judged.final_mass)[0]})
+    def build(self) -> None:
+        """Make the environment."""
+        (self._episode,) = shared_batches(self.cache, self.tracks[0].cfg, (1, self._method.contact))
+        self.problem = self._episode.problem
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make the network, or take that of the file."""
+        (entries,), (size,) = self._episode.observation_space.shape, self._episode.action_space.shape
+        self._training = PolicyTraining(self._method, entries, size, track.cfg.seed)
+        if state is not None:
+            self._training.restore(state)
+
+    def step(self, track: Track) -> Step:
+        """Run an episode of the policy, and improve the policy by the gradient of its loss."""
+        done = policy_episode(self._episode, self._training.act)
+        # The actions again, now as functions of the weights; the same numbers but for rounding.
+        actions = self._training.policy(torch.from_numpy(done.observations))
+        norm = self._training.step(rollout(self.problem, actions[None]).sum())
+        return Step(done.measures | {"gradient_norm": norm}, done.actions, self._training.state())
+
+    @property
+    def _method(self) -> ApgConfig:
+        return self.tracks[0].cfg.method_as(ApgConfig)
 
 
 class PolicyTraining:
@@ -115,38 +111,3 @@ def _network(widths: Sequence[int]) -> torch.nn.Sequential:
     for inputs, outputs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(inputs, outputs), torch.nn.ReLU()]
     return torch.nn.Sequential(*layers[:-1], torch.nn.Tanh())
-
-
-def _optimise(cfg: Config, episode: EpisodeBatch, training: PolicyTraining, run: RunFile, note: str) -> None:
-    """Do the iterations that the file does not hold yet."""
-    start, total = len(run.result.iterations), cfg.method_as(ApgConfig).iterations
-    with show_progress(note + title(cfg), start, total, enabled=cfg.progress) as report:
-        for iteration in range(start, total):
-            # The first rollout of a process compiles the kernels.
-            with run.phase("compile" if iteration == start else "optimise"):
-                row, actions = _iterate(episode, training, iteration)
-            # Written so that the first loss beats the NaN that stands for none.
-            better = not row["loss"] >= run.result.best_loss
-            best: dict[str, Any] = {
-                "best_actions": actions,
-                "best_iteration": iteration,
-                "best_loss": row["loss"],
-            }
-            run.record(row, training.state(), **(best if better else {}))
-            best_text = f"best {run.result.best_loss:.5g}"
-            report(iteration + 1, f"loss {row['loss']:.5g} score {row['score']:.3f} {best_text}")
-
-
-def _iterate(
-    episode: EpisodeBatch, training: PolicyTraining, iteration: int
-) -> tuple[dict[str, float], np.ndarray]:
-    """Do one iteration; return its row and the actions that it ran, shape [T, A]."""
-    start = time.perf_counter()
-    done = policy_episode(episode, training.act)
-    # The actions again, now as functions of the weights; the same numbers but for rounding.
-    actions = training.policy(torch.from_numpy(done.observations))
-    norm = training.step(rollout(episode.problem, actions[None]).sum())
-    row: dict[str, float] = {"iteration": iteration, "episodes": iteration}
-    row["steps"] = iteration * episode.horizon
-    row |= done.measures | {"gradient_norm": norm, "seconds": time.perf_counter() - start}
-    return row, done.actions

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import gc
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from plab.envs.core import EpisodeBatch
-from plab.problem import Episodes
+from plab.problem import Episodes, Problem, build_scenes, build_simulator
+from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError
-from plab.sim import DeviceError, SimulationError
+from plab.sim import DeviceError, SimulationError, Simulator
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -24,15 +24,13 @@ __all__ = [
     "COLUMNS",
     "PolicyEpisode",
     "episode_columns",
-    "kept",
-    "kept_batches",
     "measures",
     "policy_episode",
+    "shared_batches",
+    "shared_problem",
     "simulation_errors",
     "torch_settings",
 ]
-
-Kept = TypeVar("Kept")
 
 COLUMNS = ("loss", "reward", "iou", "score")
 """Columns of the results that every method has: what an episode is measured by, beside the terms of its
@@ -101,37 +99,23 @@ def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarra
     return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
 
 
-_kept: dict[Any, Any] = {}
-"""The last simulator of this process, in whatever it is part of, by what it was made for: a sweep over seeds
-compiles once."""
+def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
+    """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
+    scenes, sim, method = tuple(build_scenes(cfgs)), cfgs[0].sim, cfgs[0].method
+
+    def build() -> Simulator:
+        return build_simulator(scenes, cfgs[0])
+
+    loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
+    key = scenes, loss, sim.precision, sim.device, sim.memory_mb
+    return Problem(cfgs, cache.get(key, build, check=Simulator.reset))
 
 
-def kept(key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
-    """Return something that holds a simulator: what is kept from the last run, if that is the same.
-
-    Args:
-        key: What it is made for.
-        build: Makes a new one.
-        check: Called with the old one; raises RuntimeError if its memory is gone.
-    """
-    try:
-        if key in _kept:
-            check(_kept[key])
-            return _kept[key]
-    except RuntimeError:
-        # Somebody else restarted Taichi with another precision or device.
-        pass
-    # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels again.
-    _kept.clear()
-    gc.collect()
-    _kept[key] = build()
-    return _kept[key]
-
-
-def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
+def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
     """Return environments of a configuration, those kept from the last run if they fit.
 
     Args:
+        cache: Simulators of earlier runs.
         cfg: The configuration.
         kinds: Number of environments and contact model of each batch.
 
@@ -150,7 +134,7 @@ def kept_batches(cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
 
-    return kept(json.dumps([*parts, cfg.variant]), build, check=start_again)
+    return cache.get(json.dumps([*parts, cfg.variant]), build, check=start_again)
 
 
 @contextmanager

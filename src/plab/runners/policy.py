@@ -14,9 +14,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
+from plab.config_errors import ConfigError
 from plab.results import ResultsError
 from plab.results.files import replace_file
-from plab.runners.rl_models import ALGORITHMS, CLIP
+from plab.runners.rl_models import CLIP, model_kind
 
 __all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
 
@@ -59,12 +60,13 @@ def policy_path(result: Path) -> Path:
     return result.with_suffix(".policy.npz")
 
 
-def save_policy(result: Path, algorithm: str, state: Mapping[str, Any]) -> None:
+def save_policy(result: Path, family: str, algorithm: str, state: Mapping[str, Any]) -> None:
     """Write the policy of a checkpoint beside the result.
 
     Args:
         result: The run's result file.
-        algorithm: Learning algorithm, a key of :data:`plab.runners.rl_models.ALGORITHMS`.
+        family: Family of the method, as ``method.family`` names it.
+        algorithm: Learning algorithm, as ``method.algorithm`` names it.
         state: The checkpoint, a :meth:`plab.runners.rl_trainer.Trainer.state`.
 
     Raises:
@@ -76,12 +78,13 @@ def save_policy(result: Path, algorithm: str, state: Mapping[str, Any]) -> None:
         "replay_buffer_kwargs": {},
         "buffer_size": 1,
     }
-    kind: type[BaseAlgorithm] = ALGORITHMS[algorithm].model
+    kind: type[BaseAlgorithm] = model_kind(family, algorithm).model
     model = kind.load(io.BytesIO(state["model"].tobytes()), device="cpu", custom_objects=without_buffer)
     buffer = io.BytesIO()
     # torch takes files as it takes paths.
     model.policy.save(cast(str, buffer))
     arrays: dict[str, Any] = {
+        "family": np.array(family),
         "algorithm": np.array(algorithm),
         "policy": np.frombuffer(buffer.getvalue(), np.uint8),
     }
@@ -101,18 +104,23 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         device: Where the network is to be, ``cpu`` or ``cuda``.
 
     Raises:
-        ResultsError: If there is no policy beside the result, or its file is broken.
+        ResultsError: If there is no policy beside the result, its file is broken, or it is of a family
+            outside plab whose module is not found.
     """
     path = policy_path(Path(result))
     try:
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
-        kind = ALGORITHMS[str(arrays["algorithm"])].model.policy_aliases["MlpPolicy"]
+        # Files of earlier versions are all of plab's own family.
+        family = str(arrays.get("family", "rl"))
+        kind = model_kind(family, str(arrays["algorithm"])).model.policy_aliases["MlpPolicy"]
         network = kind.load(cast(str, io.BytesIO(arrays["policy"].tobytes())), device="cpu")
     except FileNotFoundError:
         raise ResultsError(
             f"{path} is not there: sac, td3 and ppo write it when a run ends; see docs/rl.md"
         ) from None
+    except ConfigError as error:
+        raise ResultsError(f"{path}: {error}") from error
     except _BROKEN as error:
         raise ResultsError(
             f"{path} is no policy of plab's ({error}): run it again with force=true"

@@ -8,150 +8,123 @@ a row of the results and comes with a checkpoint. To reproduce a result:
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, cast
 
-import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 
 from plab.checks import check_packages
 from plab.config import ConfigError, RlConfig
-from plab.envs.core import EpisodeBatch
-from plab.progress import Report, show_progress
+from plab.progress import Report
 from plab.results import RunFile
-from plab.runners.common import (
-    PolicyEpisode,
-    kept_batches,
-    measures,
-    policy_episode,
-    simulation_errors,
-    torch_settings,
-)
-from plab.runners.jobs import Job, title
+from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
 from plab.runners.policy import save_policy
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
+from plab.runners.runner import Runner, Step, Track
 
-if TYPE_CHECKING:
-    from plab.config import Config
-
-__all__ = ["Evaluator", "run_rl"]
+__all__ = ["RlRunner"]
 
 
-def run_rl(jobs: Sequence[Job], note: str = "") -> None:
-    """Train a policy, evaluate it now and then, finish the file.
+class RlRunner(Runner):
+    """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy."""
 
-    Args:
-        jobs: One job; ``cfg.method`` is a :class:`plab.config.RlConfig`. What an earlier process left in its
-            file is taken up.
-        note: Shown before the progress.
+    # Each time: the replay buffer's file follows the training, and the state has to follow it.
+    KEEP_ALL = True
 
-    Raises:
-        plab.config.ConfigError: If something that the configuration asks for is not installed or not there.
-        plab.results.ResultsError: If a file cannot be written.
-        plab.runners.RunError: If a state stops being finite.
-    """
-    (job,) = jobs
-    cfg, run, method = job.cfg, job.run, job.cfg.method_as(RlConfig)
-    check_packages(cfg)
-    _check_torch_device(method)
-    replay_path, total = run.path.with_suffix(".replay"), total_steps(method, cfg.sim.horizon)
-    with torch_settings(method.torch_threads), simulation_errors():
-        with run.phase("build"):
-            kinds = (method.num_envs, method.contact), (1, "hard")
-            training, evaluation = kept_batches(cfg, *kinds)
-            evaluator = Evaluator(evaluation)
-        if run.result.resume is None or int(run.result.resume["steps"]) < total:
-            _train(cfg, training, replay_path, evaluator, run, note)
-        # The partial file holds the last checkpoint, after which nothing is sampled any more.
-        save_policy(run.path, method.algorithm, cast("dict[str, Any]", run.result.resume))
-        replay_path.unlink(missing_ok=True)
-        with run.phase("evaluate"):
-            judged, final_mass = evaluator.judge(cast(np.ndarray, run.result.best_actions))
-    masses = {"initial": evaluator.initial_mass, "final": final_mass, "target": evaluator.target_mass}
-    run.finish(judged, masses)
+    _trainer: Trainer | None = None
+    _watch: _Watch | None = None
 
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self._method.torch_threads)
 
-class Evaluator:
-    """One environment in the hard contact model, in which policies and actions are judged.
+    def build(self) -> None:
+        """Make the environments of the training, and the one in the hard contact model that judges."""
+        cfg = self.tracks[0].cfg
+        check_packages(cfg)
+        _check_torch_device(self._method)
+        kinds = (self._method.num_envs, self._method.contact), (1, "hard")
+        self._training, self._evaluation = shared_batches(self.cache, cfg, *kinds)
+        self.problem = self._evaluation.problem
 
-    Attributes:
-        initial_mass: Mass tensor of the initial state, shape [n, n, n].
-        target_mass: Mass tensor of the target, shape [n, n, n].
-    """
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make the model, or take that of the last checkpoint, unless its training is over."""
+        self._replay_path = track.job.run.path.with_suffix(".replay")
+        if state is None or int(state["steps"]) < total_steps(self._method, track.cfg.sim.horizon):
+            self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
+            self._trainer.set_logger(_logger(self._method, track.job.run))
 
-    def __init__(self, batch: EpisodeBatch) -> None:
-        self._batch = batch
-        self.initial_mass = self._batch.problem.initial_mass[0]
-        self.target_mass = self._batch.problem.target_mass[0]
+    def has_more(self, track: Track) -> bool:
+        """Whether there are steps to train for."""
+        return self._trainer is not None and self._trainer.steps < self._trainer.total_steps
+
+    def step(self, track: Track) -> Step:
+        """Train until the next evaluation is due, except before the first, and run the policy once."""
+        trainer = cast(Trainer, self._trainer)
+        # The first episode, of the untrained policy, compiles the kernels.
+        if track.iteration > 0:
+            self._train(trainer, track)
+            self.enter("evaluate")
+        done = self.episode(trainer)
+        trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
+        measured = done.measures | trainer.take_statistics()
+        return Step(measured, done.actions, trainer.state(), trainer.episodes, trainer.steps)
 
     def episode(self, trainer: Trainer) -> PolicyEpisode:
         """Run an episode of the deterministic policy."""
-        return policy_episode(self._batch, trainer.predict)
+        return policy_episode(self._evaluation, trainer.predict)
 
-    def judge(self, actions: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
-        """Run actions of shape [T, A]; return the scalars of the evaluation and the last mass tensor."""
-        result = self._batch.problem.rollout(actions[None], gradient=False)
-        return measures(result), cast(np.ndarray, result.final_mass)[0]
+    def extent(self) -> tuple[int, int, int]:
+        """Return how many episodes of training there are, and after how many there is an evaluation."""
+        horizon = self.tracks[0].cfg.sim.horizon
+        total = total_steps(self._method, horizon) // horizon
+        return total if self._trainer is None else self._trainer.episodes, total, self._method.evaluate_every
 
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Leave it to the training, which reports every episode."""
 
-def _train(
-    cfg: Config, training: EpisodeBatch, replay_path: Path, evaluator: Evaluator, run: RunFile, note: str
-) -> None:
-    """Train from where the file stands to the end."""
-    with run.phase("build"):
-        trainer = Trainer(cfg, training, replay_path, run.result.resume)
-        trainer.set_logger(_logger(cfg.method_as(RlConfig), run))
-    try:
-        if run.result.resume is None:
-            # The untrained policy; the first episode compiles the kernels.
-            _look(trainer, evaluator, run, "compile", time.perf_counter())
-        _alternate(cfg, trainer, evaluator, run, note)
-    finally:
-        trainer.close()
+    def close(self) -> None:
+        """Let go of the replay buffer."""
+        if self._trainer is not None:
+            self._trainer.close()
 
+    def conclude(self, track: Track) -> None:
+        """Keep the policy of the last checkpoint, after which nothing is sampled any more."""
+        state = cast("dict[str, Any]", track.job.run.result.resume)
+        save_policy(track.job.run.path, self._method.family, self._method.algorithm, state)
+        self._replay_path.unlink(missing_ok=True)
 
-def _alternate(cfg: Config, trainer: Trainer, evaluator: Evaluator, run: RunFile, note: str) -> None:
-    """Train and evaluate in turn until all episodes are done."""
-    total, every = trainer.total_steps // cfg.sim.horizon, cfg.method_as(RlConfig).evaluate_every
-    heading = note + title(cfg)
-    with show_progress(heading, trainer.episodes, total, enabled=cfg.progress, plain_every=every) as report:
-        watch = _Watch(trainer, run, report)
-        while trainer.steps < trainer.total_steps:
-            start = time.perf_counter()
-            due = int(run.result.iterations["episodes"].iloc[-1]) + every
-            with run.phase("optimise"):
-                while trainer.episodes < due and trainer.steps < trainer.total_steps:
-                    trainer.advance(watch)
-            _look(trainer, evaluator, run, "evaluate", start)
+    def _train(self, trainer: Trainer, track: Track) -> None:
+        self.enter("optimise")
+        rows = track.job.run.result.iterations
+        due = int(rows["episodes"].iloc[-1]) + self._method.evaluate_every
+        self._watch = self._watch or _Watch(trainer, self.report)
+        self._watch.score = float(rows["score"].iloc[-1])
+        while trainer.episodes < due and trainer.steps < trainer.total_steps:
+            trainer.advance(self._watch)
 
-
-def _look(trainer: Trainer, evaluator: Evaluator, run: RunFile, phase: str, start: float) -> None:
-    """Evaluate the policy, write the row and the checkpoint."""
-    with run.phase(phase):
-        done = evaluator.episode(trainer)
-    number = len(run.result.iterations)
-    row: dict[str, float] = {"iteration": number, "episodes": trainer.episodes, "steps": trainer.steps}
-    row |= done.measures | trainer.take_statistics()
-    row["seconds"] = time.perf_counter() - start
-    trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
-    # Written so that the first loss beats the NaN that stands for none.
-    better = not row["loss"] >= run.result.best_loss
-    best: dict[str, Any] = {"best_actions": done.actions, "best_iteration": number, "best_loss": row["loss"]}
-    # Each time: the replay buffer's file follows the training, and the state has to follow it.
-    run.record(row, trainer.state(), keep=True, **(best if better else {}))
+    @property
+    def _method(self) -> RlConfig:
+        return self.tracks[0].cfg.method_as(RlConfig)
 
 
 class _Watch(BaseCallback):
-    """Follows the training: notes the actions of the episode under way, reports the episodes that end."""
+    """Follows the training: notes the actions of the episode under way, reports the episodes that end.
 
-    def __init__(self, trainer: Trainer, run: RunFile, report: Report) -> None:
+    Attributes:
+        score: Score of the last evaluation.
+    """
+
+    def __init__(self, trainer: Trainer, report: Report) -> None:
         super().__init__()
-        self._trainer, self._run, self._report = trainer, run, report
+        self._trainer, self._report = trainer, report
+        self.score = math.nan
         self._first: tuple[float, int] | None = None
 
     def _on_step(self) -> bool:
@@ -162,8 +135,8 @@ class _Watch(BaseCallback):
         return True
 
     def _text(self) -> str:
-        now, score = time.perf_counter(), self._run.result.iterations["score"].iloc[-1]
-        text = f"reward {self._trainer.last_reward:.4g} score {score:.3f}"
+        now = time.perf_counter()
+        text = f"reward {self._trainer.last_reward:.4g} score {self.score:.3f}"
         if self._first is None:
             # What was before compiled the kernels.
             self._first = now, self.num_timesteps

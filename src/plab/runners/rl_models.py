@@ -16,9 +16,21 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from plab.config import PpoConfig, SacConfig, Td3Config
 from plab.config_types import OffPolicyConfig, RlConfig
+from plab.families import family
 from plab.runners.captured import CapturedPPO, CapturedSAC, CapturedTD3
 
-__all__ = ["ALGORITHMS", "LinearDecay", "ModelKind", "cycle_steps", "total_steps"]
+__all__ = [
+    "CLIP",
+    "PPO",
+    "SAC",
+    "TD3",
+    "LinearDecay",
+    "ModelKind",
+    "cycle_steps",
+    "model_kind",
+    "off_policy",
+    "total_steps",
+]
 
 CLIP = 10.0
 """Largest observation and reward, in units of their running standard deviations."""
@@ -31,10 +43,14 @@ class ModelKind:
     Attributes:
         model: Stable-Baselines3's class.
         arguments: Configuration and environments to keyword arguments of the class.
+        rollout_steps: Configuration to the steps of each environment between two updates, of an algorithm
+            that learns from what it has just done; None of one with a replay buffer, which can pause after
+            any episode.
     """
 
     model: type[BaseAlgorithm]
     arguments: Callable[[Any, VecEnv], dict[str, Any]]
+    rollout_steps: Callable[[Any], int] | None = None
 
     def make(self, method: RlConfig, env: VecEnv, seed: int, **extra: Any) -> BaseAlgorithm:
         """Make an untrained model; seeds the random numbers of NumPy and torch."""
@@ -61,11 +77,23 @@ class LinearDecay:
         return self._lr * self.remaining
 
 
+def model_kind(name: str, algorithm: str) -> ModelKind:
+    """Return the learning algorithm that a family has by some name.
+
+    Args:
+        name: The family, as ``method.family`` names it.
+        algorithm: As ``method.algorithm`` names it.
+
+    Raises:
+        plab.config.ConfigError: If it cannot be imported, or is no :class:`ModelKind`.
+    """
+    return family(name).rule(algorithm, ModelKind)
+
+
 def cycle_steps(method: RlConfig, horizon: int) -> int:
     """Return after how many transitions training can pause: an update of PPO, else a batch of episodes."""
-    if isinstance(method, PpoConfig):
-        return method.num_envs * _rollout_steps(method)
-    return method.num_envs * horizon
+    rollout_steps = model_kind(method.family, method.algorithm).rollout_steps
+    return method.num_envs * (horizon if rollout_steps is None else rollout_steps(method))
 
 
 def total_steps(method: RlConfig, horizon: int) -> int:
@@ -78,7 +106,8 @@ def _rollout_steps(method: PpoConfig) -> int:
     return math.ceil(method.steps_per_update / method.num_envs)
 
 
-def _off_policy(method: OffPolicyConfig) -> dict[str, Any]:
+def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
+    """Return the arguments that all algorithms with a replay buffer take."""
     return {
         "learning_rate": method.lr,
         "gamma": method.gamma,
@@ -97,12 +126,12 @@ def _off_policy(method: OffPolicyConfig) -> dict[str, Any]:
 
 
 def _sac(method: SacConfig, env: VecEnv) -> dict[str, Any]:
-    return _off_policy(method) | {"ent_coef": "auto", "target_entropy": "auto"}
+    return off_policy(method) | {"ent_coef": "auto", "target_entropy": "auto"}
 
 
 def _td3(method: Td3Config, env: VecEnv) -> dict[str, Any]:
     (size,) = env.action_space.shape or ()
-    return _off_policy(method) | {
+    return off_policy(method) | {
         "action_noise": NormalActionNoise(np.zeros(size), np.full(size, method.exploration_noise)),
         "target_policy_noise": method.target_noise,
         "target_noise_clip": method.target_noise_clip,
@@ -132,9 +161,7 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
     }
 
 
-ALGORITHMS = {
-    "sac": ModelKind(CapturedSAC, _sac),
-    "td3": ModelKind(CapturedTD3, _td3),
-    "ppo": ModelKind(CapturedPPO, _ppo),
-}
-"""Learning algorithms by the name that ``method.algorithm`` gives."""
+SAC = ModelKind(CapturedSAC, _sac)
+TD3 = ModelKind(CapturedTD3, _td3)
+PPO = ModelKind(CapturedPPO, _ppo, _rollout_steps)
+"""The learning algorithms; the names that ``method.algorithm`` gives them are in :mod:`plab.families`."""

@@ -22,7 +22,7 @@ from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.replay import EpisodeReplay
-from plab.runners.rl_models import ALGORITHMS, CLIP, LinearDecay, cycle_steps, total_steps
+from plab.runners.rl_models import CLIP, LinearDecay, cycle_steps, model_kind, total_steps
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -67,7 +67,7 @@ class Trainer:
         self._statistics = _statistics(cfg, self._monitor)
         self._env = self._monitor if self._statistics is None else self._statistics
         extra = self._replay_arguments(cfg, state)
-        kind = ALGORITHMS[method.algorithm]
+        kind = model_kind(method.family, method.algorithm)
         if state is None:
             self.model: BaseAlgorithm = kind.make(method, self._env, cfg.seed, **extra)
         else:

@@ -10,144 +10,79 @@ give alone. To reproduce a result:
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Iterator, Mapping, Sequence
+from types import FunctionType
+from typing import Any, cast
 
 import numpy as np
 import torch
 
 from plab.config_types import TrajectoryConfig
-from plab.problem import Episodes, Problem, build_scenes, build_simulator
-from plab.progress import show_progress
-from plab.results import ResultsError
-from plab.runners.common import episode_columns, kept, measures, simulation_errors
-from plab.runners.jobs import Job, RunError, TogetherError, batch_title
-from plab.sim import DeviceError, Simulator
+from plab.families import family
+from plab.runners.common import measures, shared_problem
+from plab.runners.runner import Runner, Step, Track
 
-if TYPE_CHECKING:
-    from plab.config import Config
-
-__all__ = ["OPTIMIZERS", "ActionSequence", "make_problem", "run_trajectory"]
+__all__ = ["ActionSequence", "TrajectoryRunner", "adam", "momentum"]
 
 
-def run_trajectory(jobs: Sequence[Job], note: str = "") -> None:
-    """Optimise a sequence of actions per job, evaluate the best ones in the hard contact model, finish.
+class TrajectoryRunner(Runner):
+    """Optimises a sequence of actions per run; each iteration is one rollout of all, with gradient.
 
-    Args:
-        jobs: Runs that share a simulator; ``cfg.method`` is a :class:`plab.config.TrajectoryConfig`. What an
-            earlier process left in their files is taken up. A run whose loss, gradient or state stops being
-            finite gets an error, and the others go on.
-        note: Shown before the progress.
-
-    Raises:
-        TogetherError: If nothing can be built of several jobs: perhaps fewer do.
-        RunError: If a lone job cannot be built, or the gradient needs more memory.
-    """
-    start = time.perf_counter()
-    try:
-        with simulation_errors():
-            problem = make_problem([job.cfg for job in jobs])
-    except Exception as error:
-        if len(jobs) > 1 and not isinstance(error.__cause__, DeviceError):
-            raise TogetherError(str(error)) from error
-        raise
-    batch = [_Sequence(job, e, problem) for e, job in enumerate(jobs)]
-    for one in batch:
-        one.job.run.result.provenance["batch"] = len(batch)
-    _spend(batch, "build", time.perf_counter() - start)
-    _optimise(problem, batch, note)
-    _evaluate(problem, [one for one in batch if one.job.open])
-
-
-def make_problem(cfgs: Sequence[Config]) -> Problem:
-    """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
-    scenes, sim, method = tuple(build_scenes(cfgs)), cfgs[0].sim, cfgs[0].method
-
-    def build() -> Simulator:
-        return build_simulator(scenes, cfgs[0])
-
-    loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
-    key = scenes, loss, sim.precision, sim.device, sim.memory_mb
-    return Problem(cfgs, kept(key, build, check=Simulator.reset))
-
-
-class _Sequence:
-    """One run of a batch: its job, its actions, and its environment.
-
-    Attributes:
-        job: Configuration, file, and how it ended.
-        method: The configuration's settings of the method.
-        environment: Number of its environment in the batch.
-        actions: Actions and optimiser, as far as the file has come.
+    A run whose loss, gradient or state stops being finite breaks off, and the others go on.
     """
 
-    def __init__(self, job: Job, environment: int, problem: Problem) -> None:
-        self.job, self.environment = job, environment
-        scene, result = problem.scenes[environment], job.run.result
-        self.method = job.cfg.method_as(TrajectoryConfig)
-        self.actions = ActionSequence(self.method, scene.horizon, scene.action_dim, job.cfg.seed)
-        if result.resume is not None:
-            self.actions.restore(result.resume)
-        self.iteration, self.best_loss = len(result.iterations), result.best_loss
+    def build(self) -> None:
+        """Make the problem, with an environment per run."""
+        self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
+        methods = [track.cfg.method_as(TrajectoryConfig) for track in self.tracks]
+        self.problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
+        self._sequences: dict[int, ActionSequence] = {}
 
-    @property
-    def active(self) -> bool:
-        """Whether there are iterations to do."""
-        return self.job.open and self.iteration < self.method.iterations
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Draw the first actions, or take those of the file."""
+        scene = self.problem.scenes[track.number]
+        method = track.cfg.method_as(TrajectoryConfig)
+        sequence = ActionSequence(method, scene.horizon, scene.action_dim, track.cfg.seed)
+        if state is not None:
+            sequence.restore(state)
+        self._sequences[track.number] = sequence
 
-    def update(self, tried: np.ndarray, episodes: Episodes, seconds: float) -> dict[str, float]:
-        """Take the result of an iteration: update the actions, write the row.
-
-        Args:
-            tried: Actions of the rollout, shape [T, A].
-            episodes: What the rollout of the batch gave.
-            seconds: The run's share of the rollout's wall time.
-
-        Returns:
-            The row.
-
-        Raises:
-            plab.results.ResultsError: If the file cannot be written.
-        """
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Run the actions of all, and improve those of each by their gradient."""
         start = time.perf_counter()
-        gradient = cast(np.ndarray, episodes.gradient)[self.environment]
-        self.actions.step(gradient)
-        measured = measures(episodes, self.environment)
-        # What the actions have cost: the rollouts, of an episode each, that led to them.
-        row: dict[str, float] = {"iteration": self.iteration, "episodes": self.iteration}
-        row["steps"] = self.iteration * len(tried)
-        row |= {name: measured[name] for name in episode_columns(episodes.term_names)}
-        row["gradient_norm"] = float(np.linalg.norm(gradient))
-        row["seconds"] = seconds + time.perf_counter() - start
-        # Written so that the first loss beats the NaN that stands for none.
-        better = not row["loss"] >= self.best_loss
-        best: dict[str, Any] = {
-            "best_actions": tried,
-            "best_iteration": self.iteration,
-            "best_loss": row["loss"],
-        }
-        self.job.run.record(row, self.actions.state(), **(best if better else {}))
-        self.iteration, self.best_loss = self.iteration + 1, row["loss"] if better else self.best_loss
-        return row
+        tried = self.actions_at_rest()
+        for track in tracks:
+            tried[track.number] = self._sequences[track.number].numpy()
+        episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
+        share = (time.perf_counter() - start) / len(tracks)
+        for track in tracks:
+            number = track.number
+            if number in episodes.failures:
+                track.fail(episodes.failures[number])
+                continue
+            start = time.perf_counter()
+            gradient = cast(np.ndarray, episodes.gradient)[number]
+            sequence = self._sequences[number]
+            sequence.step(gradient)
+            measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
+            seconds = share + time.perf_counter() - start
+            yield track, Step(measured, tried[number], sequence.state(), seconds=seconds)
 
 
-def _adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
+def adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
+    """Return torch's Adam for the actions."""
     first, second = method.betas
     return torch.optim.Adam([parameter], lr=method.lr, betas=(first, second), eps=method.eps)
 
 
-def _momentum(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
-    """v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
+def momentum(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
+    """Return gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
     # torch's SGD weighs the gradient by 1 - dampening.
     m = method.momentum
     optimizer = torch.optim.SGD([parameter], lr=method.lr, momentum=m, dampening=m)
     # Without a buffer it takes the first gradient undampened, ten times too large at m = 0.9.
     optimizer.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
     return optimizer
-
-
-OPTIMIZERS = {"adam": _adam, "gd": _momentum}
-"""Update rules by the name that ``method.optimizer`` gives."""
 
 
 class ActionSequence:
@@ -169,7 +104,8 @@ class ActionSequence:
         self._generator = torch.Generator().manual_seed(seed)
         unit = torch.rand((horizon, action_dim), generator=self._generator, dtype=torch.float64)
         self.parameter = ((2.0 * unit - 1.0) * method.action_init).requires_grad_()
-        self._optimizer = OPTIMIZERS[method.optimizer](self.parameter, method)
+        rule = family(method.family).rule(method.optimizer, FunctionType)
+        self._optimizer = rule(self.parameter, method)
         self._largest = method.max_gradient_norm
 
     def numpy(self) -> np.ndarray:
@@ -202,91 +138,3 @@ class ActionSequence:
         buffers = {name: torch.from_numpy(array) for name, array in state["optimizer"].items()}
         self._optimizer.state[self.parameter] = buffers
         self._generator.set_state(torch.from_numpy(state["random"]))
-
-
-def _optimise(problem: Problem, batch: Sequence[_Sequence], note: str) -> None:
-    """Do the iterations that the files do not hold yet."""
-    methods = [one.method for one in batch]
-    problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
-    start, total = min(one.iteration for one in batch), max(method.iterations for method in methods)
-    heading = note + batch_title([one.job.cfg for one in batch])
-    # The first rollout of a process compiles the kernels.
-    phase = "compile"
-    with show_progress(heading, start, total, enabled=batch[0].job.cfg.progress) as report:
-        while active := [one for one in batch if one.active]:
-            begin = time.perf_counter()
-            rows = _iterate(problem, batch, active)
-            _spend(active, phase, time.perf_counter() - begin)
-            phase = "optimise"
-            if rows:
-                report(min(one.iteration for one in active), _text(rows, active))
-
-
-def _iterate(
-    problem: Problem, batch: Sequence[_Sequence], active: Sequence[_Sequence]
-) -> list[dict[str, float]]:
-    """Do one iteration of each active run, at whatever iteration it is; return the rows."""
-    start = time.perf_counter()
-    tried = _zeros(problem)
-    for one in active:
-        tried[one.environment] = one.actions.numpy()
-    with simulation_errors(f"iteration {active[0].iteration}: "):
-        episodes = problem.rollout(tried, gradient=True, strict=False, exact=False)
-    share = (time.perf_counter() - start) / len(active)
-    rows = []
-    for one in active:
-        if one.environment in episodes.failures:
-            one.job.fail(RunError(f"iteration {one.iteration}: {episodes.failures[one.environment]}"))
-            continue
-        try:
-            rows.append(one.update(tried[one.environment], episodes, share))
-        except ResultsError as error:
-            one.job.fail(error)
-    return rows
-
-
-def _text(rows: Sequence[Mapping[str, float]], active: Sequence[_Sequence]) -> str:
-    """Say how it goes: of several runs on average."""
-    loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
-    best = np.mean([one.best_loss for one in active])
-    return f"{'' if len(rows) == 1 else 'mean '}loss {loss:.5g} score {score:.3f} best {best:.5g}"
-
-
-def _evaluate(problem: Problem, batch: Sequence[_Sequence]) -> None:
-    """Run the best actions in the hard contact model, and finish the files."""
-    if not batch:
-        return
-    start = time.perf_counter()
-    best = _zeros(problem)
-    for one in batch:
-        best[one.environment] = one.job.run.result.best_actions
-    problem.simulator.set_contact("hard")
-    with simulation_errors("final evaluation: "):
-        episodes = problem.rollout(best, gradient=False, strict=False)
-    _spend(batch, "evaluate", time.perf_counter() - start)
-    for one in batch:
-        e = one.environment
-        if e in episodes.failures:
-            one.job.fail(RunError(f"final evaluation: {episodes.failures[e]}"))
-            continue
-        masses = {
-            "initial": problem.initial_mass,
-            "final": cast(np.ndarray, episodes.final_mass),
-            "target": problem.target_mass,
-        }
-        try:
-            one.job.run.finish(measures(episodes, e), {name: mass[e] for name, mass in masses.items()})
-        except ResultsError as error:
-            one.job.fail(error)
-
-
-def _zeros(problem: Problem) -> np.ndarray:
-    """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
-    scene = problem.scenes[0]
-    return np.zeros((len(problem.scenes), scene.horizon, scene.action_dim))
-
-
-def _spend(batch: Sequence[_Sequence], phase: str, seconds: float) -> None:
-    """Add to the wall time of a phase, each run its share."""
-    for one in batch:
-        one.job.run.spend(phase, seconds / len(batch))

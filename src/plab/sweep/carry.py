@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from plab import runners
 from plab.locks import held, lock_path
 from plab.results import ResultsError, RunFile, read, result_path
+from plab.reuse import SimulatorCache
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
 from plab.tally import Outcome
@@ -69,8 +70,9 @@ def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -
 
 def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
     """Carry out batches in this process, one after the other."""
+    cache = SimulatorCache()
     for batch in batches:
-        yield from runners.run_batch(batch, progress())
+        yield from runners.run_batch(batch, progress(), cache)
 
 
 class BatchTask:
@@ -83,7 +85,7 @@ class BatchTask:
         """Carry out the batch of Hydra's job number; called in the job's process."""
         number = HydraConfig.get().job.num
         note = f"[batch {number + 1}/{len(self._batches)}] " if len(self._batches) > 1 else ""
-        return runners.run_batch(self._batches[number], note)
+        return runners.run_batch(self._batches[number], note, SimulatorCache())
 
 
 def look_up(cfg: Config) -> Outcome:

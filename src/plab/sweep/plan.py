@@ -8,8 +8,8 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from plab.families import family
 from plab.problem import build_scenes
-from plab.runners import BATCHING
 from plab.sim.memory import batch_limit
 
 if TYPE_CHECKING:
@@ -49,14 +49,14 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     kind = [cfg.task.name, cfg.method.family, asdict(cfg.sim), asdict(cfg.targets), loss]
-    if cfg.method.family not in BATCHING:
+    if not family(cfg.method.family).batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other.
     return [*kind, method["iterations"], scene.particle_count, [m.shape for m in scene.manipulators]]
 
 
 def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
-    if cfg.method.family not in BATCHING:
+    if not family(cfg.method.family).batching:
         return 1
     return size or batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
 

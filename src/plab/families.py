@@ -1,0 +1,196 @@
+"""The families of methods: one record each, which is all that the rest of plab has to know of a family.
+
+:data:`FAMILIES` has plab's own. A family outside plab is a :class:`Family` in a file of its own, which a
+method's YAML names as ``family: module:NAME``; see docs/own_method.md. Classes and functions are named as
+``module:NAME`` where they need a large library, so that looking up a record imports none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from plab.plugins import load_object
+
+__all__ = ["FAMILIES", "GRADIENT", "RL", "Appearance", "Family", "Rule", "family", "known_family", "schemas"]
+
+RL, GRADIENT = "RL", "gradient"
+"""Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
+
+_TYPES = "plab.config_types"
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How a method appears in tables and figures.
+
+    Attributes:
+        label: Name for readers.
+        colour: Colour of its curves.
+        dashes: Line style, for those who do not see the colour.
+    """
+
+    label: str
+    colour: str
+    dashes: str = "-"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A learning algorithm or an update rule, of which a family may offer several.
+
+    Attributes:
+        what: It, or its ``module:NAME``; of which kind it is, is up to the family's runner.
+        config: Type of the section ``method``, or its ``module:NAME``; None: the family's.
+    """
+
+    what: Any
+    config: type | str | None = None
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of methods: what they have in common, and who carries them out.
+
+    Attributes:
+        label: What the methods of the family do, in a few words.
+        config: Type of the section ``method``, a subclass of :class:`plab.config.MethodConfig`, or its
+            ``module:NAME``.
+        runner: Subclass of :class:`plab.runners.runner.Runner`, or its ``module:NAME``.
+        columns: Columns of the results beside those that all methods have.
+        may_be_nan: Those of them with entries for which there is no number.
+        batching: Whether runs can share a simulator; else each runs alone.
+        rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
+        kind: :data:`RL`, :data:`GRADIENT`, or empty.
+        methods: Appearance of methods by name; others appear in grey, by their names.
+    """
+
+    label: str
+    config: type | str
+    runner: type | str
+    columns: tuple[str, ...] = ()
+    may_be_nan: tuple[str, ...] = ()
+    batching: bool = False
+    rules: Mapping[str, Rule] = field(default_factory=dict)
+    kind: str = ""
+    methods: Mapping[str, Appearance] = field(default_factory=dict)
+
+    def rule(self, name: str, kind: type[Kind]) -> Kind:
+        """Return one of the rules, which has to be of a kind.
+
+        Raises:
+            plab.config.ConfigError: If it cannot be imported or is of another kind.
+            KeyError: If there is no such rule; :meth:`plab.config.MethodConfig.check` has seen to it.
+        """
+        return _loaded(self.rules[name].what, kind)
+
+    def config_type(self, rule: str | None = None) -> type:
+        """Return the type of the section ``method``, of a rule that has one of its own that.
+
+        Raises:
+            plab.config.ConfigError: If it cannot be imported.
+        """
+        own = self.rules[rule].config if rule is not None and rule in self.rules else None
+        return _loaded(own or self.config, type)
+
+    def runner_type(self) -> type:
+        """Return the runner.
+
+        Raises:
+            plab.config.ConfigError: If it cannot be imported.
+        """
+        return _loaded(self.runner, type)
+
+
+def _loaded(what: Any, kind: type[Kind]) -> Kind:
+    return load_object(what, kind) if isinstance(what, str) else what
+
+
+# Colours are Okabe and Ito's, which people with any colour vision can tell apart.
+FAMILIES: dict[str, Family] = {
+    "trajectory": Family(
+        label="a sequence of actions, improved by its gradient",
+        config=f"{_TYPES}:TrajectoryConfig",
+        runner="plab.runners.trajectory:TrajectoryRunner",
+        columns=("gradient_norm",),
+        batching=True,
+        rules={
+            "adam": Rule("plab.runners.trajectory:adam"),
+            "gd": Rule("plab.runners.trajectory:momentum"),
+        },
+        kind=GRADIENT,
+        methods={
+            "adam": Appearance("Adam", "#D55E00"),
+            "gd": Appearance("GD", "#E69F00", "--"),
+            "adam_h": Appearance("Adam-H", "#CC79A7", "-."),
+        },
+    ),
+    "rl": Family(
+        label="a policy that learns from rewards",
+        config=f"{_TYPES}:RlConfig",
+        runner="plab.runners.rl:RlRunner",
+        columns=("train_reward", "train_score"),
+        # No episode of training may have ended.
+        may_be_nan=("train_reward", "train_score"),
+        rules={
+            "sac": Rule("plab.runners.rl_models:SAC", f"{_TYPES}:SacConfig"),
+            "td3": Rule("plab.runners.rl_models:TD3", f"{_TYPES}:Td3Config"),
+            "ppo": Rule("plab.runners.rl_models:PPO", f"{_TYPES}:PpoConfig"),
+        },
+        kind=RL,
+        methods={
+            "sac": Appearance("SAC", "#0072B2"),
+            "td3": Appearance("TD3", "#56B4E9", "--"),
+            "ppo": Appearance("PPO", "#009E73", "-."),
+        },
+    ),
+    "apg": Family(
+        label="a policy, trained through the simulator's gradient",
+        config=f"{_TYPES}:ApgConfig",
+        runner="plab.runners.apg:ApgRunner",
+        columns=("gradient_norm",),
+        kind=GRADIENT,
+        methods={"apg": Appearance("APG", "#000000", ":")},
+    ),
+}
+"""plab's own families by name, the ``family`` of a method's YAML."""
+
+
+def family(name: str) -> Family:
+    """Return the family of a name, as in ``method.family``.
+
+    Args:
+        name: A key of :data:`FAMILIES`, or the ``module:NAME`` of a record elsewhere.
+
+    Raises:
+        plab.config.ConfigError: If there is none.
+    """
+    if name in FAMILIES:
+        return FAMILIES[name]
+    if ":" in name:
+        return load_object(name, Family)
+    from plab.config_errors import ConfigError, pick
+
+    raise ConfigError(f"method.family '{name}' does not exist; {pick(name, [*FAMILIES, 'module:NAME'])}")
+
+
+def known_family(name: str) -> Family | None:
+    """Return the family of a name, None if its module is not at hand: readers of results can do without."""
+    if name in FAMILIES:
+        return FAMILIES[name]
+    from plab.config_errors import ConfigError
+
+    try:
+        return family(name)
+    except ConfigError:
+        return None
+
+
+def schemas() -> Iterator[tuple[str, type]]:
+    """Yield names and types that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``."""
+    for name, record in FAMILIES.items():
+        own = [rule for rule, it in record.rules.items() if it.config is not None]
+        yield from ((rule, record.config_type(rule)) for rule in own or [name])

@@ -1,0 +1,44 @@
+"""Simulators that are built once and used by one run after the other."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+__all__ = ["SimulatorCache"]
+
+Kept = TypeVar("Kept")
+
+
+class SimulatorCache:
+    """The last simulator, in whatever it is part of, and what it is for: a sweep over seeds compiles once.
+
+    Whoever carries out several runs makes one and passes it on to each.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._kept: dict[Any, Any] = {}
+
+    def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
+        """Return something that holds a simulator: what is kept from the last run, if that is the same.
+
+        Args:
+            key: What it is made for.
+            build: Makes a new one.
+            check: Called with the old one; raises RuntimeError if its memory is gone.
+        """
+        try:
+            if key in self._kept:
+                check(self._kept[key])
+                return self._kept[key]
+        except RuntimeError:
+            # Somebody else restarted Taichi with another precision or device.
+            pass
+        # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels
+        # again.
+        self._kept.clear()
+        gc.collect()
+        self._kept[key] = build()
+        return self._kept[key]

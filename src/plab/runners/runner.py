@@ -1,0 +1,345 @@
+"""What all runners have in common: a run from where its file stands to the end, told once, with named hooks.
+
+A family of methods is a subclass of :class:`Runner` that says how it begins, what an iteration is and what
+the next one starts from. Taking up files, rows, the best actions so far, wall times, progress, runs that
+break off and the final evaluation in the hard contact model are here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from plab.families import family
+from plab.problem import Episodes, Problem
+from plab.progress import PLAIN_EVERY, Report, show_progress
+from plab.results import ResultsError
+from plab.reuse import SimulatorCache
+from plab.runners.common import episode_columns, measures, simulation_errors
+from plab.runners.jobs import Job, RunError, TogetherError, batch_title
+from plab.sim import DeviceError
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["Runner", "Step", "Track"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What an iteration of a run gave.
+
+    Attributes:
+        measures: What the actions are measured by: :func:`plab.runners.common.episode_columns`, and the
+            columns of the family. Others are left out.
+        actions: Actions that it ran, in [-1, 1], shape [T, A].
+        state: What the next iteration starts from: nested dictionaries of arrays, numbers and strings.
+        episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
+            iteration.
+        steps: Environment steps that they have cost; None: those of the episodes.
+        seconds: The run's share of the wall time; None: all of it.
+    """
+
+    measures: Mapping[str, float]
+    actions: np.ndarray
+    state: Mapping[str, Any]
+    episodes: int | None = None
+    steps: int | None = None
+    seconds: float | None = None
+
+
+class Track:
+    """One run of a batch on its way: its job, its place in the batch, how far it has come.
+
+    Attributes:
+        job: Configuration, file, and how it ended.
+        number: Number of the run in its batch, and of its environment in a simulator that they share.
+        iteration: Number of the iteration that is next.
+        best_loss: Lowest loss so far, NaN before the first iteration.
+        best_actions: The actions that had it, shape [T, A]; None before the first iteration.
+    """
+
+    def __init__(self, job: Job, number: int) -> None:
+        """Take up a run where its file stands."""
+        self.job, self.number = job, number
+        result = job.run.result
+        self.iteration, self.best_loss = len(result.iterations), result.best_loss
+        self.best_actions = result.best_actions
+
+    @property
+    def cfg(self) -> Config:
+        """Its configuration."""
+        return self.job.cfg
+
+    def fail(self, why: str) -> None:
+        """Break the run off in its current iteration; the others of the batch go on."""
+        self.job.fail(RunError(f"iteration {self.iteration}: {why}"))
+
+    def record(self, step: Step, columns: Sequence[str], *, keep: bool) -> dict[str, float]:
+        """Write an iteration to the file; return its row.
+
+        Args:
+            step: What the iteration gave.
+            columns: Which of the measures.
+            keep: Write the state in any case, instead of every ``checkpoint_seconds``.
+
+        Raises:
+            ResultsError: If the file cannot be written.
+        """
+        episodes = self.iteration if step.episodes is None else step.episodes
+        steps = episodes * len(step.actions) if step.steps is None else step.steps
+        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
+        row |= {name: step.measures[name] for name in columns}
+        row["seconds"] = cast(float, step.seconds)
+        # Written so that the first loss beats the NaN that stands for none.
+        better = not row["loss"] >= self.best_loss
+        best: dict[str, Any] = {
+            "best_actions": step.actions,
+            "best_iteration": self.iteration,
+            "best_loss": row["loss"],
+        }
+        self.job.run.record(row, step.state, keep=keep, **(best if better else {}))
+        self.iteration += 1
+        if better:
+            self.best_loss, self.best_actions = row["loss"], step.actions
+        return row
+
+
+class Runner:
+    """Takes the runs of a batch from where their files stand to the end, and finishes the files.
+
+    A family overrides :meth:`build`, and :meth:`step` or :meth:`iterate`; the other hooks where it has to.
+    They are called in this order: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate`
+    while any :meth:`has_more`, :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
+
+    Attributes:
+        tracks: The runs; of a family that is not ``batching`` there is one.
+        problem: What the best actions are judged in, an environment per run; :meth:`build` sets it.
+        cache: Simulators of earlier runs.
+        report: Takes how far the batch has come and a short text; see :mod:`plab.progress`.
+    """
+
+    KEEP_ALL = False
+    """Whether the state is written after every iteration, instead of every ``checkpoint_seconds``."""
+
+    problem: Problem
+    report: Report
+
+    def __init__(self, jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
+        """Take over some jobs; nothing is built yet.
+
+        Args:
+            jobs: The runs, alike as far as :func:`plab.sweep.plan` asks for.
+            note: Shown before the progress.
+            cache: Simulators of earlier runs.
+        """
+        self.tracks = [Track(job, number) for number, job in enumerate(jobs)]
+        self.cache, self._note = cache, note
+        self._family = family(jobs[0].cfg.method.family)
+        self._clock = _Clock(self.tracks)
+
+    # ------------------------------------------------------------------------------------------------ hooks
+
+    def build(self) -> None:
+        """Find out what is missing, then make what the runs share, :attr:`problem` at least."""
+        raise NotImplementedError(f"{type(self).__name__} has no build")
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make what a run has of its own, from a :attr:`Step.state` if there is one, else from nothing."""
+
+    def has_more(self, track: Track) -> bool:
+        """Whether a run has iterations to do; by default up to ``method.iterations``."""
+        return track.iteration < self.iterations(track)
+
+    def iterations(self, track: Track) -> int:
+        """Return how many iterations a run has."""
+        return cast(Any, track.cfg.method).iterations
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Do one iteration of each of some runs, wherever it stands; by default :meth:`step` of each.
+
+        Args:
+            tracks: The runs that have more to do.
+
+        Yields:
+            Those that came through; others are to be broken off by :meth:`Track.fail`.
+        """
+        for track in tracks:
+            yield track, self.step(track)
+
+    def step(self, track: Track) -> Step:
+        """Do one iteration of one run.
+
+        Raises:
+            plab.sim.SimulationError: If a state, loss or gradient stops being finite.
+            plab.runners.RunError: If it cannot go on for another reason.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has neither step nor iterate")
+
+    def close(self) -> None:
+        """Let go of what the iterations needed, even if they broke off."""
+
+    def conclude(self, track: Track) -> None:
+        """Keep what the run has beside its result, before the final evaluation."""
+
+    def judge(self, actions: np.ndarray) -> Episodes:
+        """Run actions, shape [batch, T, A], in the hard contact model."""
+        self.problem.simulator.set_contact("hard")
+        return self.problem.rollout(actions, gradient=False, strict=False)
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Return what surrounds everything, such as the threads of a library."""
+        return nullcontext()
+
+    def extent(self) -> tuple[int, int, int]:
+        """Return, for the progress, what is done, what there is to do, and how often to say so without a
+        terminal."""
+        total = max(self.iterations(track) for track in self.tracks)
+        return min(track.iteration for track in self.tracks), total, PLAIN_EVERY
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report how it goes after an iteration, of several runs on average."""
+        loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
+        best = np.mean([track.best_loss for track in tracks])
+        text = f"{'' if len(rows) == 1 else 'mean '}loss {loss:.5g} score {score:.3f} best {best:.5g}"
+        self.report(min(track.iteration for track in tracks), text)
+
+    # ------------------------------------------------------------------------------------ what hooks may use
+
+    def enter(self, phase: str) -> None:
+        """Count the wall time from now on as that of another phase."""
+        self._clock.enter(phase)
+
+    def actions_at_rest(self) -> np.ndarray:
+        """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
+        scene = self.problem.scenes[0]
+        return np.zeros((len(self.tracks), scene.horizon, scene.action_dim))
+
+    # ----------------------------------------------------------------------------------------- what is shared
+
+    def run(self) -> None:
+        """Carry out the runs. One that breaks off is noted in its job and does not disturb the others.
+
+        Raises:
+            TogetherError: If nothing can be built of several runs: perhaps fewer do.
+            plab.config.ConfigError: If something that the configuration asks for is not there.
+            plab.results.ResultsError: If the file of a lone run cannot be written.
+            plab.runners.RunError: If a lone run cannot be built, or no run can go on.
+        """
+        with self.context(), simulation_errors():
+            try:
+                self._build()
+                self._optimise()
+            finally:
+                self._clock.stop()
+                self.close()
+            self._conclude()
+
+    def _build(self) -> None:
+        self.enter("build")
+        try:
+            with simulation_errors():
+                self.build()
+        except Exception as error:
+            if len(self.tracks) > 1 and not isinstance(error.__cause__, DeviceError):
+                raise TogetherError(str(error)) from error
+            raise
+        for track in self.tracks:
+            result = track.job.run.result
+            result.labels = self.problem.labels
+            if self._family.batching:
+                result.provenance["batch"] = len(self.tracks)
+            self.start(track, result.resume)
+
+    def _optimise(self) -> None:
+        """Do the iterations that the files do not hold yet."""
+        done, total, every = self.extent()
+        first = self.tracks[0].cfg
+        heading = self._note + batch_title([track.cfg for track in self.tracks])
+        # The first rollout of a process compiles the kernels.
+        phase = "compile"
+        with show_progress(heading, done, total, enabled=first.progress, plain_every=every) as self.report:
+            while active := [track for track in self.tracks if track.job.open and self.has_more(track)]:
+                self._clock.enter(phase, active)
+                with simulation_errors(f"iteration {active[0].iteration}: "):
+                    rows = self._rows(active)
+                phase = "optimise"
+                if rows:
+                    self.tell(rows, active)
+
+    def _rows(self, active: Sequence[Track]) -> list[dict[str, float]]:
+        """Do one iteration of each active run, and return the rows of those that came through."""
+        columns = (*episode_columns(self.problem.term_names), *self._family.columns)
+        rows, start = [], time.perf_counter()
+        for track, step in self.iterate(active):
+            if step.seconds is None:
+                step = replace(step, seconds=time.perf_counter() - start)
+            try:
+                rows.append(track.record(step, columns, keep=self.KEEP_ALL))
+            except ResultsError as error:
+                track.job.fail(error)
+            start = time.perf_counter()
+        return rows
+
+    def _conclude(self) -> None:
+        """Run the best actions in the hard contact model, and finish the files."""
+        for track in (one for one in self.tracks if one.job.open):
+            try:
+                self.conclude(track)
+            except ResultsError as error:
+                track.job.fail(error)
+        left = [track for track in self.tracks if track.job.open]
+        if not left:
+            return
+        best = self.actions_at_rest()
+        for track in left:
+            best[track.number] = track.best_actions
+        self._clock.enter("evaluate", left)
+        with simulation_errors("final evaluation: "):
+            episodes = self.judge(best)
+        self._clock.stop()
+        for track in left:
+            self._finish(track, episodes)
+
+    def _finish(self, track: Track, episodes: Episodes) -> None:
+        number = track.number
+        if number in episodes.failures:
+            track.job.fail(RunError(f"final evaluation: {episodes.failures[number]}"))
+            return
+        masses = {
+            "initial": self.problem.initial_mass,
+            "final": cast(np.ndarray, episodes.final_mass),
+            "target": self.problem.target_mass,
+        }
+        try:
+            track.job.run.finish(
+                measures(episodes, number), {name: mass[number] for name, mass in masses.items()}
+            )
+        except ResultsError as error:
+            track.job.fail(error)
+
+
+class _Clock:
+    """Adds up the wall time of phases, each run its share."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self._tracks, self._phase, self._since = tracks, "", 0.0
+
+    def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
+        """End the phase that is under way and begin another, of other runs if some are given."""
+        self.stop()
+        self._phase, self._since = phase, time.perf_counter()
+        self._tracks = tracks or self._tracks
+
+    def stop(self) -> None:
+        """End the phase that is under way, if one is."""
+        if self._phase:
+            seconds = (time.perf_counter() - self._since) / len(self._tracks)
+            for track in self._tracks:
+                track.job.run.spend(self._phase, seconds)
+        self._phase = ""
