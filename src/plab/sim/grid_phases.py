@@ -6,6 +6,7 @@ import math
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
+from plab.sim.friction import slid, slid_adjoint
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
 
@@ -110,20 +111,6 @@ class GridPhases(Storage):
         return u
 
     @ti.func
-    def slide(self, r, normal, friction):
-        """Relative velocity after full contact: no normal part, the tangential one reduced by Coulomb
-        friction."""
-        rn = r.dot(normal)
-        t = r - rn * normal
-        if ti.static(self.manipulators_rub):
-            length = t.norm()
-            factor = 0.0 * rn
-            if length + rn * friction > 0.0 and length > 0.0:
-                factor = 1.0 + rn * friction / length
-            t = factor * t
-        return t
-
-    @ti.func
     def contact(self, shape: ti.template(), e, s, m, x, v):
         """Velocity of a node after contact with manipulator m."""
         out = v
@@ -137,8 +124,10 @@ class GridPhases(Storage):
             normal = self.out_of_frame(shape, e, s, m, n_local)
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
             r = v - u
-            if r.dot(normal) < 0.0:
-                out = u + (1.0 - strength) * r + strength * self.slide(r, normal, self.friction[e, m])
+            rn = r.dot(normal)
+            if rn < 0.0:
+                t = slid(r - rn * normal, rn, self.friction[e, m], self.manipulators_rub)
+                out = u + (1.0 - strength) * r + strength * t
         return out
 
     def turns(self, shape: str) -> bool:
@@ -172,20 +161,10 @@ class GridPhases(Storage):
             if rn < 0.0:
                 friction = self.friction[e, m]
                 t0 = r - rn * normal
-                length = t0.norm()
-                t = t0 * 0.0
-                t0_bar = t0 * 0.0
-                rn_bar = 0.0 * rn
-                if ti.static(not self.manipulators_rub):
-                    if length > 0.0:
-                        t = t0
-                        t0_bar = strength * bar
-                elif length + rn * friction > 0.0 and length > 0.0:
-                    factor = 1.0 + rn * friction / length
-                    along = t0.dot(bar) / length
-                    t = factor * t0
-                    t0_bar = strength * (factor * bar - (friction * rn * along / (length * length)) * t0)
-                    rn_bar = strength * friction * along
+                t = slid(t0, rn, friction, self.manipulators_rub)
+                t0_bar, rn_bar = slid_adjoint(t0, rn, friction, self.manipulators_rub, bar)
+                t0_bar *= strength
+                rn_bar *= strength
                 rn_bar -= normal.dot(t0_bar)
                 r_bar = (1.0 - strength) * bar + t0_bar + rn_bar * normal
                 normal_bar = rn_bar * r - rn * t0_bar
@@ -261,12 +240,8 @@ class GridPhases(Storage):
         """Velocity after the floor, for a floor node with v_y < 0."""
         out = v * 0.0
         if friction < STICKING:
-            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-            factor = 0.0 * length
-            if length + friction * v[1] > 0.0 and length > 0.0:
-                factor = 1.0 + friction * v[1] / length
-            out[0] = factor * v[0]
-            out[2] = factor * v[2]
+            t = slid(ti.Vector([v[0], v[2]]), v[1], friction, True)
+            out = ti.Vector([t[0], 0.0 * v[1], t[1]])
         return out
 
     @ti.func
@@ -274,14 +249,10 @@ class GridPhases(Storage):
         """Adjoint of v under :meth:`floor`."""
         out = v * 0.0
         if friction < STICKING:
-            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-            if length + friction * v[1] > 0.0 and length > 0.0:
-                factor = 1.0 + friction * v[1] / length
-                along = (v[0] * bar[0] + v[2] * bar[2]) / length
-                back = friction * v[1] * along / (length * length)
-                out[0] = factor * bar[0] - back * v[0]
-                out[1] = friction * along
-                out[2] = factor * bar[2] - back * v[2]
+            t_bar, vy_bar = slid_adjoint(
+                ti.Vector([v[0], v[2]]), v[1], friction, True, ti.Vector([bar[0], bar[2]])
+            )
+            out = ti.Vector([t_bar[0], vy_bar, t_bar[1]])
         return out
 
     @ti.func
