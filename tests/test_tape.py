@@ -28,7 +28,6 @@ class Numbers:
         self.device, self.sorts, self.substeps, self.batch, self.places = "cpu", sorts, SUBSTEPS, 1, 1
         self.slot_entries = self.slot_bytes = 1
         self.current, self.numbers = self.array(1), self.array(1)
-        self.pose_bar = self.frame_bar = self.material_bar = self.array(1)
         self.seen: list[tuple[int, list[int]]] = []
 
     def array(self, slots: int) -> np.ndarray:
@@ -36,6 +35,9 @@ class Numbers:
 
     def allocate(self, steps: int) -> np.ndarray:
         return np.full(steps, -1)
+
+    def clear_adjoint(self) -> None:
+        pass
 
     def allocate_adjoint(self) -> None:
         pass

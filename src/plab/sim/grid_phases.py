@@ -82,10 +82,6 @@ class GridPhases(Storage):
 
     # -- contact ------------------------------------------------------------------------------------
 
-    def rotated(self, shape: str) -> bool:
-        """Whether the rotation of a shape's frame matters; decided while compiling."""
-        return shape != "Sphere" or not self.skips.rotations
-
     @ti.func
     def into_frame(self, shape: ti.template(), e, s, m, v):
         """A world vector in manipulator m's frame."""
@@ -119,7 +115,7 @@ class GridPhases(Storage):
         strength = self.strength(e, d)
         if strength > 0.0:
             # What touches a manipulator that cannot move does not touch an action.
-            if ti.static(MANIPULATOR_SHAPES[shape].motion != "static"):
+            if ti.static(MANIPULATOR_SHAPES[shape].moves):
                 self.note_contact(e)
             normal = self.out_of_frame(shape, e, s, m, n_local)
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
@@ -129,14 +125,6 @@ class GridPhases(Storage):
                 t = slid(r - rn * normal, rn, self.friction[e, m], self.manipulators_rub)
                 out = u + (1.0 - strength) * r + strength * t
         return out
-
-    def turns(self, shape: str) -> bool:
-        """Whether manipulators of this shape rotate; decided while compiling."""
-        return shape in ("RollingPin", "Chopsticks", "Box") or not self.skips.rotations
-
-    def moves(self, shape: str) -> bool:
-        """Whether manipulators of this shape can move; decided while compiling."""
-        return MANIPULATOR_SHAPES[shape].motion != "static" or not self.skips.still_manipulators
 
     @ti.func
     def note_contact(self, e):
@@ -201,19 +189,10 @@ class GridPhases(Storage):
                             grid_index, m, 6 + 3 * i + j, normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
                         )
                         self.accumulate_frame(grid_index, m, 15 + 3 * i + j, u_bar[i] * p[j])
-            if ti.static(shape == "Chopsticks"):
+            if ti.static(MANIPULATOR_SHAPES[shape].grips):
                 self.accumulate_frame(
                     grid_index, m, FRAME_ADJOINT - 1, gap_slope(shape, p) * from_distance[0]
                 )
-
-    @ti.func
-    def accumulate_frame(self, grid_index, m, entry, value):
-        """Add to a frame's adjoint: plainly where one thread owns it, atomically on CUDA."""
-        wide = ti.cast(value, ti.f64)
-        if ti.static(self.cuda):
-            ti.atomic_add(self.frame_bar[grid_index, m, entry], wide)
-        else:
-            self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     # -- walls --------------------------------------------------------------------------------------
 

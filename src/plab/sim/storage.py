@@ -25,6 +25,7 @@ from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.series import Series
+from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.skips import Skips
 
 __all__ = [
@@ -159,6 +160,7 @@ class Storage:
         manipulators = scenes[0].manipulators
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
+        require_surfaces(self.shapes)
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
         rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
         self.manipulators_rub = rub or not self.skips.friction
@@ -174,6 +176,18 @@ class Storage:
             else:
                 runs.append((shape, number, number + 1))
         self.runs = tuple(runs)
+
+    def moves(self, shape: str) -> bool:
+        """Whether manipulators of this shape can move; decided while compiling, as what follows."""
+        return MANIPULATOR_SHAPES[shape].moves or not self.skips.still_manipulators
+
+    def turns(self, shape: str) -> bool:
+        """Whether manipulators of this shape rotate."""
+        return MANIPULATOR_SHAPES[shape].turns or not self.skips.rotations
+
+    def rotated(self, shape: str) -> bool:
+        """Whether the rotation of a shape's frame matters: what is round has a spin only."""
+        return self.turns(shape) or not SURFACES[shape].round
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
@@ -253,13 +267,17 @@ class Storage:
         """Allocate what only gradients need, once."""
         if hasattr(self, "velocity_bar"):
             return
-        real, b, m = self.real, self.batch, max(1, self.manipulators)
+        real, b = self.real, self.batch
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
-        self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
-        self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+        self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, max(1, self.manipulators)))
         # Adjoints of mu, lambda and yield strain.
         self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
+
+    def clear_adjoint(self) -> None:
+        """Begin a gradient: clear the adjoints that are sums over its steps."""
+        self.pose_bar.fill(0)
+        self.material_bar.fill(0)
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""
