@@ -149,6 +149,7 @@ def pair() -> tuple[Tiles, Threads]:
     for phases in both:
         phases.allocate_adjoint()
         phases.clear_adjoint()
+    both[1].work = ti.Vector.field(4, runtime.real, shape=9)
     return both
 
 

@@ -37,6 +37,12 @@ STAGE_G_BAR = 40
 class MaterialTiles(ParticlePhases):
     """Return mapping and stress of tiles, and their adjoints."""
 
+    def _allocate(self) -> None:
+        super()._allocate()
+        self.stage = ti.Vector.field(self.lanes, self.real, shape=self.batch * self.chunks * STAGE)
+        self.once = ti.field(ti.i32, shape=())
+        self.once[None] = 1
+
     @ti.func
     def all_served(self, z_squared, j):
         """Whether the series served all lanes of a tile."""

@@ -9,7 +9,7 @@ particle), and the next part takes them from there.
 import taichi as ti
 
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import BLOCK, BLOCK_BITS, INDEX_MASK
+from plab.sim.storage import INDEX_MASK, PLACES, SPREAD, WORK
 from plab.sim.transfer import at_base, column, gather, gather_adjoint, scatter, spline, spline_slope
 
 __all__ = ["TransferTiles"]
@@ -34,6 +34,27 @@ REACHING = tuple(
 
 class TransferTiles(ParticlePhases):
     """Particle-to-grid and grid-to-particle transfers of tiles, and their adjoints."""
+
+    def _allocate(self) -> None:
+        grids = self.batch * self.chunks
+        if grids * self.nodes > INDEX_MASK:
+            raise MemoryError(
+                f"{self.batch} environments of {self.n}^3 nodes are more than one simulator can number: "
+                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
+            )
+        super()._allocate()
+        self.work = ti.Vector.field(4, self.real, shape=grids * WORK)
+        self.spread = ti.Vector.field(self.lanes, self.real, shape=grids * SPREAD)
+        self.places = ti.Vector.field(self.lanes, ti.i32, shape=grids * PLACES)
+        # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
+        self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
+        self.block_chunks = ti.field(ti.i32, shape=self.batch * self.blocks)
+        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
+        # block.
+        self.mark_stamp = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_code = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_list = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_count = ti.field(ti.i32, shape=grids)
 
     @ti.func
     def bounded(self, index):
@@ -71,9 +92,9 @@ class TransferTiles(ParticlePhases):
                 for k in ti.static(range(3)):
                     self.spread[at + SLOPES + 3 * k + axis] = dw[k]
             node = node * self.axis + base
-            block = block * self.blocks_per_axis + (base >> BLOCK_BITS)
-            # 1 where the stencil reaches into the next block.
-            crossing = crossing + ((((base & (BLOCK - 1)) + 2) >> BLOCK_BITS) << axis)
+            b, crosses = self.block_along(base)
+            block = block * self.blocks_per_axis + b
+            crossing = crossing + (crosses << axis)
         self.places[places_at + NODE] = node
         self.places[places_at + KEY] = block * 8 + crossing
 

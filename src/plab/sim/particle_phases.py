@@ -258,17 +258,17 @@ class ParticlePhases(Storage):
     # -- which blocks hold mass ---------------------------------------------------------------------
 
     @ti.func
+    def block_along(self, base):
+        """Block of a base node along an axis, and 1 where its stencil reaches into the next, else 0."""
+        return base >> BLOCK_BITS, ((base & (BLOCK - 1)) + 2) >> BLOCK_BITS
+
+    @ti.func
     def block_of(self, base):
         """Linear index of the block of a base node, and which axes its stencil crosses into the next block
         (3 bits)."""
-        b = base >> BLOCK_BITS
-        r = base & (BLOCK - 1)
-        crossing = (
-            ti.select(r[0] >= BLOCK - 2, 1, 0)
-            + ti.select(r[1] >= BLOCK - 2, 2, 0)
-            + ti.select(r[2] >= BLOCK - 2, 4, 0)
-        )
-        return (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2], crossing
+        b, crosses = self.block_along(base)
+        block = (b[0] * self.blocks_per_axis + b[1]) * self.blocks_per_axis + b[2]
+        return block, crosses[0] + 2 * crosses[1] + 4 * crosses[2]
 
     @ti.func
     def neighbour(self, block, corner: ti.template()):

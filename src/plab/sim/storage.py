@@ -191,13 +191,7 @@ class Storage:
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
-        if not self.cuda and b * self.chunks * self.nodes > INDEX_MASK:
-            raise MemoryError(
-                f"{b} environments of {self.n}^3 nodes are more than one simulator can number: "
-                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
-            )
         m = max(1, self.manipulators)
-        grids = b * self.chunks
         self.lane_type = ti.types.vector(self.lanes, real)
         # Material per environment: mu, lambda, yield strain, floor friction, gravity (3).
         self.material = ti.Vector.field(7, real, shape=b)
@@ -219,14 +213,13 @@ class Storage:
         self.frame_gap = ti.field(real, shape=(b, self.substeps, m))
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
-        self.work = ti.Vector.field(4, real, shape=1 if self.cuda else grids * WORK)
-        self.spread = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * SPREAD)
-        self.places = ti.Vector.field(self.lanes, ti.i32, shape=1 if self.cuda else grids * PLACES)
-        # Intermediate results of the material update of one tile per chunk.
-        self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
-        self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
+        self.momentum = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
-        self._allocate_blocks(grids)
+        # A block is in use when its stamp is the current substep's.
+        self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_list = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_count = ti.field(ti.i32, shape=b)
+        self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
         self.target = ti.field(real, shape=b * self.n**3)
         self.target_sdf = ti.field(real, shape=b * self.n**3)
         self.target_sum = ti.field(ti.f64, shape=b)
@@ -234,8 +227,6 @@ class Storage:
         self.loss_part = ti.Vector.field(4, ti.f64, shape=(b, self.chunks))
         self.contact_part = ti.field(real, shape=(b, self.chunks, m))
         self.contact_particle = ti.field(ti.i32, shape=(b, self.chunks, m))
-        self.once = ti.field(ti.i32, shape=())
-        self.once[None] = 1
         self.fault = ti.field(ti.i32, shape=b)
         # Whether a moving manipulator has touched the body since the reset, and the last environment step at
         # whose start none had.
@@ -245,23 +236,6 @@ class Storage:
     def gathered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors that particles gather from."""
         return ti.Vector.field(4, self.real, shape=nodes)
-
-    def _allocate_blocks(self, grids: int) -> None:
-        b = self.batch
-        # A block is in use when its stamp is the current substep's.
-        self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
-        self.block_list = ti.field(ti.i32, shape=b * self.blocks)
-        self.block_count = ti.field(ti.i32, shape=b)
-        self.block_first = ti.field(ti.i32, shape=(1, 1) if self.cuda else (b, self.chunks + 1))
-        self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
-        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
-        # block.
-        private = 1 if self.cuda else grids
-        self.mark_stamp = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_code = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_list = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_count = ti.field(ti.i32, shape=private)
-        self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
 
     def allocate_adjoint(self) -> None:
         """Allocate what only gradients need, once."""
