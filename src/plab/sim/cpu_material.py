@@ -38,9 +38,9 @@ class MaterialTiles(ParticlePhases):
     """Return mapping and stress of tiles, and their adjoints."""
 
     def _allocate(self) -> None:
-        super()._allocate()
         self.stage = ti.Vector.field(self.lanes, self.real, shape=self.batch * self.chunks * STAGE)
         self.once = ti.field(ti.i32, shape=())
+        super()._allocate()
         self.once[None] = 1
 
     @ti.func

@@ -10,6 +10,7 @@ from plab.sim.cpu_material import MaterialTiles
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.loss_phases import LossPhases
+from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases
 from plab.sim.storage import BLOCK, FRAME_ADJOINT, PLACES, SPREAD, STAGE, WORK
 
@@ -216,9 +217,23 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, LossPhases
         ``after``."""
         self.note_step(e, t)
         for m in ti.static(range(self.manipulators)):
-            self.move_manipulator(e, m, actions, poses, t, before, after)
+            entry = (before * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                self.pose[e, 0, m][i] = poses[entry * 8 + i]
+            u = self.substep_motion(e, m, actions, t)
             for s in range(self.substeps):
+                self.pose[e, s + 1, m] = advance_pose(
+                    self.motions[m],
+                    self.pose[e, s, m],
+                    u,
+                    self.low[e, m],
+                    self.high[e, m],
+                    self.minimal_gap[e, m],
+                )
                 self.set_frame(e, s, m)
+            entry = (after * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                poses[entry * 8 + i] = self.pose[e, self.substeps, m][i]
 
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):

@@ -22,6 +22,7 @@ from plab.sim.material import (
     trial_gradient,
     yield_factor,
 )
+from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
@@ -303,7 +304,20 @@ class CudaPhases(OrderPhases, PosePhases):
         """Poses of one manipulator in all substeps of environment step t."""
         if ti.static(m == 0):
             self.note_step(e, t)
-        self.move_manipulator(e, m, actions, poses, t, before, after)
+        pose = self.pose[e, 0, m]
+        entry = (before * self.batch + e) * self.manipulators + m
+        for i in ti.static(range(8)):
+            pose[i] = poses[entry * 8 + i]
+        self.pose[e, 0, m] = pose
+        u = self.substep_motion(e, m, actions, t)
+        for s in range(self.substeps):
+            pose = advance_pose(
+                self.motions[m], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+            )
+            self.pose[e, s + 1, m] = pose
+        entry = (after * self.batch + e) * self.manipulators + m
+        for i in ti.static(range(8)):
+            poses[entry * 8 + i] = pose[i]
 
     @ti.func
     def retreat_through(self, e, m: ti.template(), actions: ti.template(), actions_bar: ti.template(), t):

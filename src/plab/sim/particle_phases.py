@@ -91,20 +91,11 @@ class ParticlePhases(Storage):
 
     @ti.func
     def put_gathered(self, state: ti.template(), target, lane, x, fx, m0, mx, my, mz, e, time):
-        """Write v, C and x after the substep from the moments of the grid's velocities.
+        """Write v, C and x after the substep of the particle at x, from moments of the grid's velocities.
 
-        Args:
-            state: Particle state.
-            target: Entry of the tile after the substep.
-            lane: Particle of the tile.
-            x: Its position before.
-            fx: x / dx - base.
-            m0: Sum of w v over the stencil, a 4-vector whose last entry is ignored, as those that follow.
-            mx: Sum of w v times the node's offset (0, 1, 2) along x.
-            my: The same along y.
-            mz: The same along z.
-            e: Environment.
-            time: Substep, noted where the speed is not sane.
+        ``m0`` is the sum of w v over the stencil, ``mx``, ``my``, ``mz`` are those of w v times the node's
+        offset (0, 1, 2) along an axis, 4-vectors whose last entry is ignored. ``time`` is noted where the
+        speed is not sane.
         """
         scale = 4.0 * self.inv_dx
         c0 = scale * (mx - fx[0] * m0)
@@ -138,25 +129,11 @@ class ParticlePhases(Storage):
         mz,
         slope,
     ):
-        """Write the adjoints of x and v before the substep, from what was gathered.
+        """Write the adjoints of x and v before the substep; returns that of A, row by row.
 
-        Args:
-            bar: Adjoints of the particles.
-            target: Entry of the tile in it.
-            lane: Particle of the tile.
-            a: A, 9 numbers.
-            c_bar: Adjoint of C after the substep, 9 numbers.
-            x: Position before.
-            v_after: Velocity after.
-            fx: x / dx - base.
-            m0: Moments of the momentum's adjoint, as in :meth:`put_gathered`.
-            mx: First moment along x.
-            my: First moment along y.
-            mz: First moment along z.
-            slope: Sum of grad_f w (momentum_bar . q + velocity . h) over the stencil, a 3-vector.
-
-        Returns:
-            Adjoint of A, row by row.
+        Takes A, the adjoint of C, x before and v after the substep; the moments of the momentum's adjoint as
+        in :meth:`put_gathered`; and ``slope``, the sum of grad_f w (momentum_bar . q + velocity . h) over the
+        stencil, 3-vector.
         """
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)

@@ -3,7 +3,11 @@
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.motion import advance_pose, advance_pose_adjoint, rotation_matrix, rotation_matrix_adjoint
+from plab.sim.motion import (
+    advance_pose_adjoint,
+    rotation_matrix,
+    rotation_matrix_adjoint,
+)
 from plab.sim.storage import Storage
 
 __all__ = ["PosePhases", "vec7"]
@@ -39,27 +43,6 @@ class PosePhases(Storage):
         if ti.static(self.skips.adjoints):
             if self.touched[e] == 0:
                 self.untouched_step[e] = t
-
-    @ti.func
-    def move_manipulator(
-        self, e, m: ti.template(), actions: ti.template(), poses: ti.template(), t, before, after
-    ):
-        """Poses of one manipulator in all substeps of environment step t, from slot ``before`` of the pose
-        history to slot ``after``."""
-        pose = self.pose[e, 0, m]
-        entry = (before * self.batch + e) * self.manipulators + m
-        for i in ti.static(range(8)):
-            pose[i] = poses[entry * 8 + i]
-        self.pose[e, 0, m] = pose
-        u = self.substep_motion(e, m, actions, t)
-        for s in range(self.substeps):
-            pose = advance_pose(
-                self.motions[m], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
-            )
-            self.pose[e, s + 1, m] = pose
-        entry = (after * self.batch + e) * self.manipulators + m
-        for i in ti.static(range(8)):
-            poses[entry * 8 + i] = pose[i]
 
     @ti.func
     def place_manipulators(self, e, poses: ti.template(), slot):
