@@ -220,7 +220,8 @@ class GridPhases(Storage):
         out = v * 0.0
         if friction < STICKING:
             t = slid(ti.Vector([v[0], v[2]]), v[1], friction, True)
-            out = ti.Vector([t[0], 0.0 * v[1], t[1]])
+            out[0] = t[0]
+            out[2] = t[1]
         return out
 
     @ti.func
