@@ -29,7 +29,6 @@ class Numbers:
         self.slot_entries = self.slot_bytes = 1
         self.terms, self.measures = (), 2
         self.current, self.numbers = self.array(1), self.array(1)
-        self.pose_bar = self.frame_bar = self.material_bar = self.array(1)
         self.seen: list[tuple[int, list[int]]] = []
 
     def array(self, slots: int) -> np.ndarray:
@@ -37,6 +36,9 @@ class Numbers:
 
     def allocate(self, steps: int) -> np.ndarray:
         return np.full(steps, -1)
+
+    def clear_adjoint(self) -> None:
+        pass
 
     def allocate_adjoint(self) -> None:
         pass

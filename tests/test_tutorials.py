@@ -32,13 +32,14 @@ from plab.render.shapes import manipulator_parts
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator
 
-tool = Manipulator("Disc", (0.06, 0.03), (0.5, 0.235, 0.5), scale=(0.02,) * 3)
+tool = Manipulator("Disc", (0.06, 0.03), (0.5, 0.235, 0.5), scale=(0.02,) * 3 + (0.2,) * 3)
 body = Body("box", (0.5, 0.1, 0.5), (0.2, 0.2, 0.2), 200)
 scene = Scene("disc", (body,), (tool,), grid_size=16, substeps=5, dt=4e-4, horizon=4)
 simulator = Simulator([scene], terms=make_terms({"sdf": 10.0, "contact": 1.0}), precision="float64")
 aim = np.roll(simulator.mass_tensor(), 4, axis=1)
 simulator.set_target(aim, np.stack([target_sdf(mass) for mass in aim]))
-actions = np.random.default_rng(0).uniform(-0.5, 0.5, (1, 4, 3)) - [0.0, 0.4, 0.0]
+actions = np.random.default_rng(0).uniform(-0.5, 0.5, (1, 4, 6))
+actions[..., 1] -= 0.4
 direction = np.random.default_rng(1).normal(size=actions.shape)
 
 
@@ -47,7 +48,9 @@ def loss(shift):
     return terms.sum(axis=0) @ [10, 1]
 
 
-slope = (simulator.rollout(actions).gradient * direction).sum()
+gradient = simulator.rollout(actions).gradient
+assert (np.abs(gradient).max(axis=(0, 1)) > 1e-3 * np.abs(gradient).max()).all(), gradient
+slope = (gradient * direction).sum()
 # Nodes come into reach of contact and leave it: over longer ways the loss has jumps.
 difference = (loss(1e-6) - loss(-1e-6)) / 2e-6
 assert abs(difference) > 1e-3, difference

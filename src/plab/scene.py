@@ -63,6 +63,21 @@ class ManipulatorShape:
     motion: str
     action_names: tuple[str, ...]
 
+    @property
+    def moves(self) -> bool:
+        """Whether it can move."""
+        return self.motion != "static"
+
+    @property
+    def turns(self) -> bool:
+        """Whether it can turn: whether its rotation depends on the actions."""
+        return self.motion in ("roll", "grip", "rigid")
+
+    @property
+    def grips(self) -> bool:
+        """Whether its gap depends on the actions."""
+        return self.motion == "grip"
+
 
 _XYZ = ("x", "y", "z")
 _ROTATION = ("rotation_x", "rotation_y", "rotation_z")

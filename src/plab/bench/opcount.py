@@ -161,10 +161,7 @@ def _scatter() -> None:
     grid: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     work: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     fx = _vector(3)
-    scene = SimpleNamespace(dx=Counting())
-    field = plain(ParticlePhases.affine_field)(
-        scene, Counting() * _vector(3), Counting(), _numbers(9), fx, 1.0
-    )
+    field = plain(transfer.affine_field)(Counting() * _vector(3), Counting(), _numbers(9), fx, Counting())
     plain(transfer.scatter)(grid, 0, 100, 10, plain(transfer.spline)(fx), field, work, 0)
 
 
@@ -183,11 +180,8 @@ def _gather_adjoint() -> None:
     grid: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     work: dict[int, np.ndarray] = defaultdict(lambda: _vector(4))
     fx = _vector(3)
-    scene = SimpleNamespace(dx=Counting(), axis=10)
     for _field in range(2):
-        plain(ParticlePhases.affine_field)(
-            scene, Counting() * _vector(3), Counting(), _numbers(9), fx, Counting()
-        )
+        plain(transfer.affine_field)(Counting() * _vector(3), Counting(), _numbers(9), fx, Counting())
     weights, slopes = plain(transfer.spline)(fx), plain(transfer.spline_slope)(fx)
     plain(transfer.gather_adjoint)(grid, grid, 0, 100, 10, weights, slopes, work, 0)
     # Slopes summed, offsets by C_bar and A, adjoints of x and v, and nine entries of A's.

@@ -76,12 +76,8 @@ def check_gradient(
 
 def _free(scene: Scene) -> np.ndarray:
     """Which of the manipulators' 8 numbers each can change, 1 or 0, shape [manipulator, 8]."""
-    motions = [MANIPULATOR_SHAPES[m.shape].motion for m in scene.manipulators]
-    rows = [
-        [motion != "static"] * 3 + [motion in ("roll", "grip", "rigid")] * 4 + [motion == "grip"]
-        for motion in motions
-    ]
-    return np.array(rows, float)
+    kinds = [MANIPULATOR_SHAPES[m.shape] for m in scene.manipulators]
+    return np.array([[kind.moves] * 3 + [kind.turns] * 4 + [kind.grips] for kind in kinds], float)
 
 
 def _disturbed(simulator: Simulator, rng: np.random.Generator) -> State:

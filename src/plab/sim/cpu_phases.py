@@ -6,10 +6,12 @@ where threads wait for each other, is up to :mod:`plab.sim.engine`.
 
 import taichi as ti
 
+from plab.sim.cpu_material import MaterialTiles
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
+from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases
-from plab.sim.storage import BLOCK, CHUNKS, PLACES, SPREAD, STAGE, WORK
+from plab.sim.storage import BLOCK, CHUNKS, FRAME_ADJOINT, PLACES, SPREAD, STAGE, WORK
 from plab.sim.term_phases import TermPhases
 
 __all__ = ["BLOCK_NODES", "CpuPhases"]
@@ -17,7 +19,7 @@ __all__ = ["BLOCK_NODES", "CpuPhases"]
 BLOCK_NODES = BLOCK**3
 
 
-class CpuPhases(TransferTiles, GridPhases, PosePhases, TermPhases):
+class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases):
     """All phases, for one chunk at a time."""
 
     shares = CHUNKS
@@ -27,9 +29,15 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, TermPhases):
         if hasattr(self, "velocity_bar"):
             return
         super().allocate_adjoint()
+        m = max(1, self.manipulators)
+        self.frame_bar = ti.field(ti.f64, shape=(self.batch * self.chunks, m, FRAME_ADJOINT))
         # Shares of the chunks in the poses' adjoints under terms of distances.
-        chunks = self.chunks if self.spreads else 1
-        self.pose_part = ti.Vector.field(8, ti.f64, shape=(self.batch, chunks, max(1, self.manipulators)))
+        self.pose_part = ti.Vector.field(8, ti.f64, shape=(self.batch, self.chunks if self.spreads else 1, m))
+
+    def clear_adjoint(self) -> None:
+        """Begin a gradient: clear the adjoints that are sums over its steps."""
+        super().clear_adjoint()
+        self.frame_bar.fill(0)
 
     # -- shares -------------------------------------------------------------------------------------
 
@@ -204,6 +212,65 @@ class CpuPhases(TransferTiles, GridPhases, PosePhases, TermPhases):
                     self.bounded(grid_index * WORK),
                 )
             self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded(grid_index * STAGE))
+
+    # -- poses --------------------------------------------------------------------------------------
+
+    @ti.func
+    def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
+        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
+        ``after``."""
+        self.note_step(e, t)
+        for m in ti.static(range(self.manipulators)):
+            entry = (before * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                self.pose[e, 0, m][i] = poses[entry * 8 + i]
+            u = self.substep_motion(e, m, actions, t)
+            for s in range(self.substeps):
+                self.pose[e, s + 1, m] = advance_pose(
+                    self.motions[m],
+                    self.pose[e, s, m],
+                    u,
+                    self.low[e, m],
+                    self.high[e, m],
+                    self.minimal_gap[e, m],
+                )
+                self.set_frame(e, s, m)
+            entry = (after * self.batch + e) * self.manipulators + m
+            for i in ti.static(range(8)):
+                poses[entry * 8 + i] = self.pose[e, self.substeps, m][i]
+
+    @ti.func
+    def accumulate_frame(self, grid_index, m, entry, value):
+        """Add to a frame's adjoint, where one thread owns it."""
+        wide = ti.cast(value, ti.f64)
+        self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
+
+    @ti.func
+    def collect_frame_adjoint(self, e, m: ti.template()):
+        """Sum the chunks' frame adjoints of one manipulator, and clear them."""
+        bar = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
+        for c in range(self.chunks):
+            for i in ti.static(range(FRAME_ADJOINT)):
+                bar[i] += self.frame_bar[e * self.chunks + c, m, i]
+                self.frame_bar[e * self.chunks + c, m, i] = 0.0
+        return bar
+
+    @ti.func
+    def retreat_manipulator(
+        self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t
+    ):
+        """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
+        end_bar, start_bar = self.frame_shares(e, m, s, self.collect_frame_adjoint(e, m))
+        u = self.substep_motion(e, m, actions, t)
+        pose_bar, u_bar = self.retreat_pose(e, m, s, u, self.pose_bar[e, m] + end_bar)
+        self.pose_bar[e, m] = pose_bar + start_bar
+        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
+
+    @ti.func
+    def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
+        """Adjoint of all manipulators' motion in substep s."""
+        for m in ti.static(range(self.manipulators)):
+            self.retreat_manipulator(e, m, s, actions, actions_bar, t)
 
     # -- terms of the loss, one chunk ---------------------------------------------------------------
 

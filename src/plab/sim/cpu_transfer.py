@@ -9,8 +9,8 @@ particle), and the next part takes them from there.
 import taichi as ti
 
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import BLOCK, BLOCK_BITS
-from plab.sim.transfer import column, gather, gather_adjoint, scatter, spline, spline_slope
+from plab.sim.storage import INDEX_MASK, PLACES, SPREAD, WORK
+from plab.sim.transfer import at_base, column, gather, gather_adjoint, scatter, spline, spline_slope
 
 __all__ = ["TransferTiles"]
 
@@ -34,6 +34,37 @@ REACHING = tuple(
 
 class TransferTiles(ParticlePhases):
     """Particle-to-grid and grid-to-particle transfers of tiles, and their adjoints."""
+
+    def _allocate(self) -> None:
+        grids = self.batch * self.chunks
+        if grids * self.nodes > INDEX_MASK:
+            raise MemoryError(
+                f"{self.batch} environments of {self.n}^3 nodes are more than one simulator can number: "
+                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
+            )
+        # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
+        self.work = ti.Vector.field(4, self.real, shape=grids * WORK)
+        self.spread = ti.Vector.field(self.lanes, self.real, shape=grids * SPREAD)
+        self.places = ti.Vector.field(self.lanes, ti.i32, shape=grids * PLACES)
+        # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
+        self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
+        self.block_chunks = ti.field(ti.i32, shape=self.batch * self.blocks)
+        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
+        # block.
+        self.mark_stamp = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_code = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_list = ti.field(ti.i32, shape=grids * self.blocks)
+        self.mark_count = ti.field(ti.i32, shape=grids)
+        super()._allocate()
+
+    @ti.func
+    def bounded(self, index):
+        """An index, the same: one of which LLVM can tell that sums with it do not overflow.
+
+        So it computes one address for all that lies at fixed distances, and finds neighbours to be
+        neighbours. Without, each of a stencil's nodes takes four instructions for its address.
+        """
+        return index & INDEX_MASK
 
     # -- by lanes -----------------------------------------------------------------------------------
 
@@ -62,9 +93,9 @@ class TransferTiles(ParticlePhases):
                 for k in ti.static(range(3)):
                     self.spread[at + SLOPES + 3 * k + axis] = dw[k]
             node = node * self.axis + base
-            block = block * self.blocks_per_axis + (base >> BLOCK_BITS)
-            # 1 where the stencil reaches into the next block.
-            crossing = crossing + ((((base & (BLOCK - 1)) + 2) >> BLOCK_BITS) << axis)
+            b, crosses = self.block_along(base)
+            block = block * self.blocks_per_axis + b
+            crossing = crossing + (crosses << axis)
         self.places[places_at + NODE] = node
         self.places[places_at + KEY] = block * 8 + crossing
 
@@ -73,29 +104,19 @@ class TransferTiles(ParticlePhases):
         """Value at the base node of the momentum that each particle of a tile scatters."""
         f = [self.spread[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
-            a = [self.affine[entry9 + 3 * i + j] for j in range(3)]
-            self.spread[at + MOMENTUM_FIELD + i] = self.mass * state[source + 3 + i] - self.dx * (
-                f[0] * a[0] + f[1] * a[1] + f[2] * a[2]
-            )
+            row = [self.affine[entry9 + 3 * i + j] for j in range(3)]
+            self.spread[at + MOMENTUM_FIELD + i] = at_base(self.mass * state[source + 3 + i], row, f, self.dx)
 
     @ti.func
     def adjoint_tile(self, state: ti.template(), source, after, bar: ti.template(), target, at):
         """Value at the base node of what each particle of a tile adds to the velocities' adjoint."""
         f = [self.spread[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
-            c_bar = [bar[target + 6 + 3 * i + j] for j in range(3)]
-            x_bar = self.open_lanes(state[source + i], state[after + 3 + i]) * bar[target + i]
-            self.spread[at + ADJOINT_FIELD + i] = (
-                bar[target + 3 + i]
-                + self.dt * x_bar
-                - (4.0 * self.inv_dx) * (f[0] * c_bar[0] + f[1] * c_bar[1] + f[2] * c_bar[2])
+            row = [bar[target + 6 + 3 * i + j] for j in range(3)]
+            v_bar = self.velocity_adjoint(
+                state[source + i], state[after + 3 + i], bar[target + i], bar[target + 3 + i]
             )
-
-    @ti.func
-    def open_lanes(self, x, v):
-        """1 where advection by v stays inside the domain along this axis, else 0."""
-        y = x + self.dt * v
-        return ti.select((y < 0.0) | (y > self.x_max), 0.0 * x, 0.0 * x + 1.0)
+            self.spread[at + ADJOINT_FIELD + i] = at_base(v_bar, row, f, 4.0 * self.inv_dx)
 
     # -- particle by particle -----------------------------------------------------------------------
 
@@ -189,24 +210,14 @@ class TransferTiles(ParticlePhases):
         # A variable: what is passed on as an expression is compiled again wherever it is used.
         w = self.weights(at + WEIGHTS, lane)
         gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.work, work_at)
-        scale = 4.0 * self.inv_dx
         f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
         x = self.vector(state, source, lane)
-        v = self.work[work_at]
+        m0 = self.work[work_at]
+        mx = self.work[work_at + 1]
+        my = self.work[work_at + 2]
+        mz = self.work[work_at + 3]
         # Everything is read before the first store, after which LLVM has to look up where arrays are again.
-        c0 = scale * (self.work[work_at + 1] - f[0] * v)
-        c1 = scale * (self.work[work_at + 2] - f[1] * v)
-        c2 = scale * (self.work[work_at + 3] - f[2] * v)
-        speed = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-        for i in ti.static(range(3)):
-            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v[i], 0.0), self.x_max)
-            state[target + 3 + i][lane] = v[i]
-            state[target + 6 + 3 * i][lane] = c0[i]
-            state[target + 7 + 3 * i][lane] = c1[i]
-            state[target + 8 + 3 * i][lane] = c2[i]
-        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
-        if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
-            self.fault[e] = time + 1
+        self.put_gathered(state, target, lane, x, f, m0, mx, my, mz, e, time)
 
     @ti.func
     def gather_particle_adjoint(
@@ -247,24 +258,17 @@ class TransferTiles(ParticlePhases):
             self.work,
             work_at,
         )
-        scale = 4.0 * self.inv_dx * self.inv_dx
+        slope = ti.Vector([self.work[work_at + 4 + i].sum() for i in range(3)])
+        f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+        x = self.vector(state, source, lane)
         v_after = self.vector(state, after + 3, lane)
-        open_axes = self.unclamped(self.vector(state, source, lane), v_after)
-        m0 = ti.Vector([self.work[work_at][0], self.work[work_at][1], self.work[work_at][2]])
-        for i in ti.static(range(3)):
-            slope = self.work[work_at + 4 + i].sum()
-            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
-            # the scatter.
-            offsets = scale * (
-                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
-            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
-            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope - offsets
-            bar[target + 3 + i][lane] = self.mass * m0[i]
-            f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
-            for j in ti.static(range(3)):
-                self.affine[entry9 + 3 * i + j][lane] = self.dx * (
-                    self.work[work_at + 1 + j][i] - f[j] * m0[i]
-                )
+        m0 = self.work[work_at]
+        mx = self.work[work_at + 1]
+        my = self.work[work_at + 2]
+        mz = self.work[work_at + 3]
+        a_bar = self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, f, m0, mx, my, mz, slope)
+        for i in ti.static(range(9)):
+            self.affine[entry9 + i][lane] = a_bar[i]
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 

@@ -35,6 +35,21 @@ class OrderPhases(WarpPhases):
         return e, q - e * (self.tiles * self.lanes)
 
     @ti.func
+    def mark_shared(self, e, base, stamp):
+        """Note that a particle touches the blocks around a node."""
+        block, crossing = self.block_of(base)
+        for corner in ti.static(range(8)):
+            if (crossing & corner) == corner:
+                self.list_block(e * self.blocks + self.neighbour(block, corner), stamp)
+
+    @ti.func
+    def list_block(self, entry, stamp):
+        """Take a block into the list of all environments, unless it is in it."""
+        if self.block_stamp[entry] < stamp:
+            if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
+                self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry
+
+    @ti.func
     def cell_of(self, state: ti.template(), slot, e, particle):
         """Array index of a particle's base node."""
         entry = self.tile_entry(slot, e, particle // self.lanes)
@@ -82,7 +97,7 @@ class OrderPhases(WarpPhases):
             e, particle = self.particle_of(q)
             if particle < self.particles:
                 base = self.cell_of(state, slot, e, particle)
-                self.rank[q] = ti.atomic_add(self.cell_count[e * self.nodes + self.node_index(base)], 1)
+                self.rank[q] = ti.atomic_add(self.cell_count[e * self.nodes + self.linear(base)], 1)
                 block, _crossing = self.block_of(base)
                 self.list_block(e * self.blocks + block, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
@@ -95,7 +110,7 @@ class OrderPhases(WarpPhases):
             place = particle
             if particle < self.particles:
                 base = self.cell_of(state, slot, e, particle)
-                place = self.cell_count[e * self.nodes + self.node_index(base)] + self.rank[q]
+                place = self.cell_count[e * self.nodes + self.linear(base)] + self.rank[q]
             moves[t * self.particle_threads + q - particle + place] = particle
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):

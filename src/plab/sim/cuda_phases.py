@@ -29,7 +29,7 @@ from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
-from plab.sim.transfer import spline, spline_slope
+from plab.sim.transfer import affine_field, spline, spline_slope
 
 __all__ = ["DISTANCE_GROUPS", "CudaPhases"]
 
@@ -163,20 +163,8 @@ class CudaPhases(OrderPhases, PosePhases):
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         w = spline(fx)
-        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.node_index(base), w)
-        scale = 4.0 * self.inv_dx
-        speed = 0.0 * fx[0]
-        for i in ti.static(range(3)):
-            v = m0[i]
-            state[target + 3 + i][lane] = v
-            state[target + 6 + 3 * i][lane] = scale * (mx[i] - fx[0] * v)
-            state[target + 7 + 3 * i][lane] = scale * (my[i] - fx[1] * v)
-            state[target + 8 + 3 * i][lane] = scale * (mz[i] - fx[2] * v)
-            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * v, 0.0), self.x_max)
-            speed += v * v
-        # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
-        if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
-            self.fault[e] = time + 1
+        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.linear(base), w)
+        self.put_gathered(state, target, lane, x, fx, m0, mx, my, mz, e, time)
 
     @ti.func
     def gather_particle_adjoint(
@@ -191,34 +179,29 @@ class CudaPhases(OrderPhases, PosePhases):
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)
         v_after = self.vector(state, after + 3, lane)
-        q = self.affine_field(self.mass * self.vector(state, source + 3, lane), self.mass, a, fx, 1.0)
+        q = self.momentum_field(state, source, a, lane, fx)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
         w = spline(fx)
         dw = spline_slope(fx)
-        node = e * self.nodes + self.node_index(base)
+        node = e * self.nodes + self.linear(base)
         m0, mx, my, mz, slope = self.moments_adjoint(self.velocity, self.momentum_bar, node, w, dw, q, h)
         c_bar = self.load(bar, target + 6, lane, 9)
-        scale = 4.0 * self.inv_dx * self.inv_dx
-        open_axes = self.unclamped(x, v_after)
-        a_bar = ti.Vector.zero(self.real, 9)
-        for i in ti.static(range(3)):
-            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
-            # the scatter.
-            offsets = scale * (
-                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
-            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
-            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
-            bar[target + 3 + i][lane] = self.mass * m0[i]
-            a_bar[3 * i] = self.dx * (mx[i] - fx[0] * m0[i])
-            a_bar[3 * i + 1] = self.dx * (my[i] - fx[1] * m0[i])
-            a_bar[3 * i + 2] = self.dx * (mz[i] - fx[2] * m0[i])
-        return a_bar
+        return self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, fx, m0, mx, my, mz, slope)
 
     @ti.func
     def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
         """The affine field of momentum and mass that a particle scatters, given A."""
         v = self.vector(state, source + 3, lane)
-        return self.affine_field(self.mass * v, self.mass, a, fx, 1.0)
+        return affine_field(self.mass * v, self.mass, a, fx, self.dx)
+
+    @ti.func
+    def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
+        """The affine field that the particle's adjoint contributes to the adjoint of the grid velocities."""
+        v = self.vector(state, after + 3, lane)
+        x_bar = self.vector(bar, target, lane)
+        v_bar = self.velocity_adjoint(x, v, x_bar, self.vector(bar, target + 3, lane))
+        c_bar = self.load(bar, target + 6, lane, 9)
+        return affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx)
 
     # -- material ------------------------------------------------------------------------------------
 
@@ -283,6 +266,13 @@ class CudaPhases(OrderPhases, PosePhases):
                 bar[target + 15 + i][lane] = f_out[i]
         else:
             self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
+
+    @ti.func
+    def accumulate_material(self, grid_index, mu_bar, lam_bar, yield_bar):
+        """Add to the material's adjoint, which all threads of an environment share."""
+        bars = (mu_bar, lam_bar, yield_bar)
+        for i in ti.static(range(3)):
+            ti.atomic_add(self.material_bar[grid_index, i], ti.cast(bars[i], ti.f64))
 
     # -- grid ---------------------------------------------------------------------------------------
 

@@ -39,7 +39,7 @@ class ThreadPhases(CudaPhases):
         x = self.vector(state, entry, lane)
         base, fx = self.stencil(x)
         particle = tile * self.lanes + lane
-        node = e * self.nodes + self.node_index(base)
+        node = e * self.nodes + self.linear(base)
         if particle >= self.particles:
             node = -1 - particle
         return e, tile, entry, lane, x, base, fx, node

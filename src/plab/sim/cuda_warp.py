@@ -219,7 +219,7 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
     def sorted_lane(self, state: ti.template(), source, tile, lane):
         """Which particle of the tile a lane takes: the one whose base node is the lane-th in order."""
         base, _fx = self.stencil(self.vector(state, source, lane))
-        node = self.node_index(base)
+        node = self.linear(base)
         if tile * self.lanes + lane >= self.particles:
             node = self.nodes
         # The node and the particle in one number; n = 256 takes 29 bits.

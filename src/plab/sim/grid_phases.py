@@ -6,6 +6,7 @@ import math
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
+from plab.sim.friction import slid, slid_adjoint
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
 
@@ -81,10 +82,6 @@ class GridPhases(Storage):
 
     # -- contact ------------------------------------------------------------------------------------
 
-    def rotated(self, shape: str) -> bool:
-        """Whether the rotation of a shape's frame matters; decided while compiling."""
-        return shape != "Sphere" or not self.skips.rotations
-
     @ti.func
     def into_frame(self, shape: ti.template(), e, s, m, v):
         """A world vector in manipulator m's frame."""
@@ -110,20 +107,6 @@ class GridPhases(Storage):
         return u
 
     @ti.func
-    def slide(self, r, normal, friction):
-        """Relative velocity after full contact: no normal part, the tangential one reduced by Coulomb
-        friction."""
-        rn = r.dot(normal)
-        t = r - rn * normal
-        if ti.static(self.manipulators_rub):
-            length = t.norm()
-            factor = 0.0 * rn
-            if length + rn * friction > 0.0 and length > 0.0:
-                factor = 1.0 + rn * friction / length
-            t = factor * t
-        return t
-
-    @ti.func
     def contact(self, shape: ti.template(), e, s, m, x, v):
         """Velocity of a node after contact with manipulator m."""
         out = v
@@ -132,22 +115,16 @@ class GridPhases(Storage):
         strength = self.strength(e, d)
         if strength > 0.0:
             # What touches a manipulator that cannot move does not touch an action.
-            if ti.static(MANIPULATOR_SHAPES[shape].motion != "static"):
+            if ti.static(MANIPULATOR_SHAPES[shape].moves):
                 self.note_contact(e)
             normal = self.out_of_frame(shape, e, s, m, n_local)
             u = self.rigid_velocity(ti.static(self.turns(shape)), e, s, m, p)
             r = v - u
-            if r.dot(normal) < 0.0:
-                out = u + (1.0 - strength) * r + strength * self.slide(r, normal, self.friction[e, m])
+            rn = r.dot(normal)
+            if rn < 0.0:
+                t = slid(r - rn * normal, rn, self.friction[e, m], self.manipulators_rub)
+                out = u + (1.0 - strength) * r + strength * t
         return out
-
-    def turns(self, shape: str) -> bool:
-        """Whether manipulators of this shape rotate; decided while compiling."""
-        return shape in ("RollingPin", "Chopsticks", "Box") or not self.skips.rotations
-
-    def moves(self, shape: str) -> bool:
-        """Whether manipulators of this shape can move; decided while compiling."""
-        return MANIPULATOR_SHAPES[shape].motion != "static" or not self.skips.still_manipulators
 
     @ti.func
     def note_contact(self, e):
@@ -172,20 +149,10 @@ class GridPhases(Storage):
             if rn < 0.0:
                 friction = self.friction[e, m]
                 t0 = r - rn * normal
-                length = t0.norm()
-                t = t0 * 0.0
-                t0_bar = t0 * 0.0
-                rn_bar = 0.0 * rn
-                if ti.static(not self.manipulators_rub):
-                    if length > 0.0:
-                        t = t0
-                        t0_bar = strength * bar
-                elif length + rn * friction > 0.0 and length > 0.0:
-                    factor = 1.0 + rn * friction / length
-                    along = t0.dot(bar) / length
-                    t = factor * t0
-                    t0_bar = strength * (factor * bar - (friction * rn * along / (length * length)) * t0)
-                    rn_bar = strength * friction * along
+                t = slid(t0, rn, friction, self.manipulators_rub)
+                t0_bar, rn_bar = slid_adjoint(t0, rn, friction, self.manipulators_rub, bar)
+                t0_bar *= strength
+                rn_bar *= strength
                 rn_bar -= normal.dot(t0_bar)
                 r_bar = (1.0 - strength) * bar + t0_bar + rn_bar * normal
                 normal_bar = rn_bar * r - rn * t0_bar
@@ -222,19 +189,10 @@ class GridPhases(Storage):
                             grid_index, m, 6 + 3 * i + j, normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
                         )
                         self.accumulate_frame(grid_index, m, 15 + 3 * i + j, u_bar[i] * p[j])
-            if ti.static(shape == "Chopsticks"):
+            if ti.static(MANIPULATOR_SHAPES[shape].grips):
                 self.accumulate_frame(
                     grid_index, m, FRAME_ADJOINT - 1, gap_slope(shape, p) * from_distance[0]
                 )
-
-    @ti.func
-    def accumulate_frame(self, grid_index, m, entry, value):
-        """Add to a frame's adjoint: plainly where one thread owns it, atomically on CUDA."""
-        wide = ti.cast(value, ti.f64)
-        if ti.static(self.cuda):
-            ti.atomic_add(self.frame_bar[grid_index, m, entry], wide)
-        else:
-            self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     # -- walls --------------------------------------------------------------------------------------
 
@@ -261,12 +219,9 @@ class GridPhases(Storage):
         """Velocity after the floor, for a floor node with v_y < 0."""
         out = v * 0.0
         if friction < STICKING:
-            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-            factor = 0.0 * length
-            if length + friction * v[1] > 0.0 and length > 0.0:
-                factor = 1.0 + friction * v[1] / length
-            out[0] = factor * v[0]
-            out[2] = factor * v[2]
+            t = slid(ti.Vector([v[0], v[2]]), v[1], friction, True)
+            out[0] = t[0]
+            out[2] = t[1]
         return out
 
     @ti.func
@@ -274,14 +229,10 @@ class GridPhases(Storage):
         """Adjoint of v under :meth:`floor`."""
         out = v * 0.0
         if friction < STICKING:
-            length = ti.sqrt(v[0] * v[0] + v[2] * v[2])
-            if length + friction * v[1] > 0.0 and length > 0.0:
-                factor = 1.0 + friction * v[1] / length
-                along = (v[0] * bar[0] + v[2] * bar[2]) / length
-                back = friction * v[1] * along / (length * length)
-                out[0] = factor * bar[0] - back * v[0]
-                out[1] = friction * along
-                out[2] = factor * bar[2] - back * v[2]
+            t_bar, vy_bar = slid_adjoint(
+                ti.Vector([v[0], v[2]]), v[1], friction, True, ti.Vector([bar[0], bar[2]])
+            )
+            out = ti.Vector([t_bar[0], vy_bar, t_bar[1]])
         return out
 
     @ti.func

@@ -2,13 +2,13 @@
 
 import taichi as ti
 
+from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.motion import (
-    advance_pose,
     advance_pose_adjoint,
     rotation_matrix,
     rotation_matrix_adjoint,
 )
-from plab.sim.storage import FRAME_ADJOINT, Storage
+from plab.sim.storage import Storage
 
 __all__ = ["PosePhases", "vec7"]
 
@@ -45,30 +45,6 @@ class PosePhases(Storage):
                 self.untouched_step[e] = t
 
     @ti.func
-    def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
-        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
-        ``after``."""
-        self.note_step(e, t)
-        for m in ti.static(range(self.manipulators)):
-            entry = (before * self.batch + e) * self.manipulators + m
-            for i in ti.static(range(8)):
-                self.pose[e, 0, m][i] = poses[entry * 8 + i]
-            u = self.substep_motion(e, m, actions, t)
-            for s in range(self.substeps):
-                self.pose[e, s + 1, m] = advance_pose(
-                    self.motions[m],
-                    self.pose[e, s, m],
-                    u,
-                    self.low[e, m],
-                    self.high[e, m],
-                    self.minimal_gap[e, m],
-                )
-                self.set_frame(e, s, m)
-            entry = (after * self.batch + e) * self.manipulators + m
-            for i in ti.static(range(8)):
-                poses[entry * 8 + i] = self.pose[e, self.substeps, m][i]
-
-    @ti.func
     def place_manipulators(self, e, poses: ti.template(), slot):
         """Take slot ``slot`` of the pose history as the end of an environment step, for the losses."""
         for m in ti.static(range(self.manipulators)):
@@ -92,27 +68,6 @@ class PosePhases(Storage):
                 self.frame_rotation[e, s, m][i, j] = ti.cast(r0[i, j], self.real)
                 self.frame_spin[e, s, m][i, j] = ti.cast((r1[i, j] - r0[i, j]) * inv_dt, self.real)
         self.frame_gap[e, s, m] = ti.cast(start[7], self.real)
-
-    @ti.func
-    def collect_frame_adjoint(self, e, m: ti.template()):
-        """Sum the chunks' frame adjoints of one manipulator, and clear them."""
-        bar = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
-        for c in range(self.chunks):
-            for i in ti.static(range(FRAME_ADJOINT)):
-                bar[i] += self.frame_bar[e * self.chunks + c, m, i]
-                self.frame_bar[e * self.chunks + c, m, i] = 0.0
-        return bar
-
-    @ti.func
-    def retreat_manipulator(
-        self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t
-    ):
-        """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
-        end_bar, start_bar = self.frame_shares(e, m, s, self.collect_frame_adjoint(e, m))
-        u = self.substep_motion(e, m, actions, t)
-        pose_bar, u_bar = self.retreat_pose(e, m, s, u, self.pose_bar[e, m] + end_bar)
-        self.pose_bar[e, m] = pose_bar + start_bar
-        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
 
     @ti.func
     def retreat_pose(self, e, m: ti.template(), s, u, bar):
@@ -144,7 +99,7 @@ class PosePhases(Storage):
                 rotation_bar[i, j] = frame[6 + 3 * i + j]
                 spin_bar[i, j] = frame[15 + 3 * i + j] * inv_dt
         start_bar[7] = frame[24]
-        if ti.static(self.motions[m] in ("roll", "grip", "rigid")):
+        if ti.static(MANIPULATOR_SHAPES[self.shapes[m]].turns):
             end_q = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
             start_q = rotation_matrix_adjoint(quaternion(self.pose[e, s, m]), rotation_bar - spin_bar)
             for i in ti.static(range(4)):
@@ -161,9 +116,3 @@ class PosePhases(Storage):
             entry = (t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)
             if ti.abs(actions[entry]) <= 1.0:
                 actions_bar[entry] += u_bar[i] * self.scale[e, m][i] / self.substeps
-
-    @ti.func
-    def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
-        """Adjoint of all manipulators' motion in substep s."""
-        for m in ti.static(range(self.manipulators)):
-            self.retreat_manipulator(e, m, s, actions, actions_bar, t)

@@ -1,21 +1,52 @@
 """Signed distances of the manipulators in their own frames, with what the adjoint of contact needs of them.
 
-Every shape is three functions of a local point: the distance d, the outward normal n = grad d, and the
-product of the Hessian of d with a vector. They are all exact distances, so |n| = 1 and the broad phase may
-rely on it.
+Every shape of :data:`plab.scene.MANIPULATOR_SHAPES` has its functions of a local point in :data:`SURFACES`.
+All distances are exact, so the normal, their gradient, has length 1, and the broad phase may rely on it.
 """
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import taichi as ti
 
-__all__ = ["gap_slope", "hessian_product", "signed_distance"]
+from plab.scene import MANIPULATOR_SHAPES, SceneError
+
+__all__ = [
+    "SURFACES",
+    "Surface",
+    "gap_slope",
+    "hessian_product",
+    "require_surfaces",
+    "signed_distance",
+]
 
 
-@ti.func
-def planar(axial, radial_x, radial_z):
-    """Radius in the xz plane, guarded, and the unit radial direction."""
-    rho = ti.sqrt(radial_x * radial_x + radial_z * radial_z)
-    safe = ti.max(rho, 1e-12)
-    return rho, safe, ti.Vector([radial_x / safe, 0.0 * axial, radial_z / safe])
+def missing(*_arguments: object) -> object:
+    """Stands for a function that a shape does not have."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What contact needs to know of one shape.
+
+    The functions take a local point [domain units], 3-vector; the shape's lengths in the order of
+    ``MANIPULATOR_SHAPES[shape].size_names``, padded to a 3-vector; and the gap.
+
+    Attributes:
+        distance: Distance d, negative inside, and outward normal n = grad d, 3-vector.
+        hessian_product: Hessian of d times a 3-vector, the last argument.
+        gap_slope: Derivative by the gap of the point's own x, relative to what is nearest of the shape, from
+            the point alone; only where the motion changes the gap.
+        round: Whether it is the same however it is turned.
+    """
+
+    distance: Callable = missing
+    hessian_product: Callable = missing
+    gap_slope: Callable = missing
+    round: bool = False
+
+
+# -- bodies around points and segments --------------------------------------------------------------------
 
 
 @ti.func
@@ -27,9 +58,85 @@ def ball(q, r):
 
 
 @ti.func
+def ball_hessian_product(q, w):
+    """Hessian of :func:`ball` times w."""
+    length = ti.max(q.norm(), 1e-12)
+    n = q / length
+    return (w - n * n.dot(w)) / length
+
+
+@ti.func
+def rod_hessian_product(q, w):
+    """Hessian of the distance from a segment of the y axis times w; q is relative to its nearest point."""
+    masked = w
+    # Along the straight part the distance does not depend on y.
+    if q[1] == 0.0:
+        masked[1] = 0.0
+    return ball_hessian_product(q, masked)
+
+
+@ti.func
 def on_segment(p, low, high):
     """p relative to the nearest point of the segment of the y axis from low to high."""
     return ti.Vector([p[0], p[1] - ti.min(ti.max(p[1], low), high), p[2]])
+
+
+@ti.func
+def sphere_distance(p, size, _gap):
+    """Sphere of radius size[0]."""
+    return ball(p, size[0])
+
+
+@ti.func
+def sphere_hessian_product(p, _size, _gap, w):
+    """Hessian of :func:`sphere_distance` times w."""
+    return ball_hessian_product(p, w)
+
+
+@ti.func
+def capsule_distance(p, size, _gap):
+    """Capsule about y: length size[0] between its ends' centres, radius size[1]."""
+    return ball(on_segment(p, -0.5 * size[0], 0.5 * size[0]), size[1])
+
+
+@ti.func
+def capsule_hessian_product(p, size, _gap, w):
+    """Hessian of :func:`capsule_distance` times w."""
+    return rod_hessian_product(on_segment(p, -0.5 * size[0], 0.5 * size[0]), w)
+
+
+@ti.func
+def nearer_stick(p):
+    """Sign of the own x offset of the chopstick nearer to p."""
+    return ti.select(p[0] < 0.0, -1.0, 1.0)
+
+
+@ti.func
+def stick_point(p, size, gap):
+    """p relative to the nearest point of the nearer chopstick's axis."""
+    side = nearer_stick(p)
+    return on_segment(p - ti.Vector([0.5 * side * gap, 0.0, 0.0]), -size[0], 0.0 * gap)
+
+
+@ti.func
+def chopsticks_distance(p, size, gap):
+    """Two capsules along own -y, of length size[0] and radius size[1], their axes a gap apart."""
+    return ball(stick_point(p, size, gap), size[1])
+
+
+@ti.func
+def chopsticks_hessian_product(p, size, gap, w):
+    """Hessian of :func:`chopsticks_distance` times w."""
+    return rod_hessian_product(stick_point(p, size, gap), w)
+
+
+@ti.func
+def chopsticks_gap_slope(p):
+    """Derivative of :func:`stick_point`'s x with respect to the gap."""
+    return -0.5 * nearer_stick(p)
+
+
+# -- sets of points whose coordinates are bounded ---------------------------------------------------------
 
 
 @ti.func
@@ -71,70 +178,39 @@ def solid_hessian_product(q, half, w):
 
 
 @ti.func
-def nearer_stick(p):
-    """Sign of the own x offset of the chopstick nearer to p."""
-    return ti.select(p[0] < 0.0, -1.0, 1.0)
+def box_distance(p, size, _gap):
+    """Box of half edges ``size``."""
+    return solid(p, size)
 
 
 @ti.func
-def stick_point(p, size, gap):
-    """p relative to the nearest point of the nearer chopstick's axis."""
-    side = nearer_stick(p)
-    return on_segment(p - ti.Vector([0.5 * side * gap, 0.0, 0.0]), -size[0], 0.0 * gap)
+def box_hessian_product(p, size, _gap, w):
+    """Hessian of :func:`box_distance` times w."""
+    return solid_hessian_product(p, size, w)
+
+
+# -- bodies of revolution about y -------------------------------------------------------------------------
 
 
 @ti.func
-def gap_slope(shape: ti.template(), p):
-    """Derivative of the local point's x, relative to the nearer chopstick, with respect to the gap."""
-    out = 0.0 * p[0]
-    if ti.static(shape == "Chopsticks"):
-        out = -0.5 * nearer_stick(p)
-    return out
+def planar(axial, radial_x, radial_z):
+    """Radius in the xz plane, guarded, and the unit radial direction."""
+    rho = ti.sqrt(radial_x * radial_x + radial_z * radial_z)
+    safe = ti.max(rho, 1e-12)
+    return rho, safe, ti.Vector([radial_x / safe, 0.0 * axial, radial_z / safe])
 
 
 @ti.func
-def signed_distance(shape: ti.template(), p, size, gap):
-    """Distance and outward normal of a shape in its own frame.
-
-    Args:
-        shape: Name of the shape.
-        p: Local point [domain units], 3-vector.
-        size: Lengths in the order of ``MANIPULATOR_SHAPES[shape].size_names``, padded to a 3-vector.
-        gap: Distance between the chopsticks' axes.
-
-    Returns:
-        d and n (3-vector).
-    """
-    d = 0.0 * p[0]
-    n = p * 0.0
-    if ti.static(shape == "Sphere"):
-        d, n = ball(p, size[0])
-    elif ti.static(shape in ("Capsule", "RollingPin")):
-        d, n = ball(on_segment(p, -0.5 * size[0], 0.5 * size[0]), size[1])
-    elif ti.static(shape == "Chopsticks"):
-        d, n = ball(stick_point(p, size, gap), size[1])
-    elif ti.static(shape == "Torus"):
-        rho, _safe, radial = planar(p[1], p[0], p[2])
-        q = ti.Vector([rho - size[0], p[1]])
-        length = q.norm()
-        m = q / ti.max(length, 1e-12)
-        d = length - size[1]
-        n = m[0] * radial
-        n[1] = m[1]
-    elif ti.static(shape == "Cylinder"):
-        rho, _safe, radial = planar(p[1], p[0], p[2])
-        dist, m = solid(ti.Vector([rho, p[1]]), ti.Vector([size[0], size[1]]))
-        d = dist
-        n = m[0] * radial
-        n[1] = m[1]
-    else:
-        d, n = solid(p, size)
-    return d, n
+def revolved(m, radial):
+    """Normal of a body of revolution from its profile's, m."""
+    n = m[0] * radial
+    n[1] = m[1]
+    return n
 
 
 @ti.func
 def revolved_hessian_product(m, h, safe, radial, w):
-    """Hessian product of a body of revolution about y from its profile's normal m and Hessian product h."""
+    """Hessian product of a body of revolution from its profile's normal m and Hessian product h."""
     tangent = ti.Vector([-radial[2], 0.0 * safe, radial[0]])
     out = h[0] * radial + m[0] / safe * tangent.dot(w) * tangent
     out[1] = h[1]
@@ -142,37 +218,84 @@ def revolved_hessian_product(m, h, safe, radial, w):
 
 
 @ti.func
+def torus_distance(p, size, _gap):
+    """Torus: major radius size[0], minor radius size[1]."""
+    rho, _safe, radial = planar(p[1], p[0], p[2])
+    d, m = ball(ti.Vector([rho - size[0], p[1]]), size[1])
+    return d, revolved(m, radial)
+
+
+@ti.func
+def torus_hessian_product(p, size, _gap, w):
+    """Hessian of :func:`torus_distance` times w."""
+    rho, safe, radial = planar(p[1], p[0], p[2])
+    q = ti.Vector([rho - size[0], p[1]])
+    _d, m = ball(q, size[1])
+    h = ball_hessian_product(q, ti.Vector([radial.dot(w), w[1]]))
+    return revolved_hessian_product(m, h, safe, radial, w)
+
+
+@ti.func
+def cylinder_distance(p, size, _gap):
+    """Cylinder of radius size[0] and half height size[1]."""
+    rho, _safe, radial = planar(p[1], p[0], p[2])
+    d, m = solid(ti.Vector([rho, p[1]]), ti.Vector([size[0], size[1]]))
+    return d, revolved(m, radial)
+
+
+@ti.func
+def cylinder_hessian_product(p, size, _gap, w):
+    """Hessian of :func:`cylinder_distance` times w."""
+    rho, safe, radial = planar(p[1], p[0], p[2])
+    q = ti.Vector([rho, p[1]])
+    half = ti.Vector([size[0], size[1]])
+    _d, m = solid(q, half)
+    h = solid_hessian_product(q, half, ti.Vector([radial.dot(w), w[1]]))
+    return revolved_hessian_product(m, h, safe, radial, w)
+
+
+# -- by name ----------------------------------------------------------------------------------------------
+
+SURFACES: dict[str, Surface] = {
+    "Sphere": Surface(sphere_distance, sphere_hessian_product, round=True),
+    "Capsule": Surface(capsule_distance, capsule_hessian_product),
+    "RollingPin": Surface(capsule_distance, capsule_hessian_product),
+    "Chopsticks": Surface(chopsticks_distance, chopsticks_hessian_product, chopsticks_gap_slope),
+    "Torus": Surface(torus_distance, torus_hessian_product),
+    "Cylinder": Surface(cylinder_distance, cylinder_hessian_product),
+    "Box": Surface(box_distance, box_hessian_product),
+}
+"""The surface of each of :data:`plab.scene.MANIPULATOR_SHAPES`."""
+
+
+def require_surfaces(shapes: Iterable[str]) -> None:
+    """Raise SceneError if a shape lacks a function that contact with it needs."""
+    for shape in shapes:
+        surface = SURFACES.get(shape, Surface())
+        needed = {"distance": surface.distance, "hessian_product": surface.hessian_product}
+        if MANIPULATOR_SHAPES[shape].grips:
+            needed["gap_slope"] = surface.gap_slope
+        lacking = [name for name, function in needed.items() if function is missing]
+        if lacking:
+            raise SceneError(
+                f"shape '{shape}' has no {' and no '.join(lacking)}: "
+                f"complete SURFACES['{shape}'] in plab/sim/shapes.py"
+            )
+
+
+@ti.func
+def signed_distance(shape: ti.template(), p, size, gap):
+    """Distance and outward normal of a shape in its own frame; arguments as in :class:`Surface`."""
+    return SURFACES[shape].distance(p, size, gap)
+
+
+@ti.func
 def hessian_product(shape: ti.template(), p, size, gap, w):
-    """Hessian of the distance of a shape times w, in its own frame; arguments as for
-    :func:`signed_distance`."""
-    out = p * 0.0
-    if ti.static(shape in ("Torus", "Cylinder")):
-        rho, safe, radial = planar(p[1], p[0], p[2])
-        w2 = ti.Vector([radial.dot(w), w[1]])
-        if ti.static(shape == "Torus"):
-            q = ti.Vector([rho - size[0], p[1]])
-            length = ti.max(q.norm(), 1e-12)
-            m = q / length
-            out = revolved_hessian_product(m, (w2 - m * m.dot(w2)) / length, safe, radial, w)
-        else:
-            q = ti.Vector([rho, p[1]])
-            half = ti.Vector([size[0], size[1]])
-            _d, m = solid(q, half)
-            out = revolved_hessian_product(m, solid_hessian_product(q, half, w2), safe, radial, w)
-    elif ti.static(shape == "Box"):
-        out = solid_hessian_product(p, size, w)
-    else:
-        q = p
-        if ti.static(shape in ("Capsule", "RollingPin")):
-            q = on_segment(p, -0.5 * size[0], 0.5 * size[0])
-        elif ti.static(shape == "Chopsticks"):
-            q = stick_point(p, size, gap)
-        masked = w
-        if ti.static(shape != "Sphere"):
-            # Along the straight part the distance does not depend on y.
-            if q[1] == 0.0:
-                masked[1] = 0.0
-        length = ti.max(q.norm(), 1e-12)
-        n = q / length
-        out = (masked - n * n.dot(masked)) / length
-    return out
+    """Hessian of the distance of a shape times w, in its own frame; arguments as in :class:`Surface`."""
+    return SURFACES[shape].hessian_product(p, size, gap, w)
+
+
+@ti.func
+def gap_slope(shape: ti.template(), p):
+    """Derivative of the local point's x, relative to what is nearest of the shape, by the gap."""
+    return SURFACES[shape].gap_slope(p)

@@ -18,7 +18,7 @@ class Skips:
         empty_blocks: Blocks of the grid that hold no mass.
         empty_grids: Private grids of chunks of particles that do not reach a block; CPU.
         far_manipulators: Manipulators that cannot reach a block; on CUDA a node, in the backward pass.
-        rotations: Rotation of spheres, and spin of manipulators that do not rotate.
+        rotations: Rotation of round manipulators and spin of all, where they do not rotate.
         singular_values: The decomposition into singular values where series serve.
         plasticity: Everything about yielding where the yield stress is infinite in all environments.
         flow: Plastic flow of particles that do not yield; on the CPU of tiles in which none does.

@@ -25,6 +25,7 @@ from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.series import Series
+from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.skips import Skips
 
 __all__ = [
@@ -154,6 +155,7 @@ class Storage:
         manipulators = scenes[0].manipulators
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
+        require_surfaces(self.shapes)
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
         rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
         self.manipulators_rub = rub or not self.skips.friction
@@ -170,15 +172,21 @@ class Storage:
                 runs.append((shape, number, number + 1))
         self.runs = tuple(runs)
 
+    def moves(self, shape: str) -> bool:
+        """Whether manipulators of this shape can move; decided while compiling, as what follows."""
+        return MANIPULATOR_SHAPES[shape].moves or not self.skips.still_manipulators
+
+    def turns(self, shape: str) -> bool:
+        """Whether manipulators of this shape rotate."""
+        return MANIPULATOR_SHAPES[shape].turns or not self.skips.rotations
+
+    def rotated(self, shape: str) -> bool:
+        """Whether the rotation of a shape's frame matters: what is round has a spin only."""
+        return self.turns(shape) or not SURFACES[shape].round
+
     def _allocate(self) -> None:
         real, b = self.real, self.batch
-        if not self.cuda and b * self.chunks * self.nodes > INDEX_MASK:
-            raise MemoryError(
-                f"{b} environments of {self.n}^3 nodes are more than one simulator can number: "
-                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
-            )
         m = max(1, self.manipulators)
-        grids = b * self.chunks
         self.lane_type = ti.types.vector(self.lanes, real)
         # Material per environment: mu, lambda, yield strain, floor friction, gravity (3).
         self.material = ti.Vector.field(7, real, shape=b)
@@ -199,16 +207,13 @@ class Storage:
         self.frame_gap = ti.field(real, shape=(b, self.substeps, m))
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
-        self.work = ti.Vector.field(4, real, shape=1 if self.cuda else grids * WORK)
-        self.spread = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * SPREAD)
-        self.places = ti.Vector.field(self.lanes, ti.i32, shape=1 if self.cuda else grids * PLACES)
-        # Intermediate results of the material update of one tile per chunk.
-        self.stage = ti.Vector.field(self.lanes, real, shape=1 if self.cuda else grids * STAGE)
-        self.momentum = ti.Vector.field(4, real, shape=grids * self.nodes)
+        self.momentum = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
-        self._allocate_blocks(grids)
-        self.once = ti.field(ti.i32, shape=())
-        self.once[None] = 1
+        # A block is in use when its stamp is the current substep's.
+        self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_list = ti.field(ti.i32, shape=b * self.blocks)
+        self.block_count = ti.field(ti.i32, shape=b)
+        self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
         self.fault = ti.field(ti.i32, shape=b)
         # Whether a moving manipulator has touched the body since the reset, and the last environment step at
         # whose start none had.
@@ -219,34 +224,21 @@ class Storage:
         """Allocate a grid of 4-vectors that particles gather from."""
         return ti.Vector.field(4, self.real, shape=nodes)
 
-    def _allocate_blocks(self, grids: int) -> None:
-        b = self.batch
-        # A block is in use when its stamp is the current substep's.
-        self.block_stamp = ti.field(ti.i32, shape=b * self.blocks)
-        self.block_list = ti.field(ti.i32, shape=b * self.blocks)
-        self.block_count = ti.field(ti.i32, shape=b)
-        self.block_first = ti.field(ti.i32, shape=(1, 1) if self.cuda else (b, self.chunks + 1))
-        self.block_chunks = ti.field(ti.i32, shape=1 if self.cuda else b * self.blocks)
-        # Blocks of base nodes per chunk, with a bit for each of the 8 ways a stencil crosses into the next
-        # block.
-        private = 1 if self.cuda else grids
-        self.mark_stamp = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_code = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_list = ti.field(ti.i32, shape=private * self.blocks)
-        self.mark_count = ti.field(ti.i32, shape=private)
-        self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
-
     def allocate_adjoint(self) -> None:
         """Allocate what only gradients need, once."""
         if hasattr(self, "velocity_bar"):
             return
-        real, b, m = self.real, self.batch, max(1, self.manipulators)
+        real, b = self.real, self.batch
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
-        self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, m))
-        self.frame_bar = ti.field(ti.f64, shape=(b * self.chunks, m, FRAME_ADJOINT))
+        self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, max(1, self.manipulators)))
         # Adjoints of mu, lambda and yield strain.
         self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
+
+    def clear_adjoint(self) -> None:
+        """Begin a gradient: clear the adjoints that are sums over its steps."""
+        self.pose_bar.fill(0)
+        self.material_bar.fill(0)
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""

@@ -221,8 +221,9 @@ class Tape:
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
         # Allocated on the way forward.
         assert self.bar is not None
-        for array in (actions_bar, self.bar, engine.pose_bar, engine.frame_bar, engine.material_bar):
+        for array in (actions_bar, self.bar):
             array.fill(0)
+        engine.clear_adjoint()
         last = (steps - 1) // self._length
         for t in reversed(range(steps)):
             k = t // self._length

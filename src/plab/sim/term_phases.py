@@ -13,6 +13,7 @@ from typing import Any
 
 import taichi as ti
 
+from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
 from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import Storage
@@ -96,7 +97,7 @@ class TermPhases(Storage):
             for j in ti.static(range(3)):
                 for k in ti.static(range(3)):
                     at = self.folded_node(base, i, j, k)
-                    node = grid_index * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
+                    node = grid_index * self.nodes + self.linear(at)
                     share = self.mass * w[i][0] * w[j][1] * w[k][2]
                     self.momentum[node][3] = self.momentum[node][3] + share
 
@@ -123,8 +124,7 @@ class TermPhases(Storage):
         if ti.static(dense):
             out = ti.cast(slopes[self.entry(e, at - 1)], self.real)
         else:
-            node = e * self.nodes + (at[0] * self.axis + at[1]) * self.axis + at[2]
-            out = self.node_slope(slopes, node)
+            out = self.node_slope(slopes, e * self.nodes + self.linear(at))
         return out
 
     @ti.func
@@ -250,7 +250,7 @@ class TermPhases(Storage):
             )
             for i in ti.static(range(4)):
                 pose_bar[3 + i] = q_bar[i]
-        if ti.static(shape == "Chopsticks"):
+        if ti.static(MANIPULATOR_SHAPES[shape].grips):
             pose_bar[7] = ti.cast(gap_slope(shape, p), ti.f64) * d_bar * n64[0]
         return ti.cast(x_bar, self.real), pose_bar
 
@@ -288,7 +288,7 @@ class TermPhases(Storage):
     def acts(self, shape: str) -> bool:
         """Whether a shape's distances count in the loss: where an action can move it; decided while
         compiling."""
-        return self.motions[self.shapes.index(shape)] != "static"
+        return MANIPULATOR_SHAPES[shape].moves
 
     @property
     def spreads(self) -> bool:

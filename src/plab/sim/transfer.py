@@ -9,6 +9,8 @@ then x.
 import taichi as ti
 
 __all__ = [
+    "affine_field",
+    "at_base",
     "column",
     "gather",
     "gather_adjoint",
@@ -32,7 +34,7 @@ def spline_slope(f):
 
 
 @ti.func
-def widen(v, last):
+def widen(v: ti.template(), last):
     """A 3-vector and a scalar as a 4-vector."""
     return ti.Vector([v[0], v[1], v[2], last])
 
@@ -41,6 +43,34 @@ def widen(v, last):
 def column(a: ti.template(), j: ti.template(), scale):
     """Column j of a row-major 3x3 tuple, scaled, as a 4-vector with 0 at the end."""
     return ti.Vector([scale * a[j], scale * a[3 + j], scale * a[6 + j], 0.0 * a[j]])
+
+
+@ti.func
+def at_base(value, row: ti.template(), f: ti.template(), scale):
+    """One component of an affine field at the base node, from its value at the particle.
+
+    Args:
+        value: The component at the particle, a number or lanes.
+        row: Its row of the matrix A, three numbers or lanes.
+        f: x / dx - base, three numbers or lanes.
+        scale: Factor of A times the grid spacing.
+    """
+    return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
+
+
+@ti.func
+def affine_field(value, last, a: ti.template(), f, scale):
+    """An affine field in the form that :func:`scatter` takes.
+
+    Args:
+        value: The field at the particle, a 3-vector.
+        last: Fourth entry at the base node.
+        a: The matrix A, 9 numbers.
+        f: x / dx - base, a 3-vector.
+        scale: Factor of A times the grid spacing.
+    """
+    base = [at_base(value[i], [a[3 * i], a[3 * i + 1], a[3 * i + 2]], f, scale) for i in range(3)]
+    return [widen(base, last), column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
 
 
 @ti.func

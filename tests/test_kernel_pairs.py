@@ -1,0 +1,283 @@
+"""What is written twice, for the CPU by tiles and for CUDA by particle or manipulator, computes the same.
+
+Functions for CUDA that use nothing of warps are compiled for the CPU here, with the CPU's layout of tiles.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import suite
+from plab.sim.cpu_phases import CpuPhases
+from plab.sim.cuda_threads import ThreadPhases
+from plab.sim.runtime import start_runtime
+from plab.sim.skips import Skips
+from plab.sim.storage import FRAME_ADJOINT, STATE
+from plab.sim.transfer import scatter, spline
+
+pytestmark = [
+    pytest.mark.physics,
+    pytest.mark.skipif(
+        suite.DEVICE != "cpu", reason="what runs on CUDA is compared with the reference there"
+    ),
+]
+
+SCENES = [
+    suite.scene(suite.KINDS, particles=150, grid_size=16),
+    # Most particles of this one leave the range of the series.
+    suite.scene(suite.KINDS, particles=150, grid_size=16, yield_stress=400.0),
+]
+STRAINS = (0.02, 0.6)
+
+
+@ti.data_oriented
+class Tiles(CpuPhases):
+    """The CPU's phases, one at a time."""
+
+    @ti.kernel
+    def scatter_all(self, state: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for c in range(self.chunks):
+                self.scatter_chunk(state, 0, 1, e, c, 1)
+
+    @ti.kernel
+    def gather_all(self, state: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for c in range(self.chunks):
+                self.gather_chunk(state, 0, 1, e, c, 6)
+
+    @ti.kernel
+    def scatter_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for c in range(self.chunks):
+                self.scatter_chunk_adjoint(state, 0, 1, bar, e, c, 2)
+
+    @ti.kernel
+    def gather_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for c in range(self.chunks):
+                self.gather_chunk_adjoint(state, 0, 1, bar, e, c)
+
+    @ti.kernel
+    def advance_all(self, poses: ti.types.ndarray(ndim=1), actions: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            self.advance_manipulators(e, actions, poses, 0, 0, 1)
+
+    @ti.kernel
+    def retreat_all(
+        self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1), s: ti.i32
+    ):
+        for e in range(self.batch):
+            self.retreat_manipulators(e, s, actions, actions_bar, 0)
+
+
+@ti.data_oriented
+class Threads(ThreadPhases):
+    """CUDA's phases, one at a time, and one particle after the other where warps would scatter together."""
+
+    @ti.func
+    def scatter_alone(self, grid: ti.template(), e, base, fx, field: ti.template()):
+        w = spline(fx)
+        node = e * self.nodes + self.linear(base)
+        scatter(grid, node, self.axis * self.axis, self.axis, w, field, self.work, 0)
+
+    @ti.kernel
+    def scatter_all(self, state: ti.types.ndarray(ndim=1)):
+        ti.loop_config(serialize=True)
+        for q in range(self.batch * self.tiles * self.lanes):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile, lane = particle // self.lanes, particle % self.lanes
+                source, target = self.tile_entry(0, e, tile), self.tile_entry(1, e, tile)
+                base, fx = self.stencil(self.vector(state, source, lane))
+                a = self.material_particle(state, source, target, lane, e, True)
+                field = self.momentum_field(state, source, a, lane, fx)
+                self.scatter_alone(self.momentum, e, base, fx, field)
+
+    @ti.kernel
+    def gather_all(self, state: ti.types.ndarray(ndim=1)):
+        for q in range(self.batch * self.tiles * self.lanes):
+            self.gather_thread(state, 0, 1, q, 6)
+
+    @ti.kernel
+    def scatter_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+        ti.loop_config(serialize=True)
+        for q in range(self.batch * self.tiles * self.lanes):
+            e, particle = self.particle_of(q)
+            if particle < self.particles:
+                tile, lane = particle // self.lanes, particle % self.lanes
+                source, target = self.tile_entry(0, e, tile), self.tile_entry(1, e, tile)
+                x = self.vector(state, source, lane)
+                base, fx = self.stencil(x)
+                a = self.material_particle(state, source, target, lane, e, False)
+                for i in ti.static(range(9)):
+                    self.affine[(e * self.tiles + tile) * 9 + i][lane] = a[i]
+                field = self.momentum_field(state, source, a, lane, fx)
+                self.scatter_alone(self.momentum, e, base, fx, field)
+                entry = self.tile_entry(0, e, tile)
+                h = self.velocity_adjoint_field(state, x, target, bar, entry, lane, fx)
+                self.scatter_alone(self.velocity_bar, e, base, fx, h)
+
+    @ti.kernel
+    def gather_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+        for q in range(self.batch * self.tiles * self.lanes):
+            self.gather_thread_adjoint(state, bar, 0, 1, q)
+
+    @ti.kernel
+    def advance_all(self, poses: ti.types.ndarray(ndim=1), actions: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for m in ti.static(range(self.manipulators)):
+                self.advance_manipulator(e, m, actions, poses, 0, 0, 1)
+                for s in range(self.substeps):
+                    self.set_frame(e, s, m)
+
+    @ti.kernel
+    def retreat_all(self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1)):
+        for e in range(self.batch):
+            for m in ti.static(range(self.manipulators)):
+                for s in range(self.substeps):
+                    self.share_frame(e, m, s)
+                self.retreat_through(e, m, actions, actions_bar, 0)
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Tiles, Threads]:
+    runtime = start_runtime("cpu", "float64")
+    both = tuple(kind(SCENES, runtime, Skips(), True) for kind in (Tiles, Threads))
+    for phases in both:
+        phases.allocate_adjoint()
+        phases.clear_adjoint()
+    both[1].work = ti.Vector.field(4, runtime.real, shape=9)
+    return both
+
+
+def tiles_of(values: np.ndarray, lanes: int) -> np.ndarray:
+    """Values [..., batch, particle, STATE] as tiles, [..., batch, tile, STATE, lane], padded with rest."""
+    *front, particles, _ = values.shape
+    count = -(-particles // lanes)
+    out = np.zeros((*front, count * lanes, STATE))
+    out[..., 15:] = np.eye(3).ravel()
+    out[..., :particles, :] = values
+    return np.moveaxis(out.reshape(*front, count, lanes, STATE), -1, -2)
+
+
+def array(phases: Tiles | Threads, values: np.ndarray) -> ti.Ndarray:
+    out = ti.ndarray(phases.lane_type, shape=values.size // phases.lanes)
+    out.from_numpy(values.reshape(-1, phases.lanes))
+    return out
+
+
+def particles_of(phases: Tiles | Threads, tiles: ti.Ndarray) -> np.ndarray:
+    """The particles of tiles, [slot, batch, particle, STATE]."""
+    values = tiles.to_numpy().reshape(-1, phases.batch, phases.tiles, STATE, phases.lanes)
+    flat = np.moveaxis(values, -1, -2).reshape(len(values), phases.batch, -1, STATE)
+    return flat[:, :, : phases.particles]
+
+
+def drawn(phases: Tiles) -> SimpleNamespace:
+    """A random state of which some particles leave the domain, adjoints, and fields of the grid."""
+    rng = np.random.default_rng(5)
+    shape = (2, phases.batch, phases.particles)
+    state = np.concatenate(
+        [
+            rng.uniform(0.0, phases.x_max, (*shape, 3)),
+            rng.normal(size=(*shape, 3)),
+            20.0 * rng.normal(size=(*shape, 9)),
+            np.eye(3).ravel() + np.reshape(STRAINS, (2, 1, 1)) * rng.uniform(-1, 1, (*shape, 9)),
+        ],
+        axis=-1,
+    )
+    state[0, :, ::5, :3] = rng.choice([0.0, phases.x_max], size=state[0, :, ::5, :3].shape)
+    return SimpleNamespace(
+        state=tiles_of(state, phases.lanes),
+        bar=tiles_of(rng.normal(size=(1, *shape[1:], STATE)), phases.lanes),
+        grid=rng.normal(size=(phases.batch * phases.nodes, 4)),
+        momentum_bar=rng.normal(size=(phases.batch * phases.nodes, 4)),
+    )
+
+
+def taken(phases: Tiles | Threads, field: ti.Field) -> np.ndarray:
+    """Sums of each environment in a field that chunks share out on the CPU; the field is cleared."""
+    values = field.to_numpy()
+    field.fill(0.0)
+    if isinstance(phases, Threads):
+        return values.reshape(phases.batch * phases.chunks, -1)[: phases.batch]
+    return values.reshape(phases.batch, phases.chunks, -1).sum(axis=1)
+
+
+def close(left: np.ndarray, right: np.ndarray, name: str) -> None:
+    assert np.abs(left).max() > 0.0 and left.shape == right.shape, name
+    np.testing.assert_allclose(left, right, rtol=0, atol=1e-11 * np.abs(left).max(), err_msg=name)
+
+
+def test_particles(pair: tuple[Tiles, Threads]) -> None:
+    results = []
+    for phases in pair:
+        given = drawn(pair[0])
+        state, bar = array(phases, given.state), array(phases, given.bar)
+        out: dict[str, np.ndarray] = {}
+
+        phases.scatter_all(state)
+        out["F"] = particles_of(phases, state)[1, :, :, 15:]
+        out["momentum"] = taken(phases, phases.momentum)
+        phases.velocity.from_numpy(given.grid)
+        phases.momentum_bar.from_numpy(given.momentum_bar)
+        phases.gather_all(state)
+        out["x, v and C"] = particles_of(phases, state)[1, :, :, :15]
+        phases.scatter_adjoint_all(state, bar)
+        out["momentum again"] = taken(phases, phases.momentum)
+        out["adjoint of velocity"] = taken(phases, phases.velocity_bar)
+        phases.gather_adjoint_all(state, bar)
+        for i, name in enumerate(("x", "v")):
+            out[f"adjoint of {name}"] = particles_of(phases, bar)[0, :, :, 3 * i : 3 * i + 3]
+        out["adjoint of C"] = particles_of(phases, bar)[0, :, :, 6:15]
+        out["adjoint of F"] = particles_of(phases, bar)[0, :, :, 15:]
+        out["adjoint of material"] = taken(phases, phases.material_bar)
+        # One environment's velocities are sane, the other's are not.
+        phases.velocity.from_numpy(given.grid * np.repeat([1.0, 1e6], phases.nodes)[:, None])
+        phases.gather_all(state)
+        out["fault"] = phases.fault.to_numpy()
+        results.append(out)
+    tiles, threads = results
+    assert tiles["fault"].tolist() == [0, 7]
+    at_wall = np.isin(tiles["x, v and C"][..., :3], [0.0, pair[0].x_max]).mean()
+    assert 0.05 < at_wall < 0.2, "some particles are stopped at the domain's faces"
+    for name in tiles:
+        close(tiles[name], threads[name], name)
+
+
+def test_poses(pair: tuple[Tiles, Threads]) -> None:
+    tiles, threads = pair
+    rng = np.random.default_rng(6)
+    manipulators = [s.manipulators for s in SCENES]
+    start = np.array([[[*m.position, *m.rotation, m.gap] for m in tools] for tools in manipulators])
+    frames = rng.normal(size=(tiles.substeps, tiles.batch, tiles.manipulators, FRAME_ADJOINT))
+    ends = rng.normal(size=(tiles.batch, tiles.manipulators, 8))
+    moves = rng.uniform(-1.2, 1.2, size=tiles.batch * tiles.actions_per_step)
+    results = []
+    for phases in pair:
+        poses, actions, actions_bar = (
+            ti.ndarray(ti.f64, shape=n) for n in (2 * start.size, moves.size, moves.size)
+        )
+        poses.from_numpy(np.concatenate([start.ravel(), np.zeros(start.size)]))
+        actions.from_numpy(moves)
+        actions_bar.fill(0.0)
+        phases.advance_all(poses, actions)
+        phases.pose_bar.from_numpy(ends)
+        if phases is tiles:
+            for s in reversed(range(tiles.substeps)):
+                private = np.zeros((tiles.batch, tiles.chunks, *frames.shape[2:]))
+                private[:, s % tiles.chunks] = frames[s]
+                tiles.frame_bar.from_numpy(private.reshape(tiles.frame_bar.shape))
+                tiles.retreat_all(actions, actions_bar, s)
+        else:
+            threads.frame_part.from_numpy(frames.swapaxes(0, 1).reshape(threads.frame_part.shape))
+            threads.retreat_all(actions, actions_bar)
+        names = ("centre", "rotation", "velocity", "spin", "gap")
+        out = {name: getattr(phases, f"frame_{name}").to_numpy() for name in names}
+        out |= {"poses": poses.to_numpy(), "adjoint of actions": actions_bar.to_numpy()}
+        results.append(out | {"adjoint of poses": phases.pose_bar.to_numpy()})
+    for name in results[0]:
+        close(results[0][name], results[1][name], name)
