@@ -21,7 +21,7 @@ def slid(t, rn, friction, rubs: ti.template()):
     out = t
     if ti.static(rubs):
         length = t.norm()
-        factor = 0.0 * length
+        factor = 0.0 * friction
         if length + rn * friction > 0.0 and length > 0.0:
             factor = 1.0 + rn * friction / length
         out = factor * t
