@@ -17,7 +17,7 @@ def require_alike(scenes: Sequence[Scene]) -> None:
     """Raise SceneError if scenes do not fit together in one simulator."""
     first = scenes[0]
     for number, scene in enumerate(scenes[1:], start=1):
-        for name in ("particle_count", "grid_size", "dt", "substeps"):
+        for name in ("particle_count", "grid_size", "dt", "substeps", "floor"):
             if getattr(scene, name) != getattr(first, name):
                 raise SceneError(
                     f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
