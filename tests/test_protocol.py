@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import os
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 
 import reference_mpm as reference
+from plab.config import ConfigError, build_scene, choices, load_config
 from plab.losses import make_terms
 from plab.objective import spread_mass
+from plab.problem import Problem
 from plab.scene import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
+from plab.sweep.plan import plan
 from suite import CENTER, KINDS, scene
+
+FILES = os.environ.get("PLAB_RELEASE_TARGETS")
+"""Folder of the release's target files, if there is one."""
 
 WEIGHTS = (10.0, 10.0, 1.0)
 TERMS = dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True))
@@ -168,3 +175,111 @@ def test_the_start_is_the_legacy_draw() -> None:
 def test_a_choice_that_does_not_exist_is_refused(part: str) -> None:
     with pytest.raises(SceneError, match=f"{part} 'paper' is not one of plab, release"):
         replace(SCENES[0], **{part: "paper"}).validate()
+
+
+# ---------------------------------------------------------------------------------------------- configuration
+
+
+def test_the_default_is_plabs_own() -> None:
+    cfg = load_config()
+    world = build_scene(cfg)
+    assert cfg.protocol.name == world.start == world.floor == "plab"
+    assert cfg.method.loss_terms == {"contact": "nearest"} and cfg.task.release == {}
+
+
+@pytest.mark.parametrize("method", choices("method"))
+def test_the_release_is_for_all_methods(method: str) -> None:
+    cfg = load_config(["protocol=release", f"method={method}", "task=Rope"])
+    world = build_scene(cfg)
+    assert world.start == world.floor == "release"
+    assert cfg.method.loss_terms == {"contact": "all"}
+    assert cfg.task.yield_stress == world.yield_stress == 50.0 and cfg.task.release == {}
+    own = load_config(["protocol=release", f"method={method}", "method.loss_terms.contact=nearest"])
+    assert own.method.loss_terms == {"contact": "nearest"}
+
+
+@pytest.mark.parametrize("task", choices("task"))
+def test_the_release_is_for_all_tasks(task: str) -> None:
+    for variant in "12345":
+        ours = build_scene(load_config([f"task={task}", f"variant={variant}"]))
+        theirs = build_scene(load_config([f"task={task}", f"variant={variant}", "protocol=release"]))
+        near = np.abs(sample_particles(theirs).mean(axis=0) - sample_particles(ours).mean(axis=0)).max()
+        assert theirs.particle_count == ours.particle_count and near < 0.01
+
+
+@pytest.mark.parametrize("part", ["start", "numbers", "floor"])
+def test_parts_can_be_set_alone(part: str) -> None:
+    cfg = load_config(["task=Rope", f"protocol.{part}=release"])
+    assert [key for key, value in asdict(cfg.protocol).items() if value == "release"] == [part]
+    world = build_scene(cfg)
+    assert (world.start, world.floor) == (cfg.protocol.start, cfg.protocol.floor)
+    assert world.yield_stress == (50.0 if part == "numbers" else 200.0)
+
+
+def test_numbers_have_all_digits() -> None:
+    def exact(task: str, variant: int) -> Scene:
+        return build_scene(load_config([f"task={task}", f"variant={variant}", "protocol.numbers=release"]))
+
+    assert exact("Move", 1).bodies[0].center == (0.6757143040494873, 0.5619162002773135, 0.7515980438048129)
+    assert exact("Move", 5).bodies[0].size == (0.11863044584650304,)
+    assert exact("Move", 2).manipulators[1].position[0] == 0.5800617702933017
+    assert exact("Rope", 3).manipulators[2].position == (0.48953026610561057, 0.0, 0.5199459480962076)
+    assert exact("RollingPin", 4).manipulators[0].rotation == (0.707, 0.707, 0.0, 0.0)
+    for task in set(choices("task")) - {"Move", "Rope", "RollingPin"}:
+        assert exact(task, 1) == build_scene(load_config([f"task={task}", "variant=1"]))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["protocol.floor=paper"], "protocol.floor 'paper' does not exist; choose from: plab, release"),
+        (["protocol=paper"], "paper"),
+        (["protocol.contact=far"], "there is no term 'far'"),
+        (
+            ["protocol=release", "task.yield_stress=100"],
+            "task.yield_stress is set by protocol.numbers=release",
+        ),
+        (["task.release.yield_stress=70"], "has no effect without protocol.numbers=release"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(["task=Rope", *overrides])
+
+
+def test_the_releases_numbers_can_be_overridden() -> None:
+    cfg = load_config(["task=Rope", "protocol=release", "task.release.yield_stress=70"])
+    assert cfg.task.yield_stress == 70.0
+
+
+def test_random_variants_have_the_protocol_too() -> None:
+    cfg = load_config(["task=Rope", "protocol=release", "variant=random", "seed_scene=3"])
+    assert build_scene(cfg).floor == "release" and cfg.task.yield_stress == 50.0
+
+
+def test_protocols_do_not_share_a_simulator() -> None:
+    cfgs = [
+        load_config([f"protocol={name}", f"seed={seed}"]) for name in ("plab", "release") for seed in (0, 1)
+    ]
+    assert [[cfg.protocol.name for cfg in batch] for batch in plan(cfgs)] == [["plab"] * 2, ["release"] * 2]
+    with pytest.raises(ConfigError, match=r"protocol.name differs between sub-environments 0 and 1"):
+        Problem(cfgs[1:3])
+
+
+# ----------------------------------------------------------------------------------------------- known values
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(FILES is None, reason="PLAB_RELEASE_TARGETS names no folder with the release's files")
+@pytest.mark.parametrize(
+    ("protocol", "loss", "norm"), [("plab", 73.3427, 0.1163), ("release", 74.3911, 1037.207)]
+)
+def test_loss_and_gradient_of_torus_are_the_releases(
+    protocol: str, loss: float, norm: float, device: str
+) -> None:
+    overrides = [f"protocol={protocol}", f"targets.source={FILES}", f"sim.device={device}"]
+    problem = Problem([load_config(["task=Torus", "variant=1", "sim.precision=float64", *overrides])])
+    u = np.random.default_rng(0).uniform(-1e-4, 1e-4, (1, 50, 3))
+    got = problem.rollout(u, gradient=True)
+    assert abs(got.loss.sum() - loss) < 1e-4
+    assert abs(np.linalg.norm(got.gradient) - norm) < 1e-6 * max(norm, 100.0)

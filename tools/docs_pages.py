@@ -57,6 +57,7 @@ PYTHON = {
 
 SECTIONS = (
     ("A run", "", config_types.Config, "config.yaml"),
+    ("protocol", "protocol.", config_types.ProtocolConfig, "protocol/plab.yaml"),
     ("sim", "sim.", config_types.SimConfig, "sim/fast.yaml"),
     ("targets", "targets.", config_types.TargetsConfig, "config.yaml:targets"),
     ("method, all", "method.", config_types.MethodConfig, "method/adam.yaml"),
