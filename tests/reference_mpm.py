@@ -14,7 +14,7 @@ particular): differentiate from a start whose deformation gradients have distinc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -78,10 +78,21 @@ def initial_state(scene: Scene, x: Tensor | None = None) -> State:
 
 
 def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
-    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A]."""
+    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A].
+
+    With the scene's ``numbers="release"``, rotations that are not of unit length are so from now on.
+    """
+    if scene.numbers == "release":
+        state = replace(state, poses=_unit_rotations(state.poses))
     for _ in range(scene.substeps):
         state = substep(scene, state, action, alpha)
     return state
+
+
+def _unit_rotations(poses: Tensor) -> Tensor:
+    """Poses [manipulator, 8] with unit quaternions."""
+    q = poses[:, 3:7]
+    return torch.cat([poses[:, :3], q / q.norm(dim=1, keepdim=True), poses[:, 7:]], dim=1)
 
 
 def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:

@@ -351,7 +351,7 @@ REFUSED = [
     ("+sim=reference", "write sim=reference"),
     (
         "tsk=Move",
-        "unknown key 'tsk'; did you mean task? choose from: task, method, sim, targets, variant, seed",
+        "unknown key 'tsk'; did you mean task? choose from: task, method, protocol, sim, targets",
     ),
     ("lr=0.1", "unknown key 'lr'; did you mean method.lr?"),
     (

@@ -285,6 +285,7 @@ def build_scene(cfg: Config) -> Scene:
         substeps=sim.substeps,
         horizon=sim.horizon,
         start=protocol.start,
+        numbers=protocol.numbers,
         floor=protocol.floor,
     )
     scene.validate()

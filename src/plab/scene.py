@@ -129,7 +129,7 @@ class Manipulator:
         shape: Key of :data:`MANIPULATOR_SHAPES`.
         size: Lengths named by ``MANIPULATOR_SHAPES[shape].size_names``.
         position: Position at t = 0.
-        rotation: Unit quaternion (w, x, y, z) at t = 0.
+        rotation: Unit quaternion (w, x, y, z) at t = 0, to three digits.
         scale: Motion over one environment step at action 1, one number per action component (lengths, or
             radians).
         friction: Coulomb friction coefficient with the plasticine.
@@ -187,6 +187,8 @@ class Scene:
         horizon: Environment steps per episode.
         particle_seed: Seed of the particles' positions.
         start: Whose generator draws them, one of :data:`CHOICES`.
+        numbers: Whose way with rotations that are not quite of unit length: plab's makes them so, with the
+            release's they are the poses at t = 0 as they are, and of unit length once something moves.
         floor: Whose stencil particles within half a cell of a lower face have: plab's reaches the layer of
             nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
     """
@@ -205,6 +207,7 @@ class Scene:
     horizon: int = 50
     particle_seed: int = 0
     start: str = "plab"
+    numbers: str = "plab"
     floor: str = "plab"
 
     @property
@@ -285,7 +288,7 @@ class Scene:
         _require(
             self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
         )
-        for name in ("start", "floor"):
+        for name in ("start", "numbers", "floor"):
             choice = getattr(self, name)
             _require(choice in CHOICES, f"{name} '{choice}' is not one of {', '.join(CHOICES)}")
         self._validate_gravity()

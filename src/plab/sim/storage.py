@@ -155,6 +155,7 @@ class Storage:
 
     def _set_manipulators(self, scenes: Sequence[Scene]) -> None:
         manipulators = scenes[0].manipulators
+        self.rotations_as_given = scenes[0].numbers == "release"
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
         require_surfaces(self.shapes)
