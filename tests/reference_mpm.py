@@ -5,8 +5,8 @@ formulas literally (singular value decomposition, Hencky strain, one tensor oper
 no code with the simulator. Lengths are in units of the unit cube, y is up.
 
 The grid has one ghost layer: node indices run from -1 to n - 1 on each axis, node i lies at i dx, and the
-kernel's base node is the true floor(x / dx - 0.5), so no weight is ever negative. Grid arrays are flat,
-[(n + 1)^3].
+kernel's base node is the true floor(x / dx - 0.5), so no weight is ever negative; with the scene's
+``floor="release"`` it is truncated toward zero instead. Grid arrays are flat, [(n + 1)^3].
 
 The derivative of the singular value decomposition does not exist where singular values coincide (F = I in
 particular): differentiate from a start whose deformation gradients have distinct singular values.
@@ -14,7 +14,7 @@ particular): differentiate from a start whose deformation gradients have distinc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -78,10 +78,21 @@ def initial_state(scene: Scene, x: Tensor | None = None) -> State:
 
 
 def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
-    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A]."""
+    """Advance by one environment step, ``scene.substeps`` substeps with the same action of shape [A].
+
+    With the scene's ``numbers="release"``, rotations that are not of unit length are so from now on.
+    """
+    if scene.numbers == "release":
+        state = replace(state, poses=_unit_rotations(state.poses))
     for _ in range(scene.substeps):
         state = substep(scene, state, action, alpha)
     return state
+
+
+def _unit_rotations(poses: Tensor) -> Tensor:
+    """Poses [manipulator, 8] with unit quaternions."""
+    q = poses[:, 3:7]
+    return torch.cat([poses[:, :3], q / q.norm(dim=1, keepdim=True), poses[:, 7:]], dim=1)
 
 
 def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
@@ -162,7 +173,8 @@ def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         Node indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3].
     """
-    base = (x.detach() / scene.dx - 0.5).floor()
+    base = x.detach() / scene.dx - 0.5
+    base = base.trunc() if scene.floor == "release" else base.floor()
     fx = x / scene.dx - base
     w = torch.stack([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2], dim=1)
     corner = torch.cartesian_prod(torch.arange(3), torch.arange(3), torch.arange(3))
@@ -517,7 +529,9 @@ def _identity() -> Tensor:
 # ------------------------------------------------------------------------------------------------------- loss
 
 
-def loss_terms(scene: Scene, state: State, target_mass: Tensor, target_sdf: Tensor) -> Tensor:
+def loss_terms(
+    scene: Scene, state: State, target_mass: Tensor, target_sdf: Tensor, contact: str = "nearest"
+) -> Tensor:
     """The unweighted terms of one step's loss: density, sdf, contact.
 
     Args:
@@ -525,6 +539,8 @@ def loss_terms(scene: Scene, state: State, target_mass: Tensor, target_sdf: Tens
         state: State at the end of the environment step.
         target_mass: Target mass tensor, shape [n, n, n].
         target_sdf: Distance to the target, shape [n, n, n].
+        contact: Gradient of the contact term: its own (``nearest``), or that of an atomic minimum which is
+            differentiated as if it were a sum (``all``).
 
     Returns:
         Terms, shape [3].
@@ -534,7 +550,11 @@ def loss_terms(scene: Scene, state: State, target_mass: Tensor, target_sdf: Tens
     for manipulator, pose in zip(scene.manipulators, state.poses, strict=True):
         if MANIPULATOR_SHAPES[manipulator.shape].motion != "static":
             d, _ = signed_distance(manipulator, pose, state.x)
-            contact_term = contact_term + d.clamp(min=0.0).min() ** 2
+            outside = d.clamp(min=0.0)
+            nearest = outside.min()
+            if contact == "all":
+                nearest = nearest.detach() + outside.sum() - outside.sum().detach()
+            contact_term = contact_term + nearest**2
     return torch.stack([(mass - target_mass).abs().sum(), (target_sdf * mass).sum(), contact_term])
 
 
@@ -546,6 +566,7 @@ def rollout_loss(
     target_mass: Tensor,
     target_sdf: Tensor,
     weights: tuple[float, float, float] = (10, 10, 1),
+    contact: str = "nearest",
 ) -> tuple[Tensor, State]:
     """Sum of the step losses over a rollout.
 
@@ -557,6 +578,7 @@ def rollout_loss(
         target_mass: Target mass tensor, shape [n, n, n].
         target_sdf: Distance to the target, shape [n, n, n].
         weights: Weights of density, sdf and contact.
+        contact: Gradient of the contact term, see :func:`loss_terms`.
 
     Returns:
         The loss, a scalar, and the state at the end.
@@ -565,5 +587,5 @@ def rollout_loss(
     weight = torch.tensor(weights, dtype=torch.float64)
     for action in actions:
         state = env_step(scene, state, action, alpha)
-        loss = loss + weight @ loss_terms(scene, state, target_mass, target_sdf)
+        loss = loss + weight @ loss_terms(scene, state, target_mass, target_sdf, contact)
     return loss, state

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from plab.checks import cuda_is_usable
-from plab.config import Config, choices
+from plab.config import GROUPS, Config, choices
 from plab.results import ResultsError
 from plab.reuse import SimulatorCache
 from plab.run import main
@@ -99,7 +99,7 @@ def test_a_mistake_in_a_fresh_process(tmp_path):
 def test_help_names_everything(capsys):
     assert main(["--help"]) == main(["-h", "task=nonsense"]) == 0
     text, _ = capsys.readouterr()
-    for group in ("task", "method", "sim"):
+    for group in GROUPS:
         assert all(f"{group}={name}" in text for name in choices(group))
     assert all(f"+experiment={name}" in text for name in choices("experiment"))
     for key in ("method.num_envs=1", "method.tau", "method.profiles.paper.tau=3e-4", "method.clip_range"):

@@ -13,11 +13,13 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from plab.config import (
+    GROUPS,
     ApgConfig,
     Config,
     ConfigError,
     MethodConfig,
     PpoConfig,
+    ProtocolConfig,
     SacConfig,
     SimConfig,
     TaskConfig,
@@ -35,8 +37,9 @@ from plab.scene import SceneError
 YAML_FILES = sorted(conf_folder().rglob("*.yaml"))
 KEY_LINE = re.compile(r'^ *["\w]+: ?')
 VARIANTS = [(task, variant) for task in choices("task") for variant in range(1, 6)]
-OPTIONAL = {"gap", "minimal_gap", "variant", "shift", "reach", "ranges", "random"}
-"""Fields that a YAML may leave out: those of chopsticks, and what variant=random draws."""
+OPTIONAL = {"gap", "minimal_gap", "variant", "shift", "reach", "ranges", "random", "release"}
+"""Fields that a YAML may leave out: those of chopsticks, and what variant=random draws, and
+what the release has in other numbers."""
 
 DOCUMENTED = (
     Config,
@@ -50,6 +53,7 @@ DOCUMENTED = (
     SacConfig,
     Td3Config,
     PpoConfig,
+    ProtocolConfig,
     SimConfig,
 )
 
@@ -110,7 +114,14 @@ def test_every_key_has_a_comment(path: Path):
 
 
 def test_root_keys_are_the_fields():
-    assert keys(raw("config.yaml")) | {"task", "method", "sim"} == names(Config)
+    assert keys(raw("config.yaml")) | set(GROUPS) == names(Config)
+
+
+@pytest.mark.parametrize("name", choices("protocol"))
+def test_protocol_keys_are_the_fields(name):
+    protocol = raw(f"protocol/{name}.yaml")
+    assert keys(protocol) == names(ProtocolConfig)
+    assert protocol["name"] == name
 
 
 def test_sim_keys_are_the_fields():
@@ -122,7 +133,7 @@ def test_method_keys_are_the_fields(name):
     method = raw(f"method/{name}.yaml")
     assert keys(method) == names(METHOD_KINDS[name])
     assert method["loss_weights"] == {"density": 10.0, "sdf": 10.0, "contact": 1.0}
-    assert method["loss_terms"] == {"contact": "nearest"}
+    assert method["loss_terms"] == {"contact": "${protocol.contact}"}
 
 
 @pytest.mark.parametrize("name", ["sac", "td3", "ppo"])
@@ -340,7 +351,7 @@ REFUSED = [
     ("+sim=reference", "write sim=reference"),
     (
         "tsk=Move",
-        "unknown key 'tsk'; did you mean task? choose from: task, method, sim, targets, variant, seed",
+        "unknown key 'tsk'; did you mean task? choose from: task, method, protocol, sim, targets",
     ),
     ("lr=0.1", "unknown key 'lr'; did you mean method.lr?"),
     (

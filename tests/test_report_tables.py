@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -15,6 +16,7 @@ import pytest
 from scipy import stats
 
 import synthetic
+from plab.config import load_config
 from plab.examples import example_archive, resolve
 from plab.report.__main__ import main, write_tables
 from plab.report.collect import NAMES, MixedRunsError, collect
@@ -25,7 +27,7 @@ from plab.report.table import Table, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import check, load, pack
-from plab.selection import select
+from plab.selection import SelectionError, select
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -234,6 +236,46 @@ def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
         synthetic.save(synthetic.synthetic_run(older, rows=synthetic.ROWS))
     runs = gather(tmp_path)
     assert len(runs.table) == 2 and "method.max_gradient_norm" not in runs.unusual and not runs.set_aside
+
+
+def released(folder: Path, seed: int, **changes: str) -> None:
+    """Save a run of the release's protocol, with some parts of it changed."""
+    config = synthetic.config(folder, seed=seed)
+    own = load_config(["protocol=release", "task=Rope"])
+    config["protocol"] = dataclasses.asdict(own.protocol) | changes
+    config["method"]["loss_terms"] = own.method.loss_terms
+    config["task"]["yield_stress"] = own.task.yield_stress
+    synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS))
+
+
+def test_protocols_are_not_mixed(tmp_path: Path) -> None:
+    synthetic.save(synthetic.run(tmp_path, seed=0))
+    released(tmp_path, seed=1)
+    with pytest.raises(
+        SelectionError, match=r"protocols plab and release: choose one, .* protocol\.name=plab"
+    ):
+        gather(tmp_path)
+    ours, theirs = gather(tmp_path, "protocol.name=plab"), gather(tmp_path, "protocol.name=release")
+    assert (len(ours.table), ours.protocol) == (1, "plab")
+    assert (len(theirs.table), theirs.protocol) == (1, "release")
+    assert ours.unusual == theirs.unusual == {"method.iterations": [synthetic.ROWS]}
+    notes = by_form(iou_per_task(theirs))["ours"].notes
+    assert "Protocol: release." in notes and "protocol's own" in notes[-1]
+
+
+def test_a_changed_part_of_a_protocol_is_noted(tmp_path: Path) -> None:
+    released(tmp_path, seed=0, floor="plab")
+    assert gather(tmp_path).unusual["protocol.floor"] == ["plab"]
+
+
+def test_runs_from_before_protocols_are_plabs_own(tmp_path: Path) -> None:
+    for seed in range(2):
+        older = synthetic.config(tmp_path, seed=seed)
+        if seed:
+            del older["protocol"], older["task"]["release"]
+        synthetic.save(synthetic.synthetic_run(older, rows=synthetic.ROWS))
+    runs = gather(tmp_path)
+    assert (len(runs.table), runs.protocol, runs.set_aside) == (2, "plab", 0)
 
 
 def test_two_runs_of_one_seed_are_refused(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from plab.results import (
     load,
     read,
     result_path,
+    rows,
     write,
 )
 from plab.results.hdf5 import attributes, columns
@@ -36,6 +37,13 @@ def make_config(folder: Path, **changes) -> dict:
         "task": {"name": "Rope", "yield_stress": 50.0},
         "variant": "2",
         "method": {"name": "adam", "family": "trajectory", "lr": 0.1},
+        "protocol": {
+            "name": "plab",
+            "start": "plab",
+            "numbers": "plab",
+            "floor": "plab",
+            "contact": "nearest",
+        },
         "sim": {"device": "cpu", "precision": "float64"},
         "seed": 3,
         "results_dir": str(folder),
@@ -54,6 +62,36 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
     assert config_hash(config | {"sim": config["sim"] | {"memory_mb": 7.0}}) == hash_
     assert config_hash(config | {"sim": config["sim"] | {"precision": "float32"}}) != hash_
     assert config_hash(config | {"seed": 4}) != hash_
+
+
+def test_hash_of_protocols(tmp_path: Path) -> None:
+    config = make_config(tmp_path)
+    before = {key: value for key, value in config.items() if key != "protocol"}
+    assert config_hash(before) == config_hash(config)
+    assert config_hash(config | {"task": config["task"] | {"release": {}}}) == config_hash(config)
+    hashes = {config_hash(config)}
+    for change in ({"start": "release"}, {"numbers": "release"}, {"floor": "release"}):
+        hashes.add(config_hash(config | {"protocol": config["protocol"] | change}))
+    assert len(hashes) == 4
+    # The contact term acts by what the method says.
+    assert config_hash(config | {"protocol": config["protocol"] | {"contact": "all"}}) in hashes
+
+
+def test_runs_from_before_protocols_are_of_plabs_own(tmp_path: Path) -> None:
+    config = make_config(tmp_path)
+    run = RunFile({key: value for key, value in config.items() if key != "protocol"})
+    run.finish({}, {})
+    assert read(run.path).config == config | {"protocol": config["protocol"]}
+    (row,), _ = rows(tmp_path)
+    assert row.config["protocol"] == config["protocol"]
+
+
+def test_a_target_of_the_users_is_not_written(tmp_path: Path) -> None:
+    mass = {name: np.full((4, 4, 4), 0.5) for name in ("initial", "final", "target")}
+    for source, written in ((None, {"initial", "final", "target"}), ("files", {"initial", "final"})):
+        run = RunFile(make_config(tmp_path, targets={"source": source}))
+        run.finish({}, mass)
+        assert read(run.path).masses.keys() == written
 
 
 def make_row(iteration: int) -> dict[str, float]:

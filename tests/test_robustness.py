@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
-from plab.config import Config, ConfigError, choices, load_config
-from plab.config_types import PpoConfig, SacConfig, SimConfig, Td3Config, TrajectoryConfig
+from plab.config import GROUPS, Config, ConfigError, choices, load_config
+from plab.config_types import PpoConfig, ProtocolConfig, SacConfig, SimConfig, Td3Config, TrajectoryConfig
 from plab.results import __main__ as results
 from plab.results import read, write
 from plab.scene import SceneError
@@ -42,6 +42,7 @@ def keys(kind: type, prefix: str) -> Iterator[tuple[str, str]]:
 
 SCALARS = {
     "": [(name, kind) for name, kind in keys(Config, "") if kind in ("int", "float", "bool")],
+    "protocol": list(keys(ProtocolConfig, "protocol.")),
     "sim": list(keys(SimConfig, "sim.")),
     "adam": list(keys(TrajectoryConfig, "method.")),
     "sac": list(keys(SacConfig, "method.")),
@@ -68,7 +69,7 @@ def wrong_types() -> Iterator[list[str]]:
 
 def misspelt() -> Iterator[list[str]]:
     """Each key with two letters exchanged, or one too many."""
-    for group in ("", "sim", "adam"):
+    for group in ("", "protocol", "sim", "adam"):
         for name, _ in SCALARS[group]:
             stem, _, last = name.rpartition(".")
             wrong = (
@@ -125,7 +126,7 @@ OUT_OF_RANGE = {
 }
 
 CHOICES = [
-    *([f"{group}={name}"] for group in ("task", "method", "sim") for name in ("nothing", "", "[a,b]", "3")),
+    *([f"{group}={name}"] for group in GROUPS for name in ("nothing", "", "[a,b]", "3")),
     *(["task=" + name[:-1]] for name in ("Rope", "Move", "Torus", "Writer", "Chopsticks")),
     ["method=Adam2"],
     ["+method=sac"],

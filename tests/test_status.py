@@ -82,6 +82,16 @@ def test_configuration_keys_choose_among_the_results(folder: Path) -> None:
     lock.release()
 
 
+def test_protocols_are_not_mixed(folder: Path) -> None:
+    other = synthetic.config(folder, seed=3)
+    other["protocol"] |= {"name": "release", "floor": "release"}
+    synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
+    with pytest.raises(SelectionError, match="protocols plab and release: choose one"):
+        find(folder)
+    found = find(folder, "protocol.name=release", "task=Rope")
+    assert (counts(found)["done"], found.protocol) == (1, "release")
+
+
 def test_runs_outside_of_the_grid_are_counted_apart(folder: Path) -> None:
     synthetic.save(synthetic.run(folder, variant="random7"))
     assert find(folder).others == 1

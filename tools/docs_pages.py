@@ -26,9 +26,22 @@ PYTHON = {
     "python": (
         "Python",
         "Configurations, problems, scores, and PyTorch.",
-        ("plab.config", "plab.problem", "plab.objective", "plab.losses", "plab.losses.term", "plab.torch", "plab.scene", "plab.targets"),
+        (
+            "plab.config",
+            "plab.problem",
+            "plab.objective",
+            "plab.losses",
+            "plab.losses.term",
+            "plab.torch",
+            "plab.scene",
+            "plab.targets",
+        ),
     ),
-    "simulator": ("Simulator", "Usable alone.", ("plab.sim.simulator", "plab.sim.forward", "plab.sim.recording", "plab.sim.state", "plab.sim.skips")),
+    "simulator": (
+        "Simulator",
+        "Usable alone.",
+        ("plab.sim.simulator", "plab.sim.forward", "plab.sim.recording", "plab.sim.state", "plab.sim.skips"),
+    ),
     "environments": (
         "Environments",
         "",
@@ -44,6 +57,7 @@ PYTHON = {
 
 SECTIONS = (
     ("A run", "", config_types.Config, "config.yaml"),
+    ("protocol", "protocol.", config_types.ProtocolConfig, "protocol/plab.yaml"),
     ("sim", "sim.", config_types.SimConfig, "sim/fast.yaml"),
     ("targets", "targets.", config_types.TargetsConfig, "config.yaml:targets"),
     ("method, all", "method.", config_types.MethodConfig, "method/adam.yaml"),

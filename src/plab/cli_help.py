@@ -59,6 +59,7 @@ def help_text(config_dir: str | None = None) -> str:
     parts += [f"  +{EXPERIMENT}={name:<10} {_title(path)}" for name, path in names]
     parts += ["", "KEYS, with their defaults"]
     parts += _keys(folder / "config.yaml", "")
+    parts += _keys(folder / "protocol" / "plab.yaml", "protocol.")
     parts += _keys(folder / "sim" / "fast.yaml", "sim.")
     parts += _keys(folder / "method" / "adam.yaml", "method.")
     # Each has keys of its own; those of adam are the default's, above.

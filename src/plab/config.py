@@ -30,6 +30,7 @@ from plab.config_types import (
     ManipulatorConfig,
     MethodConfig,
     PpoConfig,
+    ProtocolConfig,
     RlConfig,
     SacConfig,
     SimConfig,
@@ -57,6 +58,7 @@ __all__ = [
     "ManipulatorConfig",
     "MethodConfig",
     "PpoConfig",
+    "ProtocolConfig",
     "RlConfig",
     "SacConfig",
     "SimConfig",
@@ -72,7 +74,7 @@ __all__ = [
     "variant_task",
 ]
 
-GROUPS = ("task", "method", "sim")
+GROUPS = ("task", "method", "protocol", "sim")
 """Sections of the configuration that are a choice of one file."""
 
 EXPERIMENT = "experiment"
@@ -99,7 +101,7 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
     """Return what a group offers.
 
     Args:
-        group: ``task``, ``method``, ``sim`` or ``experiment``.
+        group: ``task``, ``method``, ``protocol``, ``sim`` or ``experiment``.
         config_dir: Folder with files of the user's own, in subfolders named like the groups.
 
     Returns:
@@ -138,7 +140,7 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
 
     Args:
         overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
-        config_dir: Folder with files of the user's own, in subfolders ``task``, ``method`` and ``sim``.
+        config_dir: Folder with files of the user's own, in subfolders named like the groups.
 
     Returns:
         The checked configuration.
@@ -225,6 +227,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         OmegaConf.set_struct(composed, None)
         _choose_profile(composed.method)
         _choose_learning_rate(composed.method)
+        _choose_numbers(composed, overrides)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
         parts = vars(OmegaConf.to_object(composed))
@@ -267,7 +270,7 @@ def build_scene(cfg: Config) -> Scene:
         ConfigError: If the variant does not exist.
         plab.scene.SceneError: If the scene cannot be simulated.
     """
-    task, sim = variant_task(cfg), cfg.sim
+    task, protocol, sim = variant_task(cfg), cfg.protocol, cfg.sim
     scene = Scene(
         name=task.name,
         bodies=tuple(body.build(sim.particles_scale) for body in task.bodies.values()),
@@ -281,6 +284,9 @@ def build_scene(cfg: Config) -> Scene:
         dt=sim.dt,
         substeps=sim.substeps,
         horizon=sim.horizon,
+        start=protocol.start,
+        numbers=protocol.numbers,
+        floor=protocol.floor,
     )
     scene.validate()
     return scene
@@ -328,6 +334,18 @@ def _choose_learning_rate(method: DictConfig) -> None:
     if "lr_by_task" in method:
         OmegaConf.resolve(method)
         method.lr_by_task = {}
+
+
+def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:
+    """Put the release's numbers into the task if they are asked for, and forget them otherwise."""
+    changes = composed.task.release
+    if composed.protocol.numbers == "release":
+        if key := undone_key(changes, overrides):
+            raise ConfigError(f"task.{key} is set by protocol.numbers=release: override task.release.{key}")
+        composed.task = OmegaConf.merge(composed.task, changes)
+    elif unused := [o for o in overrides if o.lstrip("+").startswith("task.release.")]:
+        raise ConfigError(f"'{unused[0]}' has no effect without protocol.numbers=release")
+    composed.task.release = {}
 
 
 def _choose_variant(composed: DictConfig, overrides: Sequence[str]) -> None:

@@ -56,7 +56,7 @@ class Scores:
     score: float
 
 
-def spread_mass(x: ArrayLike, n: int, mass: float) -> np.ndarray:
+def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.ndarray:
     """Spread particles of equal mass over the grid with the quadratic B-spline.
 
     Node i is at i / n. A particle within half a cell of a lower face also reaches the ghost node at -1; that
@@ -66,6 +66,8 @@ def spread_mass(x: ArrayLike, n: int, mass: float) -> np.ndarray:
         x: Particle positions [domain units], shape [particle, 3].
         n: Grid nodes per axis.
         mass: Mass per particle.
+        floor: Whose stencil such particles have, as in :class:`plab.scene.Scene`. With the release's, they
+            have negative weights instead of a ghost node.
 
     Returns:
         Mass tensor, shape [n, n, n], float64.
@@ -83,6 +85,8 @@ def spread_mass(x: ArrayLike, n: int, mass: float) -> np.ndarray:
             f"positions outside the grid: each coordinate must be in [{-0.5 / n:.4g}, {1 - 1.5 / n:.4g})"
         )
     base = np.floor(scaled - 0.5)
+    if floor == "release":
+        base = np.maximum(base, 0.0)
     f = scaled - base
     weight = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
     node = np.maximum(base.astype(np.int64) + np.arange(3)[:, None, None], 0)

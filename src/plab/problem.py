@@ -84,7 +84,9 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
 
 def _kinds(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal where configurations differ in method, seed and files only."""
-    return [json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.sim)]) for cfg in cfgs]
+    return [
+        json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)]) for cfg in cfgs
+    ]
 
 
 class Problem:
@@ -105,7 +107,7 @@ class Problem:
         """Build everything.
 
         Args:
-            cfgs: One configuration per environment, alike in ``sim``, ``targets`` and the loss.
+            cfgs: One configuration per environment, alike in ``protocol``, ``sim``, ``targets`` and the loss.
             simulator: Simulator of the very same scenes and terms of the loss, if there is one already.
 
         Raises:
@@ -210,7 +212,7 @@ def _targets(cfgs: Sequence[Config], scenes: Sequence[Scene], simulator: Simulat
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """Refuse configurations of which one simulator could only follow the first."""
     for number, cfg in enumerate(cfgs):
-        for part in ("sim", "method.loss_weights", "method.loss_terms", "targets"):
+        for part in ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets"):
             first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
             if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:
                 raise ConfigError(

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 __all__ = [
+    "CHOICES",
     "MANIPULATOR_SHAPES",
     "ROLL_RADIUS",
     "Body",
@@ -24,6 +25,9 @@ __all__ = [
     "sample_particles",
     "vector3",
 ]
+
+CHOICES = ("plab", "release")
+"""Whose way something is done: plab's own, or that of the PlasticineLab release."""
 
 Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -125,7 +129,7 @@ class Manipulator:
         shape: Key of :data:`MANIPULATOR_SHAPES`.
         size: Lengths named by ``MANIPULATOR_SHAPES[shape].size_names``.
         position: Position at t = 0.
-        rotation: Unit quaternion (w, x, y, z) at t = 0.
+        rotation: Unit quaternion (w, x, y, z) at t = 0, to three digits.
         scale: Motion over one environment step at action 1, one number per action component (lengths, or
             radians).
         friction: Coulomb friction coefficient with the plasticine.
@@ -182,6 +186,11 @@ class Scene:
         substeps: Substeps per environment step.
         horizon: Environment steps per episode.
         particle_seed: Seed of the particles' positions.
+        start: Whose generator draws them, one of :data:`CHOICES`.
+        numbers: Whose way with rotations that are not quite of unit length: plab's makes them so, with the
+            release's they are the poses at t = 0 as they are, and of unit length once something moves.
+        floor: Whose stencil particles within half a cell of a lower face have: plab's reaches the layer of
+            nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
     """
 
     name: str
@@ -197,6 +206,9 @@ class Scene:
     substeps: int = 19
     horizon: int = 50
     particle_seed: int = 0
+    start: str = "plab"
+    numbers: str = "plab"
+    floor: str = "plab"
 
     @property
     def dx(self) -> float:
@@ -276,6 +288,9 @@ class Scene:
         _require(
             self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
         )
+        for name in ("start", "numbers", "floor"):
+            choice = getattr(self, name)
+            _require(choice in CHOICES, f"{name} '{choice}' is not one of {', '.join(CHOICES)}")
         self._validate_gravity()
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
@@ -379,11 +394,13 @@ def sample_particles(scene: Scene) -> np.ndarray:
     """Draw the particles' initial positions, uniformly inside each body.
 
     Args:
-        scene: The scene; ``particle_seed`` and the bodies decide the result.
+        scene: The scene; ``particle_seed``, ``start`` and the bodies decide the result.
 
     Returns:
         Positions [domain units], shape [particle, 3], float64, body after body.
     """
+    if scene.start == "release":
+        return _legacy_particles(scene)
     rng = np.random.default_rng(scene.particle_seed)
     parts = []
     for body in scene.bodies:
@@ -395,4 +412,21 @@ def sample_particles(scene: Scene) -> np.ndarray:
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             radius = body.size[0] * np.cbrt(rng.random((body.particles, 1)))
             parts.append(np.asarray(body.center) + radius * direction)
+    return np.concatenate(parts)
+
+
+def _legacy_particles(scene: Scene) -> np.ndarray:
+    """Draw the particles' initial positions as the release does: with seed 0, the very same numbers, which no
+    other generator has."""
+    rng = np.random.RandomState(scene.particle_seed)
+    parts = []
+    for body in scene.bodies:
+        center = np.asarray(body.center)
+        if body.shape == "box":
+            unit = rng.random_sample((body.particles, 3)) * 2 - 1
+            parts.append(center + unit * np.asarray(body.size) / 2)
+        else:
+            p = rng.normal(size=(body.particles, 3))
+            u = rng.random_sample((body.particles, 1))
+            parts.append(center + body.size[0] * u ** (1 / 3) * p / np.linalg.norm(p, axis=1, keepdims=True))
     return np.concatenate(parts)

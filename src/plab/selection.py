@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-__all__ = ["Selection", "SelectionError", "lookup", "select"]
+__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "select"]
 
 
 class SelectionError(ValueError):
@@ -70,6 +70,22 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
         texts = list(override.sweep_string_iterator()) if sweep else [str(override.value())]
         (keys if "." in name else choices)[name] = texts
     return Selection(choices, keys)
+
+
+def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
+    """Return the name of the protocol that runs have in common, plab's own where there are none.
+
+    Args:
+        configs: The runs' configurations.
+
+    Raises:
+        SelectionError: If there are several: they are not to be pooled.
+    """
+    names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
+    if len(names) > 1:
+        advice = f"choose one, for example protocol.name={names[0]}"
+        raise SelectionError(f"there are runs of the protocols {' and '.join(names)}: {advice}")
+    return names[0]
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:

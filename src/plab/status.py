@@ -26,7 +26,7 @@ from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes
 from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
-from plab.selection import Selection, SelectionError, select
+from plab.selection import Selection, SelectionError, one_protocol, select
 from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 
 __all__ = ["STATES", "Group", "Run", "Survey", "main", "survey"]
@@ -111,12 +111,14 @@ class Survey:
         groups: The same by task and method.
         others: Number of further runs in the results: not asked for, or of other settings.
         unreadable: What could not be read.
+        protocol: Name of the runs' protocol.
     """
 
     runs: list[Run]
     groups: list[Group]
     others: int
     unreadable: list[str]
+    protocol: str
 
     @property
     def running(self) -> list[Run]:
@@ -149,9 +151,11 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
 
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
+        SelectionError: If there are runs of several protocols.
     """
     found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
+    protocol = one_protocol(row.config for row in fitting)
     runs = {key: Run(*key) for key in _expected(fitting, chosen)}
     others = 0
     for row in fitting:
@@ -168,7 +172,7 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
     groups = [
         _group(task, method, runs.values(), means) for task, method in dict.fromkeys(_pairs(runs.values()))
     ]
-    return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable])
+    return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable], protocol)
 
 
 # --------------------------------------------------------------------------------------------------- counting
@@ -352,6 +356,8 @@ def _show(found: Survey) -> None:
         done = f"{group.counts['done']}/{group.expected}"
         table.add_row(group.task, group.method, done, *counts, mean, rate, left)
     console.print(table)
+    if found.protocol != "plab":
+        console.print(f"protocol: {found.protocol}", highlight=False)
     for run in found.runs:
         name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
         if run.state == "running":

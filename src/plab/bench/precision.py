@@ -141,7 +141,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
 
 def spread(scene: Scene, x: np.ndarray) -> np.ndarray:
     """Mass tensor of positions."""
-    return spread_mass(x, scene.grid_size, scene.particle_mass)
+    return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor)
 
 
 def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:

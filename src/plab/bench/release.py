@@ -3,7 +3,8 @@
     python -m plab.bench.release --csv release.csv
     python -m plab.bench.release --task Move,Rope --particles 10000
 
-Two choices of the release are put into the simulator, one at a time, in float64:
+Two choices of the release are put into the simulator, one at a time, in float64; both floors are of the
+scene, see :class:`plab.scene.Scene`:
 
 - ``floor``: base nodes are truncated toward zero, so that particles within half a cell of the domain's lower
   faces have negative weights. Compared are the final state and score of a demonstration in the hard contact
@@ -20,8 +21,8 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import taichi as ti
@@ -46,15 +47,6 @@ CLAMP = 1e-6
 
 SMALL, LARGE = 1e-4, 0.7
 """Size of random actions, and factor on a demonstration's, at which gradients are compared."""
-
-
-@ti.func
-def truncated_stencil(self, x):
-    """:meth:`plab.sim.particle_phases.ParticlePhases.stencil` with the base node truncated toward zero."""
-    q = x * self.inv_dx
-    base = ti.cast(ti.floor(q - 0.5), ti.i32)
-    base = ti.min(ti.max(base, 0), self.n - 4)
-    return base + 1, q - ti.cast(base, self.real)
 
 
 @ti.func
@@ -105,39 +97,19 @@ def clamped_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strain, tiny):
     return u @ x @ v.transpose()
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A choice of the release.
-
-    Attributes:
-        owner: What has the part of the simulator that is replaced.
-        name: Name of the part.
-        part: The release's.
-        series: Whether material is computed by series where they serve.
-    """
-
-    owner: Any
-    name: str
-    part: Any
-    series: bool
-
-
-CHOICES = {
-    "floor": Choice(particle_phases.ParticlePhases, "stencil", truncated_stencil, True),
-    "svd": Choice(particle_phases, "spectral_return_map_adjoint", clamped_adjoint, False),
-}
+CHOICES = ("floor", "svd")
 """The release's choices that can be measured."""
 
 
 @contextlib.contextmanager
-def as_released(choice: Choice) -> Iterator[None]:
-    """Put a choice of the release into simulators that are compiled meanwhile."""
-    before = getattr(choice.owner, choice.name)
-    setattr(choice.owner, choice.name, choice.part)
+def decomposed() -> Iterator[None]:
+    """Put the release's gradient into simulators that are compiled meanwhile."""
+    ours = particle_phases.spectral_return_map_adjoint
+    particle_phases.spectral_return_map_adjoint = clamped_adjoint
     try:
         yield
     finally:
-        setattr(choice.owner, choice.name, before)
+        particle_phases.spectral_return_map_adjoint = ours
 
 
 def rows(tasks: Sequence[str], particles: int, choices: Sequence[str]) -> Iterator[dict[str, object]]:
@@ -153,11 +125,13 @@ def rows(tasks: Sequence[str], particles: int, choices: Sequence[str]) -> Iterat
     """
     configurations = starts(tasks, ["1"], particles)
     for name in choices:
-        choice = CHOICES[name]
-        compare = _states if name == "floor" else _gradients
-        ours = compare(configurations, choice)
-        with as_released(choice):
-            theirs = compare(configurations, choice)
+        if name == "floor":
+            truncated = [replace(s, scene=replace(s.scene, floor="release")) for s in configurations]
+            ours, theirs = _states(configurations), _states(truncated)
+        else:
+            ours = _gradients(configurations)
+            with decomposed():
+                theirs = _gradients(configurations)
         for start in configurations:
             for row in ours[start.task]:
                 yield {"choice": name, "task": start.task} | _row(
@@ -165,14 +139,14 @@ def rows(tasks: Sequence[str], particles: int, choices: Sequence[str]) -> Iterat
                 )
 
 
-def _simulator(configurations: Sequence[Start], choice: Choice) -> Simulator:
-    skips = replace(ANY_SCENE, singular_values=choice.series)
+def _simulator(configurations: Sequence[Start], *, series: bool) -> Simulator:
+    skips = replace(ANY_SCENE, singular_values=series)
     return Simulator([configurations[0].scene], terms=grid_terms(), precision="float64", skips=skips)
 
 
-def _states(configurations: Sequence[Start], choice: Choice) -> Mapping[str, Mapping[str, np.ndarray]]:
+def _states(configurations: Sequence[Start]) -> Mapping[str, Mapping[str, np.ndarray]]:
     """Final positions of the demonstrations, NaN where they break off, by task and kind of actions."""
-    simulator = _simulator(configurations, choice)
+    simulator = _simulator(configurations, series=True)
     simulator.set_contact("hard")
     out = {}
     for start in configurations:
@@ -183,9 +157,9 @@ def _states(configurations: Sequence[Start], choice: Choice) -> Mapping[str, Map
     return out
 
 
-def _gradients(configurations: Sequence[Start], choice: Choice) -> Mapping[str, Mapping[str, np.ndarray]]:
+def _gradients(configurations: Sequence[Start]) -> Mapping[str, Mapping[str, np.ndarray]]:
     """Gradients at small and at large actions, by task and kind of actions."""
-    simulator = _simulator(configurations, choice)
+    simulator = _simulator(configurations, series=False)
     out = {}
     for number, start in enumerate(configurations):
         shown = start.actions["demonstration"]

@@ -16,7 +16,7 @@ from plab.config_types.method import (
     Td3Config,
     TrajectoryConfig,
 )
-from plab.config_types.run import PRECISIONS, Config, SimConfig, TargetsConfig
+from plab.config_types.run import PRECISIONS, Config, ProtocolConfig, SimConfig, TargetsConfig
 from plab.config_types.task import (
     BodyConfig,
     DrawConfig,
@@ -38,6 +38,7 @@ __all__ = [
     "MethodConfig",
     "OffPolicyConfig",
     "PpoConfig",
+    "ProtocolConfig",
     "RandomConfig",
     "RangeConfig",
     "RlConfig",

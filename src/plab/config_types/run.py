@@ -7,10 +7,12 @@ from typing import TypeVar
 
 from plab.config_errors import ConfigError
 from plab.config_types.method import DEVICES, MethodConfig
-from plab.config_types.ranges import at_least, one_of, positive
+from plab.config_types.ranges import at_least, folder_name, one_of, positive
 from plab.config_types.task import TaskConfig
+from plab.losses.registry import check_terms
+from plab.scene import CHOICES
 
-__all__ = ["PRECISIONS", "Config", "SimConfig", "TargetsConfig"]
+__all__ = ["PRECISIONS", "Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
 
 PRECISIONS = ("float32", "float64")
 
@@ -54,6 +56,32 @@ class SimConfig:
 
 
 @dataclass
+class ProtocolConfig:
+    """What is done as the PlasticineLab release does it, where that is not what the paper says.
+
+    Attributes:
+        name: Name of the protocol in results and reports; runs of different names are never pooled.
+        start: Whose generator draws the particles' positions, ``plab`` or ``release``.
+        numbers: Whose digits the task's numbers have, likewise; the release's are in ``task.release``.
+        floor: Whose stencil particles at the lower faces have, likewise.
+        contact: Which term ``method.loss_terms.contact`` is, unless that says so itself.
+    """
+
+    name: str
+    start: str
+    numbers: str
+    floor: str
+    contact: str
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        folder_name(f"{path}.name", self.name)
+        for part in ("start", "numbers", "floor"):
+            one_of(f"{path}.{part}", getattr(self, part), CHOICES)
+        check_terms({"contact": 1.0}, {"contact": self.contact})
+
+
+@dataclass
 class TargetsConfig:
     """Where the targets come from.
 
@@ -71,6 +99,7 @@ class Config:
     Attributes:
         task: Scene, target and variants.
         method: How the actions are found.
+        protocol: What is done as the PlasticineLab release does it.
         sim: How the scene is simulated.
         targets: Where the targets come from.
         variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
@@ -84,6 +113,7 @@ class Config:
 
     task: TaskConfig
     method: MethodConfig
+    protocol: ProtocolConfig
     sim: SimConfig
     targets: TargetsConfig
     variant: str
@@ -106,6 +136,7 @@ class Config:
             raise ConfigError("targets.source has no files for variant=random: leave one of them out")
         self.task.check("task")
         self.method.check("method")
+        self.protocol.check("protocol")
         self.sim.check("sim")
 
     def method_as(self, kind: type[Method]) -> Method:

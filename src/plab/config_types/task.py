@@ -170,6 +170,9 @@ class TaskConfig:
         variants: By name: what each variant changes: a part of this very structure, merged over it.
         random: What ``variant=random`` draws: the fields of :class:`RandomConfig`. Empty where there is
             nothing to draw, and in a run's configuration.
+        release: What the PlasticineLab release has in other numbers, merged over this structure, variants
+            included, by ``protocol.numbers=release``. Empty where that is nothing, and in a run's
+            configuration.
     """
 
     name: str
@@ -183,6 +186,7 @@ class TaskConfig:
     target: dict[str, Any]
     variants: dict[str, Any]
     random: dict[str, Any] = field(default_factory=dict)
+    release: dict[str, Any] = field(default_factory=dict)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""

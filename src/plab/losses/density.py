@@ -23,7 +23,8 @@ class Density(NodeTerm):
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Sum the targets' masses: what empty environments miss."""
-        self.total.from_numpy(mass.sum(axis=(1, 2, 3)))
+        # A target of the release may have negative ones.
+        self.total.from_numpy(np.abs(mass).sum(axis=(1, 2, 3)))
 
     @ti.func
     def empty(self, e):
@@ -32,9 +33,9 @@ class Density(NodeTerm):
 
     @ti.func
     def measure(self, e, node, mass):
-        """|S - S*| - S*."""
+        """|S - S*| - |S*|."""
         target = self.target[self.sim.entry(e, node)]
-        return ti.abs(mass - target) - target
+        return ti.abs(mass - target) - ti.abs(target)
 
     @ti.func
     def slope(self, e, node, mass):

@@ -59,7 +59,7 @@ class NodeTerm(Term):
             e: Environment.
             node: Index of the node along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry
                 in fields of n^3 numbers per environment.
-            mass: Its mass, positive.
+            mass: Its mass, positive; with the release's floor it may be negative.
         """
         return 0.0 * mass
 

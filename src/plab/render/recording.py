@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from plab.checks import cuda_is_usable
 from plab.config import build_scene, load_config
-from plab.config_types import Config, SimConfig, TaskConfig
+from plab.config_types import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig
 from plab.problem import Problem
 from plab.render.graphics import RenderError
 from plab.results import read
@@ -61,11 +61,19 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
-    task, sim = _section(run.config["task"], TaskConfig), _section(run.config["sim"], SimConfig)
+    sim = _section(run.config["sim"], SimConfig)
     if sim.device == "cuda" and not cuda_is_usable():
         _say("the run used CUDA, which this computer has not: replaying it on the CPU")
         sim.device = "cpu"
-    cfg = dataclasses.replace(load_config(), variant=str(run.config["variant"]), task=task, sim=sim)
+    cfg = dataclasses.replace(
+        load_config(),
+        variant=str(run.config["variant"]),
+        task=_section(run.config["task"], TaskConfig),
+        protocol=_section(run.config["protocol"], ProtocolConfig),
+        sim=sim,
+        # A target that came from a file of the user's is not in the result.
+        targets=_section(run.config["targets"], TargetsConfig),
+    )
     actions, components = run.best_actions, build_scene(cfg).action_dim
     if actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
         shape = list(actions.shape)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +91,8 @@ def _replayed(group: Mapping[Path, Mapping[str, Path]]) -> dict[tuple[Path, str]
     for folder, files in group.items():
         for name, path in files.items():
             cfg, actions = recording.result(path)
-            kind = json.dumps([dataclasses.asdict(cfg.sim), actions.shape])
+            sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+            kind = json.dumps([*sections, actions.shape])
             alike[kind].append(((folder, name), cfg, actions))
     made: dict[tuple[Path, str], recording.Recording] = {}
     for cases in alike.values():

@@ -133,5 +133,6 @@ def times(run: RunResult) -> Drawing:
 def facts(run: RunResult) -> pd.DataFrame:
     """Return where a run comes from and what it reached, a row per fact."""
     known = {f"evaluation: {name}": f"{value:.4g}" for name, value in run.evaluation.items()}
+    known |= {"protocol": run.config["protocol"]["name"]}
     known |= {name: str(value) for name, value in run.provenance.items()}
     return pd.DataFrame({"what": known.keys(), "value": known.values()})

@@ -17,7 +17,7 @@ import yaml
 from plab.report.methods import ordered
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows
-from plab.selection import Selection
+from plab.selection import Selection, one_protocol
 from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 
 __all__ = [
@@ -48,6 +48,10 @@ _HARMLESS = (
     "method.lr_by_task",
     "method.torch_device",
     "method.torch_threads",
+    # Acts where method.loss_terms.contact says so.
+    "protocol.contact",
+    # Empty, or older than it.
+    "task.release",
 )
 """Keys in which the runs of one mean may differ."""
 
@@ -71,6 +75,7 @@ class Runs:
         set_aside: Number of finished runs with more changes to plab's own settings than others of the same
             task and method have.
         unusual: Settings other than plab's own: key to the values that occur.
+        protocol: Name of their protocol.
         unreadable: What could not be read.
     """
 
@@ -83,6 +88,7 @@ class Runs:
     others: int
     set_aside: int
     unusual: dict[str, list[Any]]
+    protocol: str
     unreadable: list[str]
 
     @property
@@ -129,6 +135,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
 
     Raises:
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
+        plab.selection.SelectionError: If there are runs of several protocols.
         plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
             can be read.
     """
@@ -137,6 +144,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
+    protocol = one_protocol(row.config for row in complete)
     finished, unusual = _prefer_usual(complete)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
@@ -153,6 +161,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
         set_aside=len(complete) - len(finished),
         unusual=unusual,
+        protocol=protocol,
         unreadable=[str(error) for error in unreadable],
     )
 
@@ -212,7 +221,7 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
     for row in found:
         groups[row.values["task"], row.values["method"]].append(row)
     for (task, method), own in groups.items():
-        sections = ("sim", "method")
+        sections = ("protocol", "sim", "method")
         _refuse_differing(f"{task} {method}", [{name: row.config[name] for name in sections} for row in own])
         variants: dict[str, list[Row]] = defaultdict(list)
         for row in own:
@@ -294,16 +303,18 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
         config: The run's configuration.
     """
     by_variant = {f"task.{key}" for key in _changed_by_variant(config)}
-    expected = _expected(config["method"]["name"], config["task"]["name"])
+    expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
     own = {key: (value, _present(config, key)) for key, value in expected.items() if key not in by_variant}
     return {key: mine for key, (value, mine) in own.items() if mine != value}
 
 
 @functools.cache
-def _expected(method: str, task: str) -> dict[str, Any]:
-    """Return what a method and a task have in plab's files, by dotted key, but for what does not matter."""
-    usual = _usual(method) | _usual_rate(method, task)
-    usual |= {f"task.{key}": value for key, value in _usual_task(task).items()}
+def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
+    """Return what a method and a task have in plab's files under a protocol, by dotted key, but for what does
+    not matter."""
+    usual = _usual(method, protocol) | _usual_rate(method, task)
+    exact = usual["protocol.numbers"] == "release"
+    usual |= {f"task.{key}": value for key, value in _usual_task(task, exact).items()}
     return {key: value for key, value in usual.items() if key not in _HARMLESS}
 
 
@@ -314,15 +325,18 @@ def _present(config: Mapping[str, Any], key: str) -> Any:
 
 
 @functools.cache
-def _usual(method: str) -> dict[str, Any]:
-    """Return method and sim as plab's files have them; only sim of a method that plab does not know."""
+def _usual(method: str, protocol: str) -> dict[str, Any]:
+    """Return method, protocol and sim as plab's files have them; all but the method of one that plab does not
+    know, and plab's own protocol for one that it does not know."""
     # Imported here: composing needs Hydra.
     from plab.config import choices, load_config
     from plab.results import config_dict
 
     known = method in choices("method")
-    config = config_dict(load_config([f"method={method}"] if known else []))
-    sections = ("sim", "method") if known else ("sim",)
+    words = [f"method={method}"] if known else []
+    words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
+    config = config_dict(load_config(words))
+    sections = ("protocol", "sim", "method") if known else ("protocol", "sim")
     return dict(_leaves({name: config[name] for name in sections}))
 
 
@@ -332,9 +346,12 @@ def _usual_rate(method: str, task: str) -> dict[str, float]:
     return {"method.lr": rates.get(task, rates["default"])} if rates else {}
 
 
-def _usual_task(task: str) -> dict[str, Any]:
-    """Return the numbers of a task that are no part of bodies, manipulators, target or variants."""
-    return {key: value for key, value in _own_file("task", task).items() if not isinstance(value, dict)}
+def _usual_task(task: str, exact: bool) -> dict[str, Any]:
+    """Return the numbers of a task that are no part of bodies, manipulators, target or variants, the
+    release's if they are to be ``exact``."""
+    own = _own_file("task", task)
+    own = own | own.get("release", {}) if exact else own
+    return {key: value for key, value in own.items() if not isinstance(value, dict)}
 
 
 @functools.cache

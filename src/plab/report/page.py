@@ -173,6 +173,8 @@ def _command(config: Mapping[str, Any]) -> str:
     variant = config["variant"] if drawn is None else f"random seed_scene={drawn}"
     words = [f"task={config['task']['name']}", *f"variant={variant}".split()]
     words += [f"method={config['method']['name']}", f"seed={config['seed']}"]
+    if config["protocol"]["name"] != "plab":
+        words.append(f"protocol={config['protocol']['name']}")
     if config["sim"]["device"] != "cpu":
         words.append(f"sim.device={config['sim']['device']}")
     words += [f"{key}={_word(value)}" for key, value in changed_settings(config).items()]

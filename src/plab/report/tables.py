@@ -292,11 +292,16 @@ def _in_paper(name: str) -> bool:
 
 def settings_note(runs: Runs) -> list[str]:
     """Say how the runs were made where that is not plab's own way."""
+    protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
     if not runs.unusual:
-        return []
+        return protocol
     shown = [f"{key} = {', '.join(map(str, values))}" for key, values in list(runs.unusual.items())[:6]]
     more = len(runs.unusual) - len(shown)
-    return [f"Settings other than plab's own: {'; '.join(shown)}{f'; and {more} more' if more else ''}."]
+    other = "the protocol's own" if protocol else "plab's own"
+    return [
+        *protocol,
+        f"Settings other than {other}: {'; '.join(shown)}{f'; and {more} more' if more else ''}.",
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ solvability

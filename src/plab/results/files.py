@@ -17,7 +17,15 @@ import numpy as np
 import pandas as pd
 
 from plab.results.hdf5 import attributes, columns
-from plab.results.schema import ARCHIVE_SUFFIX, SCHEMA_VERSION, NewerSchemaError, ResultsError, RunResult
+from plab.results.schema import (
+    ARCHIVE_SUFFIX,
+    SCHEMA_VERSION,
+    NewerSchemaError,
+    ResultsError,
+    RunResult,
+    stored_config,
+)
+from plab.selection import lookup
 
 __all__ = [
     "encode",
@@ -93,7 +101,7 @@ def read(path: str | Path) -> RunResult:
         masses = {name: _read_sparse(group) for name, group in file["mass"].items()}
         own, best = attributes(file), attributes(file, "best")
         return RunResult(
-            config=json.loads(own["config"]),
+            config=stored_config(own["config"]),
             config_hash=own["config_hash"],
             status=own["status"],
             message=own["message"],
@@ -127,11 +135,14 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
     path = Path(path)
     with opened(path) as file:
         config = attributes(file, names=("config",))["config"]
-        return json.loads(config), pd.DataFrame(columns(file, "iterations"))
+        return stored_config(config), pd.DataFrame(columns(file, "iterations"))
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
-    """Return the bytes of the HDF5 file, built in memory: then a full disk is a plain OSError, not HDF5's."""
+    """Return the bytes of the HDF5 file, built in memory: then a full disk is a plain OSError, not HDF5's.
+
+    The target is left out if it came from a file of the user's: whose it is and who may have it is not known.
+    """
     options = {"compression": "gzip", "shuffle": True} if compress else {}
     # A name of its own: Ctrl-C inside h5py can leave the previous image open, under its name.
     name = f"image{next(_images)}"
@@ -154,7 +165,10 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
         if result.best_actions is not None:
             best.create_dataset("actions", data=result.best_actions, **options)
         masses = file.create_group("mass")
+        given = isinstance(lookup(result.config, "targets.source"), str)
         for name, mass in result.masses.items():
+            if given and name == "target":
+                continue
             _write_sparse(masses.create_group(name), mass, options)
         if result.resume is not None:
             _write_tree(file.create_group("resume"), result.resume)

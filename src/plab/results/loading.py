@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 import zipfile
@@ -19,7 +18,14 @@ import pandas as pd
 from plab.results.files import explained, opened, opened_image, split_archive
 from plab.results.hdf5 import attributes
 from plab.results.index import Index
-from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, SUFFIX, ResultsError, final_path
+from plab.results.schema import (
+    ARCHIVE_SUFFIX,
+    PARTIAL_SUFFIX,
+    SUFFIX,
+    ResultsError,
+    final_path,
+    stored_config,
+)
 from plab.selection import lookup
 
 __all__ = ["Row", "load", "read_rows", "readable_rows", "rows", "run_files"]
@@ -239,7 +245,7 @@ def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | Result
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, from its attributes alone."""
     own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
-    config, table = json.loads(own["config"]), file["iterations"]
+    config, table = stored_config(own["config"]), file["iterations"]
     evaluation, phases = attributes(file, "evaluation"), attributes(file, "wall_time")
     columns = [str(name) for name in table.attrs["columns"]]
     known = {

@@ -32,6 +32,7 @@ __all__ = [
     "member_name",
     "parse_member",
     "result_path",
+    "stored_config",
 ]
 
 SCHEMA_VERSION = 1
@@ -55,6 +56,12 @@ EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 
 _NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
+
+
+_BEFORE_PROTOCOLS = {
+    "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"}
+}
+"""What the configurations of runs say that are older than protocols."""
 
 
 class ResultsError(RuntimeError):
@@ -114,12 +121,25 @@ def config_dict(cfg: Any) -> dict[str, Any]:
     return json.loads(json.dumps(plain))
 
 
+def stored_config(text: str) -> dict[str, Any]:
+    """Return the configuration that a result file holds as ``text``, with what older ones lack."""
+    return _BEFORE_PROTOCOLS | json.loads(text)
+
+
 def config_hash(cfg: Any) -> str:
     """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
     # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
     plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
+    # The name has no effect, and the contact term acts where the method says so. Runs of plab's own protocol
+    # keep the hashes that they had before there was another.
+    protocol = plain.pop("protocol", {})
+    chosen = {key: protocol[key] for key in protocol if key not in ("name", "contact")}
+    if any(choice != "plab" for choice in chosen.values()):
+        plain["protocol"] = chosen
+    # Always empty.
+    plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 

@@ -124,7 +124,7 @@ def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) 
     """
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
-    parts = [asdict(cfg.task), asdict(cfg.sim), asdict(cfg.targets), loss, kinds]
+    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
 
     def build() -> list[EpisodeBatch]:
         return [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]
@@ -134,7 +134,7 @@ def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) 
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
 
-    return cache.get(json.dumps([*parts, cfg.variant]), build, check=start_again)
+    return cache.get(json.dumps([*sections, loss, kinds, cfg.variant]), build, check=start_again)
 
 
 @contextmanager

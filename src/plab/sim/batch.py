@@ -17,7 +17,7 @@ def require_alike(scenes: Sequence[Scene]) -> None:
     """Raise SceneError if scenes do not fit together in one simulator."""
     first = scenes[0]
     for number, scene in enumerate(scenes[1:], start=1):
-        for name in ("particle_count", "grid_size", "dt", "substeps"):
+        for name in ("particle_count", "grid_size", "dt", "substeps", "numbers", "floor"):
             if getattr(scene, name) != getattr(first, name):
                 raise SceneError(
                     f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
@@ -32,8 +32,9 @@ def require_alike(scenes: Sequence[Scene]) -> None:
 def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
     """Poses in which the scenes' manipulators start, as in :class:`plab.sim.State`, shape [batch,
     manipulator, 8]."""
+    turn = list if scenes[0].numbers == "release" else _unit
     return np.array(
-        [[[*m.position, *_unit(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
+        [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
         dtype=np.float64,
     ).reshape(len(scenes), len(scenes[0].manipulators), 8)
 

@@ -10,7 +10,7 @@ from plab.sim.cpu_material import MaterialTiles
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import advance_pose
-from plab.sim.pose_phases import PosePhases
+from plab.sim.pose_phases import PosePhases, with_unit_rotation
 from plab.sim.storage import BLOCK, CHUNKS, FRAME_ADJOINT, PLACES, SPREAD, STAGE, WORK
 from plab.sim.term_phases import TermPhases
 
@@ -224,6 +224,8 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             entry = (before * self.batch + e) * self.manipulators + m
             for i in ti.static(range(8)):
                 self.pose[e, 0, m][i] = poses[entry * 8 + i]
+            if ti.static(self.rotations_as_given):
+                self.pose[e, 0, m] = with_unit_rotation(self.pose[e, 0, m])
             u = self.substep_motion(e, m, actions, t)
             for s in range(self.substeps):
                 self.pose[e, s + 1, m] = advance_pose(

@@ -26,7 +26,7 @@ from plab.sim.material import (
     yield_factor,
 )
 from plab.sim.motion import advance_pose
-from plab.sim.pose_phases import PosePhases, vec7
+from plab.sim.pose_phases import PosePhases, vec7, with_unit_rotation
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import FRAME_ADJOINT
 from plab.sim.transfer import affine_field, spline, spline_slope
@@ -308,6 +308,8 @@ class CudaPhases(OrderPhases, PosePhases):
         entry = (before * self.batch + e) * self.manipulators + m
         for i in ti.static(range(8)):
             pose[i] = poses[entry * 8 + i]
+        if ti.static(self.rotations_as_given):
+            pose = with_unit_rotation(pose)
         self.pose[e, 0, m] = pose
         u = self.substep_motion(e, m, actions, t)
         for s in range(self.substeps):

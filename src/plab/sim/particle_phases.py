@@ -66,13 +66,14 @@ class ParticlePhases(Storage):
 
     @ti.func
     def stencil(self, x):
-        """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5).
+        """Array index of the base node along each axis, and the offset x / dx - base in [0.5, 1.5), in the
+        lowest half cell of the release's floor in [0, 0.5).
 
         The index is clamped so that not even a NaN leads out of the grid.
         """
         q = x * self.inv_dx
         base = ti.cast(ti.floor(q - 0.5), ti.i32)
-        base = ti.min(ti.max(base, -1), self.n - 4)
+        base = ti.min(ti.max(base, self.lowest_base), self.n - 4)
         return base + 1, q - ti.cast(base, self.real)
 
     # -- transfers ----------------------------------------------------------------------------------

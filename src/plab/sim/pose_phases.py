@@ -10,7 +10,7 @@ from plab.sim.motion import (
 )
 from plab.sim.storage import Storage
 
-__all__ = ["PosePhases", "vec7"]
+__all__ = ["PosePhases", "vec7", "with_unit_rotation"]
 
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
@@ -23,6 +23,19 @@ mat3 = ti.types.matrix(3, 3, ti.f64)
 def quaternion(pose):
     """The rotation of a pose."""
     return vec4(pose[3], pose[4], pose[5], pose[6])
+
+
+@ti.func
+def with_unit_rotation(pose):
+    """A pose, its rotation made a unit quaternion.
+
+    Actions turn it at a constant length, so that their gradient need not know.
+    """
+    q = quaternion(pose)
+    out = pose
+    for i in ti.static(range(4)):
+        out[3 + i] = q[i] / ti.sqrt(q.dot(q))
+    return out
 
 
 class PosePhases(Storage):
@@ -51,6 +64,8 @@ class PosePhases(Storage):
             entry = (slot * self.batch + e) * self.manipulators + m
             for i in ti.static(range(8)):
                 self.pose[e, self.substeps, m][i] = poses[entry * 8 + i]
+            if ti.static(self.rotations_as_given):
+                self.pose[e, self.substeps, m] = with_unit_rotation(self.pose[e, self.substeps, m])
 
     @ti.func
     def set_frame(self, e, s, m: ti.template()):

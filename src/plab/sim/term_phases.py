@@ -5,7 +5,9 @@ The terms themselves are elsewhere (:mod:`plab.losses`): each is an object with 
 compiled into the kernels here.
 
 The mass tensor has a node for each of n^3 grid points; the mass that particles near a lower face spread to
-the layer below the domain counts at the face's node, so that the tensor holds all mass.
+the layer below the domain counts at the face's node, so that the tensor holds all mass. The release's floor
+knows no such layer: there, particles near a lower face have negative weights, and nodes may have negative
+masses.
 """
 
 from collections.abc import Sequence
@@ -149,6 +151,14 @@ class TermPhases(Storage):
     # -- terms of nodes and particles ---------------------------------------------------------------
 
     @ti.func
+    def is_empty(self, mass):
+        """Whether a node holds no mass; not for NaN."""
+        out = mass <= 0.0
+        if ti.static(self.lowest_base == 0):
+            out = mass == 0.0
+        return out
+
+    @ti.func
     def node_measures(self, e, i, mass):
         """What a node adds to the terms of the mass tensor, and its mass; and the loss's slope there.
 
@@ -160,8 +170,7 @@ class TermPhases(Storage):
         values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         slope = 0.0 * mass
         node = i - 1
-        # Written so that NaN is not taken for an empty node.
-        if self.in_tensor(node) and not (mass <= 0.0):
+        if self.in_tensor(node) and not self.is_empty(mass):
             for k, column, term in ti.static(self.node_terms):
                 values[k] = ti.cast(term.measure(e, node, mass), ti.f64)
                 if ti.static(term.weighted):

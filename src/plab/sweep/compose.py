@@ -121,7 +121,8 @@ class _Composer:
 
     def _check(self, cfg: Config) -> str | None:
         """Return what is wrong with scene and target, if anything is."""
-        key = json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.sim), asdict(cfg.targets)])
+        parts = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+        key = json.dumps([cfg.variant, *parts])
         if key not in self._checked:
             try:
                 check_sources(cfg)

@@ -48,7 +48,8 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     """Return what has to be the same in runs that come one after the other or, in one batch, together."""
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
-    kind = [cfg.task.name, cfg.method.family, asdict(cfg.sim), asdict(cfg.targets), loss]
+    shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+    kind = [cfg.task.name, cfg.method.family, *shared, loss]
     if not family(cfg.method.family).batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other.

@@ -125,7 +125,7 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             f"the target reaches outside the domain 0 .. {top:.4g}: it covers {points.min(0).round(3)} to "
             f"{points.max(0).round(3)}"
         )
-    return spread_mass(points, scene.grid_size, scene.particle_mass)
+    return spread_mass(points, scene.grid_size, scene.particle_mass, scene.floor)
 
 
 def build_targets(
