@@ -215,7 +215,7 @@ def test_a_term_of_weight_0_is_not_there() -> None:
 @pytest.mark.parametrize(
     ("overrides", "line"),
     [
-        (["+method.loss_weights.hight=1"], "method.loss_weights.hight: there is no term 'hight'"),
+        (["+method.loss_weights.densty=1"], "method.loss_weights.densty: there is no term 'densty'"),
         (["method.loss_terms.contact=sofd"], "method.loss_weights.contact: there is no term 'sofd'; .*soft"),
         (["+method.loss_terms.points=soft"], "method.loss_terms.points has no weight"),
         (["method.loss_weights={density:0,sdf:0,contact:0}"], "method.loss_weights are all 0"),
