@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,13 @@ from plab.config import ConfigError, build_scene, choices, load_config
 from plab.losses import make_terms
 from plab.objective import spread_mass
 from plab.problem import Problem
+from plab.render.recording import record, result
+from plab.results import check, pack, read, rows
+from plab.runners import run_config
 from plab.scene import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
 from plab.sweep.plan import plan
+from plab.targets import TargetError
 from suite import CENTER, KINDS, scene
 
 FILES = os.environ.get("PLAB_RELEASE_TARGETS")
@@ -296,3 +301,39 @@ def test_loss_and_gradient_of_torus_are_the_releases(
     got = problem.rollout(u, gradient=True)
     assert abs(got.loss.sum() - loss) < 1e-4
     assert abs(np.linalg.norm(got.gradient) - norm) < 1e-6 * max(norm, 100.0)
+
+
+# --------------------------------------------------------------------------------------------------- results
+
+
+def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
+    coarse = [
+        "sim.grid_size=16",
+        "sim.dt=4e-4",
+        "sim.substeps=5",
+        "sim.horizon=2",
+        "sim.particles_scale=0.03",
+    ]
+    folder, results = tmp_path / "files", tmp_path / "results"
+    words = ["task=Torus", "protocol=release", f"targets.source={folder}", f"results_dir={results}", *coarse]
+    cfg = load_config([*words, "method.iterations=1", f"sim.device={device}"])
+    world = build_scene(cfg)
+    folder.mkdir()
+    moved = sample_particles(world)
+    moved[:, 0] += 0.05
+    np.save(folder / "Torus3D-v1.npy", spread_mass(moved, 16, world.particle_mass, "release"))
+    run_config(cfg)
+    archive = tmp_path / "a.plab.zip"
+    pack(results, archive, keep_masses=True)
+    for row in (*rows(results)[0], *rows(archive)[0]):
+        run = read(row.path)
+        assert run.config["protocol"]["name"] == "release"
+        assert run.masses.keys() == {"initial", "final"}
+    assert [problem for _, problem in check(results)] == [None]
+    path = rows(results)[0][0].path
+    again = record(*result(path))
+    assert abs(again.score - read(path).evaluation["score"]) < 1e-6
+    assert np.array_equal(again.target_mass, np.load(folder / "Torus3D-v1.npy"))
+    folder.rename(tmp_path / "elsewhere")
+    with pytest.raises(TargetError, match=r"targets.source: there is no folder"):
+        record(*result(path))
