@@ -37,11 +37,17 @@ class TermPhases(Storage):
     Attributes:
         shares: Parts of the particles that distances are tallied in before they are joined.
         terms: The terms, in the order of their measures.
+        node_terms: Those of the mass tensor: number among these, column among the measures, term.
+        particle_terms: Those of the particles, likewise.
+        distance_terms: Those of the distances.
         references: Numbers per node of the targets that terms have asked for, by name.
     """
 
     shares: int
     terms: tuple[Any, ...] = ()
+    node_terms: tuple[tuple[int, int, Any], ...] = ()
+    particle_terms: tuple[tuple[int, int, Any], ...] = ()
+    distance_terms: tuple[tuple[int, int, Any], ...] = ()
 
     def attach(self, terms: Sequence[Any]) -> None:
         """Take over the terms, before the first kernel is compiled.
