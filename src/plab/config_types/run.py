@@ -55,6 +55,10 @@ class SimConfig:
         positive(f"{path}.particles_scale", self.particles_scale)
 
 
+SCORES = ("best", "last")
+"""What a run's score is of: ``protocol.score``."""
+
+
 @dataclass
 class ProtocolConfig:
     """What is done as the PlasticineLab release does it, where that is not what the paper says.
@@ -64,6 +68,8 @@ class ProtocolConfig:
         start: Whose generator draws the particles' positions, ``plab`` or ``release``.
         numbers: Whose digits the task's numbers have, likewise; the release's are in ``task.release``.
         floor: Whose stencil particles at the lower faces have, likewise.
+        score: What a run's score is of, ``best`` or ``last``; changes what is read from a result, nothing in
+            it. See :attr:`plab.results.RunResult.score`.
         contact: Which term ``method.loss_terms.contact`` is, unless that says so itself.
     """
 
@@ -71,6 +77,7 @@ class ProtocolConfig:
     start: str
     numbers: str
     floor: str
+    score: str
     contact: str
 
     def check(self, path: str) -> None:
@@ -78,6 +85,7 @@ class ProtocolConfig:
         folder_name(f"{path}.name", self.name)
         for part in ("start", "numbers", "floor"):
             one_of(f"{path}.{part}", getattr(self, part), CHOICES)
+        one_of(f"{path}.score", self.score, SCORES)
         check_terms({"contact": 1.0}, {"contact": self.contact})
 
 

@@ -176,9 +176,9 @@ def contact_models(runs: Runs, series: Series) -> Drawing | None:
         if len(best):
             before = min(max(float(best.iloc[0]), 0.0), 1.0)
             panel.plot(
-                before, row["score"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
+                before, row["score_best"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
             )
-            gaps[row["method"]].append(row["score"] - before)
+            gaps[row["method"]].append(row["score_best"] - before)
     panel.set_xlim(-0.02, 1.02)
     panel.set_ylim(-0.02, 1.02)
     panel.set_xlabel("score of the best row, in its own contact model")

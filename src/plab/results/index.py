@@ -22,7 +22,7 @@ from plab.results.schema import SCHEMA_VERSION, ResultsError
 
 __all__ = ["Index"]
 
-_FORMAT = f"plab-index 4.{SCHEMA_VERSION}"
+_FORMAT = f"plab-index 5.{SCHEMA_VERSION}"
 """To be raised when rows hold other columns."""
 
 _SETTLED = 2.0

@@ -103,7 +103,8 @@ def load(
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
         best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
         of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
-        ``score``, ``iou`` and ``loss`` are the final evaluation's, NaN before it.
+        ``score_best``, ``iou`` and ``loss`` are the final evaluation's, NaN before it; ``score`` is the same,
+        or that of the last iteration with ``protocol.score=last``.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
@@ -243,7 +244,7 @@ def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | Result
 
 
 def _row(file: h5py.File, path: Path) -> Row:
-    """Return the row of an open file, from its attributes alone."""
+    """Return the row of an open file, from its attributes; of its arrays it reads the last score alone."""
     own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
     config, table = stored_config(own["config"]), file["iterations"]
     evaluation, phases = attributes(file, "evaluation"), attributes(file, "wall_time")
@@ -264,4 +265,7 @@ def _row(file: h5py.File, path: Path) -> Row:
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
+    values["score_best"] = values["score"]
+    if evaluation and config["protocol"]["score"] == "last":
+        values["score"] = float(np.clip(table["score"][-1], 0.0, 1.0))
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

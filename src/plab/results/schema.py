@@ -114,6 +114,17 @@ class RunResult:
     resume: dict[str, Any] | None = None
     path: Path | None = None
 
+    @property
+    def score(self) -> float:
+        """Score of a finished run in [0, 1], as its protocol counts it.
+
+        With ``protocol.score=best`` that of the final evaluation; with ``last`` that of the last iteration,
+        in the contact model of the iterations, as the PlasticineLab release logs it.
+        """
+        if self.config["protocol"]["score"] == "last":
+            return float(np.clip(self.iterations["score"].iloc[-1], 0.0, 1.0))
+        return self.evaluation["score"]
+
 
 def config_dict(cfg: Any) -> dict[str, Any]:
     """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists."""
@@ -123,7 +134,10 @@ def config_dict(cfg: Any) -> dict[str, Any]:
 
 def stored_config(text: str) -> dict[str, Any]:
     """Return the configuration that a result file holds as ``text``, with what older ones lack."""
-    return _BEFORE_PROTOCOLS | json.loads(text)
+    config = _BEFORE_PROTOCOLS | json.loads(text)
+    usual = "last" if config["protocol"]["name"] == "release" else "best"
+    config["protocol"] = {"score": usual} | config["protocol"]
+    return config
 
 
 def config_hash(cfg: Any) -> str:
@@ -132,10 +146,10 @@ def config_hash(cfg: Any) -> str:
     # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
     plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
-    # The name has no effect, and the contact term acts where the method says so. Runs of plab's own protocol
-    # keep the hashes that they had before there was another.
+    # Name and score change nothing in a result, and the contact term acts where the method says so. Runs of
+    # plab's own protocol keep the hashes that they had before there was another.
     protocol = plain.pop("protocol", {})
-    chosen = {key: protocol[key] for key in protocol if key not in ("name", "contact")}
+    chosen = {key: protocol[key] for key in protocol if key not in ("name", "score", "contact")}
     if any(choice != "plab" for choice in chosen.values()):
         plain["protocol"] = chosen
     # Always empty.

@@ -34,7 +34,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
         cache: Simulators of earlier runs, for whoever runs several; None: a new one.
 
     Returns:
-        Score of the final evaluation, in [0, 1].
+        The run's score in [0, 1], as its protocol counts it.
 
     Raises:
         ResultsError: If the results folder cannot be written, or another process computes the run.
@@ -46,7 +46,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
         _carry_out([job], "", cache or SimulatorCache())
     if job.error is not None:
         raise job.error
-    score = job.run.result.evaluation["score"]
+    score = job.run.result.score
     print(f"{'finished before' if before else 'finished'}: score {score:.4f}, {job.run.path}")
     return score
 
@@ -86,7 +86,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
 def _outcome(job: Job, how: str) -> Outcome:
     if job.error is None:
-        return outcome(job.cfg, how, job.run.result.evaluation["score"])
+        return outcome(job.cfg, how, job.run.result.score)
     refused = isinstance(job.error, USER_ERRORS)
     what = str(job.error) if refused or isinstance(job.error, RunError) else describe(job.error)
     return outcome(job.cfg, "refused" if refused else "failed", message=what)

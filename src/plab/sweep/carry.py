@@ -114,4 +114,4 @@ def _finished_before(cfg: Config) -> Outcome | None:
         return None
     if result.status != "finished":
         return None
-    return outcome(cfg, "before", result.evaluation["score"])
+    return outcome(cfg, "before", result.score)
