@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,12 +12,14 @@ import pytest
 import torch
 
 import reference_mpm as reference
+import synthetic
 from plab.config import ConfigError, build_scene, choices, load_config
 from plab.losses import make_terms
 from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.render.recording import record, result
-from plab.results import check, pack, read, rows
+from plab.results import check, config_hash, load, pack, read, rows
+from plab.results.schema import stored_config
 from plab.runners import run_config
 from plab.scene import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
@@ -231,6 +234,23 @@ def test_parts_can_be_set_alone(part: str) -> None:
     world = build_scene(cfg)
     assert (world.start, world.floor) == (cfg.protocol.start, cfg.protocol.floor)
     assert world.yield_stress == (50.0 if part == "numbers" else 200.0)
+
+
+def test_the_score_is_of_the_best_iteration_or_of_the_last(tmp_path: Path) -> None:
+    best, last = synthetic.run(tmp_path / "best"), synthetic.run(tmp_path / "last")
+    last.config["protocol"]["score"] = "last"
+    assert config_hash(best.config) == config_hash(last.config)
+    want = {"best": best.evaluation["score"], "last": last.iterations["score"].iloc[-1]}
+    assert want["best"] != want["last"]
+    for name, run in (("best", best), ("last", last)):
+        assert run.score == want[name]
+        (row,) = load(synthetic.save(run)).to_dict("records")
+        assert (row["score"], row["score_best"]) == (want[name], want["best"])
+
+
+def test_results_without_the_score_are_their_protocols() -> None:
+    for name, score in (("plab", "best"), ("release", "last")):
+        assert stored_config(json.dumps({"protocol": {"name": name}}))["protocol"]["score"] == score
 
 
 def test_numbers_have_all_digits() -> None:

@@ -168,3 +168,18 @@ def test_commands_start_without_torch_and_taichi() -> None:
     slow = "{'torch', 'taichi', 'scipy', 'hydra'} & {*sys.modules}"
     code = f"import sys, plab.results.__main__, plab.status; assert not {slow}, {slow}"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_iterations_can_be_rounded(folder: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "all.plab.zip"
+    assert main(["pack", str(folder), "--digits", "3", "--output", str(archive)]) == 0
+    loose, packed = load(folder).query("status == 'finished'"), load(archive)
+    for a, b in zip(loose["path"], packed["path"], strict=True):
+        one, other = read(a), read(b)
+        changed = one.iterations != other.iterations
+        assert changed["loss"].any() and not changed["iteration"].any()
+        pd.testing.assert_frame_equal(one.iterations, other.iterations, rtol=0.5e-2)
+        assert other.best_loss == other.iterations["loss"].min()
+        assert np.array_equal(one.best_actions, other.best_actions)
+        assert one.evaluation == other.evaluation
+    assert main(["check", str(archive)]) == 0

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from plab.arguments import positive
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.loading import Row
@@ -67,6 +68,8 @@ def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("words", nargs="*", help=what)
     parser.add_argument("--output", type=Path, required=True, help="archive to write, <name>.plab.zip")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
+    what = "significant digits that the iterations keep, >= 1 (default: all); 4 halve an archive"
+    parser.add_argument("--digits", type=positive, help=what)
     parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
     parser.set_defaults(run=_pack)
     return parser
@@ -104,6 +107,7 @@ def _pack(options: argparse.Namespace) -> int:
         wanted=_wanted(chosen),
         keep_masses=options.masses,
         keep_resume=options.resume,
+        digits=options.digits,
     )
     for error in done.unreadable:
         print(f"plab: left out: {error}", file=sys.stderr)

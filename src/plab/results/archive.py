@@ -8,14 +8,17 @@ with the bytes of equal significance together) and once outside (names, configur
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from plab.results.files import encode, read, replace_file
 from plab.results.loading import Row, readable_rows, rows
-from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, member_name
+from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult, member_name
 
 __all__ = ["Packed", "pack", "unpack"]
 
@@ -47,12 +50,13 @@ def pack(
     wanted: Callable[[Row], bool] | None = None,
     keep_masses: bool = False,
     keep_resume: bool = False,
+    digits: int | None = None,
 ) -> Packed:
     """Write runs into an archive, in one atomic step.
 
     Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
-    where the archive itself lies there. Numbers keep all their digits; only ``results_dir`` is no longer the
-    folder that the run was computed in.
+    where the archive itself lies there. Numbers keep all their digits, unless ``digits`` says otherwise; only
+    ``results_dir`` is no longer the folder that the run was computed in.
 
     Args:
         source: Folder of results, archive, result file, or several of them.
@@ -60,6 +64,8 @@ def pack(
         wanted: Says which runs to take; all finished ones by default.
         keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
         keep_resume: Keep the state from which unfinished runs go on.
+        digits: Significant decimal digits that the iterations keep at least, >= 1; None: all. Four halve an
+            archive. Actions and the final evaluation always keep all.
 
     Raises:
         ResultsError: If there is nothing to pack, ``source`` is files or archives, none of which can be read,
@@ -74,6 +80,8 @@ def pack(
     with zipfile.ZipFile(content, "w") as members:
         for name, row in sorted(chosen.items()):
             run = read(row.path)
+            if digits is not None:
+                run = _rounded(run, digits)
             run = replace(
                 run,
                 # A path of the computer that made it means nothing elsewhere.
@@ -88,6 +96,19 @@ def pack(
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     replace_file(archive, content.getvalue(), sync=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
+
+
+def _rounded(run: RunResult, digits: int) -> RunResult:
+    """Round a run's iterations, and the lowest loss with them."""
+    # An error of at most half of the last digit of 1.00...: 2^-bits <= 0.5 * 10^(1 - digits).
+    bits = math.ceil(1.0 + (digits - 1) * math.log2(10.0))
+
+    def nearest(values: np.ndarray) -> np.ndarray:
+        mantissa, exponent = np.frexp(values)
+        return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits)
+
+    measured = run.iterations.select_dtypes("floating").apply(nearest)
+    return replace(run, iterations=run.iterations.assign(**measured), best_loss=float(nearest(run.best_loss)))
 
 
 def _members(wanted: Iterable[Row]) -> dict[str, Row]:

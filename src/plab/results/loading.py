@@ -267,5 +267,5 @@ def _row(file: h5py.File, path: Path) -> Row:
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and config["protocol"]["score"] == "last":
-        values["score"] = float(np.clip(table["score"][-1], 0.0, 1.0))
+        values["score"] = float(table["score"][-1])
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -122,7 +122,7 @@ class RunResult:
         in the contact model of the iterations, as the PlasticineLab release logs it.
         """
         if self.config["protocol"]["score"] == "last":
-            return float(np.clip(self.iterations["score"].iloc[-1], 0.0, 1.0))
+            return float(self.iterations["score"].iloc[-1])
         return self.evaluation["score"]
 
 
