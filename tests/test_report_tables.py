@@ -17,8 +17,9 @@ from scipy import stats
 
 import synthetic
 from plab.config import load_config
-from plab.examples import example_archive, resolve
+from plab.examples import EXAMPLES, example_archive, resolve
 from plab.report.__main__ import main, write_tables
+from plab.report.agreement import agreement
 from plab.report.collect import NAMES, MixedRunsError, collect
 from plab.report.hyperparameters import hyperparameters
 from plab.report.reference import paper_table
@@ -315,13 +316,39 @@ def test_times_say_how_many_runs_shared_a_simulator(tmp_path: Path) -> None:
     assert cells["measured by"].to_list() == ["runs, cpu, 45 runs at once"]
 
 
-def test_example_stands_for_the_archive_that_comes_with_plab(tmp_path: Path, capsys) -> None:
-    assert main(["tables", "--results", "example", "--out", str(tmp_path)]) == 0
-    count = len(load(example_archive()))
-    assert f"15 tables of {count} out of" in capsys.readouterr().out
-    assert "--results example" in (tmp_path / "ours" / "iou_per_task.md").read_text(encoding="utf-8")
-    assert resolve("./example") == Path("example")
-    assert all(problem is None for _, problem in check(example_archive()))
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
+    assert main(["tables", "--results", name, "--out", str(tmp_path)]) == 0
+    count = len(load(example_archive(name)))
+    assert f"16 tables of {count} out of" in capsys.readouterr().out
+    assert f"--results {name}" in (tmp_path / "ours" / "iou_per_task.md").read_text(encoding="utf-8")
+    assert resolve(f"./{name}") == Path(name)
+    assert all(problem is None for _, problem in check(example_archive(name)))
+
+
+@pytest.mark.parametrize(
+    ("name", "correlation", "share"), [("release", "0.94", "90 %"), ("targets", "0.47", "46 %")]
+)
+def test_agreement_of_the_runs_that_come_with_plab(name: str, correlation: str, share: str) -> None:
+    """What README and docs/reproduction.md say."""
+    (table,) = agreement(collect(example_archive(name), select([], NAMES)))
+    whole = table.cells.set_index("method").loc["all"]
+    assert (whole["cells"], whole["correlation"], whole["agree"]) == ("150", correlation, share)
+
+
+def test_agreement_is_within_two_deviations_or_a_tenth(tmp_path: Path) -> None:
+    # The paper: 0.97 +- 0.01, 0.67 +- 0.03, 0.92 +- 0.02 for Adam; 0.04 +- 0.08 for GD.
+    scores = {("1", "adam"): 0.88, ("2", "adam"): 0.56, ("5", "adam"): 0.92, ("1", "gd"): 0.19}
+    for (variant, name), score in scores.items():
+        synthetic.save(synthetic.run(tmp_path, task="Move", variant=variant, method=name, score=score))
+    (table,) = agreement(gather(tmp_path))
+    data = table.data.set_index("method")
+    assert data["cells"].to_dict() == {"Adam": 3, "GD": 1, "all": 4}
+    assert data["agree"].to_dict() == {"Adam": pytest.approx(2 / 3), "GD": 1.0, "all": 0.75}
+    assert data.loc["Adam", "distance"] == pytest.approx((0.09 + 0.11 + 0.0) / 3)
+    assert data.loc["GD", "difference"] == pytest.approx(0.15) and np.isnan(data.loc["GD", "correlation"])
+    ours, papers = [0.88, 0.56, 0.92, 0.19], [0.97, 0.67, 0.92, 0.04]
+    assert data.loc["all", "correlation"] == pytest.approx(np.corrcoef(ours, papers)[0, 1])
 
 
 def test_benchmark_stands_beside_the_runs(folder: Path, tmp_path: Path, capsys) -> None:

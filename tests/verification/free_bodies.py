@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from plab.losses import make_terms
 from plab.scene import Body, Scene
 from plab.sim import Simulator, Skips, State
 from suite import DEVICE
@@ -110,7 +111,14 @@ def build() -> Simulator:
     """The simulator of all environments, float64; on CUDA :func:`kirchhoff_stress` needs all adjoints."""
     skips = Skips(adjoints=DEVICE == "cpu")
     scenes = list(SCENES.values())
-    return Simulator(scenes, precision="float64", device=DEVICE, particles=list(START), skips=skips)
+    settings = {"precision": "float64", "device": DEVICE, "particles": list(START), "skips": skips}
+    if DEVICE == "cpu":
+        return Simulator(scenes, **settings)
+    # The backward pass keeps the stress: there has to be something to differentiate.
+    sim = Simulator(scenes, terms=make_terms({"density": 1.0}), **settings)
+    empty = np.zeros((sim.batch, GRID, GRID, GRID))
+    sim.set_target(empty, empty)
+    return sim
 
 
 def at_rest() -> dict[str, np.ndarray]:

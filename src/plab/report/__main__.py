@@ -20,9 +20,10 @@ import pandas as pd
 
 import plab
 from plab.arguments import told
-from plab.examples import resolve
+from plab.examples import EXAMPLES, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
+from plab.report.agreement import agreement
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
 from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
@@ -128,7 +129,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("what", choices=list(_MAKERS), help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
-    what = "folder of results, archive, or several; 'example' is one of real runs (default: results)"
+    what = f"folder of results, archive, or several; {', '.join(EXAMPLES)}: real runs (default: results)"
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
     parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
@@ -161,6 +162,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     groups = (
         iou_per_task(runs),
         iou_per_configuration(runs),
+        agreement(runs),
         timing(runs, benchmark),
         solvability(runs),
         hyperparameters(),
@@ -193,7 +195,14 @@ def write_curves(
     """
     # Imported here: tables and the page need neither Matplotlib nor SciPy's statistics.
     from plab.report.costs import work_precision
-    from plab.report.curves import aggregates, rewards, rl_scores, score_curves, yield_ablation
+    from plab.report.curves import (
+        aggregates,
+        agreement_plot,
+        rewards,
+        rl_scores,
+        score_curves,
+        yield_ablation,
+    )
     from plab.report.figures import save, style
 
     drawings: list[Drawing] = []
@@ -204,6 +213,7 @@ def write_curves(
                 *rewards(runs, series),
                 *score_curves(runs, series),
                 *rl_scores(runs),
+                *agreement_plot(runs),
                 *aggregates(runs),
             ]
         if ablation is not None:

@@ -15,14 +15,16 @@ from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.collect import Runs
-from plab.report.figures import Drawing, draw_band, grid, legend, log_axis
+from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
 from plab.report.methods import RL, method
 from plab.report.series import band
 from plab.report.statistics import CONFIDENCE
+from plab.report.table import number
 from plab.report.tables import ordered_tasks, settings_note
 
-__all__ = ["Series", "aggregates", "rewards", "rl_scores", "score_curves", "yield_ablation"]
+__all__ = ["Series", "aggregates", "agreement_plot", "rewards", "rl_scores", "score_curves", "yield_ablation"]
 
 Tables = Mapping[str, list[pd.DataFrame]]
 """Rows of runs by method."""
@@ -194,6 +196,49 @@ def rl_scores(runs: Runs) -> list[Drawing]:
 
 
 # --------------------------------------------------------------------------------------------------- ablation
+
+
+def agreement_plot(runs: Runs) -> list[Drawing]:
+    """Draw our mean score of each configuration against the paper's; nothing where no cell is in both."""
+    cells = compared_cells(runs)
+    if cells.empty:
+        return []
+    figure, axes = grid(1, 1, width=3.4, height=3.3)
+    panel = axes[0, 0]
+    panel.fill_between(
+        [0, 1],
+        [-TOLERANCE, 1 - TOLERANCE],
+        [TOLERANCE, 1 + TOLERANCE],
+        color="#EDEDED",
+        zorder=0,
+        linewidth=0,
+    )
+    panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8, zorder=1)
+    names = [name for name in runs.methods if name in set(cells["method"])]
+    for name in names:
+        own = cells[cells["method"] == name]
+        panel.plot(
+            own["paper"],
+            own["ours"],
+            "o",
+            color=method(name).colour,
+            markersize=3.2,
+            alpha=0.75,
+            clip_on=False,
+        )
+    panel.set_xlim(0.0, 1.0)
+    panel.set_ylim(0.0, 1.0)
+    panel.set_aspect("equal")
+    panel.set_xlabel("score in the paper")
+    panel.set_ylabel("score here")
+    legend_of_methods(figure, names)
+    whole = in_all(cells)
+    panel.set_title(
+        f"{len(cells)} configurations, r = {number(whole['correlation'])}, "
+        f"{number(100.0 * whole['agree'], 0)} % agree"
+    )
+    notes = [f"Mean score of each configuration. Grey: within {TOLERANCE:g}. Agree: {AGREES}."]
+    return [Drawing("agreement", figure, notes)]
 
 
 def yield_ablation(groups: Mapping[float, Sequence[pd.DataFrame]], what: str, name: str) -> list[Drawing]:

@@ -8,16 +8,13 @@ from typing import Any
 
 import pandas as pd
 
+from plab.report.agreement import TOLERANCE
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, grid, legend_of_methods
 from plab.report.methods import method
 from plab.report.tables import iou_per_configuration, iou_per_task, ordered_tasks
 
-__all__ = ["RULE", "TOLERANCE", "VERDICTS", "differences", "verdict", "verdict_grid", "verdicts"]
-
-TOLERANCE = 0.1
-"""Differences of scores up to this count as none: about what the paper's own runs of one configuration differ
-by (its standard deviations are 0.09 in the mean)."""
+__all__ = ["RULE", "VERDICTS", "differences", "verdict", "verdict_grid", "verdicts"]
 
 VERDICTS = {
     "same": f"the whole interval lies within ±{TOLERANCE:g}",

@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -103,7 +104,7 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
     # An error of at most half of the last digit of 1.00...: 2^-bits <= 0.5 * 10^(1 - digits).
     bits = math.ceil(1.0 + (digits - 1) * math.log2(10.0))
 
-    def nearest(values: np.ndarray) -> np.ndarray:
+    def nearest(values: Any) -> Any:
         mantissa, exponent = np.frexp(values)
         return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits)
 
