@@ -10,8 +10,8 @@ from pathlib import Path
 __all__ = ["EXAMPLES", "example_archive", "resolve"]
 
 EXAMPLES = ("example", "release", "targets")
-"""Words that stand for an archive of this folder where a folder of results is asked for: of plab's own suite, of
-the paper's benchmark on the release's terms, and of plab's terms on the release's targets."""
+"""Words that stand for an archive of this folder where a folder of results is asked for: of plab's own suite,
+of the paper's benchmark on the release's terms, and of plab's terms on the release's targets."""
 
 
 def example_archive(name: str = EXAMPLES[0]) -> Path:

@@ -1,4 +1,4 @@
-"""How well our runs agree with the paper's table as a whole: every configuration that both have, a cell each."""
+"""How well our runs agree with the paper's table as a whole: a cell for each configuration that both have."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
     """Return the cells that both have, a row per task, variant and method.
 
     Returns:
-        Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours minus
-        the paper's) and agrees (whether that is within two standard deviations or the tolerance).
+        Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
+        minus the paper's) and agrees (whether that is within two standard deviations or the tolerance).
     """
     (table,) = (table for table in iou_per_configuration(runs) if table.form == "comparison")
     data = table.data[(table.data["runs"] > 0) & table.data["paper_mean"].notna()]

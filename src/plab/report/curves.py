@@ -166,13 +166,13 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     panel = axes[0, 0]
     width = 0.8 / max(len(methods), 1)
     table = runs.table
-    for number, name in enumerate(methods):
+    for rank, name in enumerate(methods):
         look = method(name)
         for position, task in enumerate(tasks):
             scores = table[(table["task"] == task) & (table["method"] == name)]["score"].to_numpy(float)
             if not len(scores):
                 continue
-            x = position + (number - (len(methods) - 1) / 2) * width
+            x = position + (rank - (len(methods) - 1) / 2) * width
             panel.bar(x, scores.mean(), width * 0.9, color=look.colour, alpha=0.45, label=look.label)
             spread = np.linspace(-0.3, 0.3, len(scores)) * width
             panel.scatter(x + spread, np.sort(scores), s=5, color=look.colour, linewidths=0, zorder=3)
