@@ -323,7 +323,8 @@ class TermPhases(Storage):
             peak = ti.max(part[last], share[last])
             part += share
             part[last] = peak
-            sums += self.particle_part[e, c]
+            if ti.static(len(self.particle_terms) > 0):
+                sums += self.particle_part[e, c]
         for k, column, term in ti.static(self.node_terms):
             terms[at + column] = term.empty(e) + part[k]
         for k, column, _term in ti.static(self.particle_terms):
