@@ -84,5 +84,6 @@ def test_targets_are_those_that_were_published(task, device):
     assert list(table["variant"]) == list(expected["variant"])
     np.testing.assert_allclose(table["mass"], expected["mass"], rtol=1e-5)
     np.testing.assert_allclose(table["peak"], expected["peak"], rtol=0.02)
-    columns = ["x", "y", "z", "std_x", "std_y", "std_z"]
+    columns = ["x", "y", "z", "std_x", "std_y", "std_z", "distance"]
     np.testing.assert_allclose(table[columns], expected[columns], atol=2e-4)
+    np.testing.assert_allclose(table["moved"], expected["moved"], atol=2e-3)

@@ -340,6 +340,23 @@ def test_a_problem_takes_its_targets_from_the_folder(tmp_path, device):
     assert np.array_equal(problem.target_mass[0], mass)
 
 
+def test_a_folder_of_release_files_is_described_as_the_suite_is(tmp_path, device):
+    """Shifted by a few nodes and of other mass than the scene: neither changes what has to move."""
+    overrides = ("task=Move", *COARSE, f"sim.device={device}")
+    for variant in SUITE_VARIANTS:
+        scene = load(*overrides, f"variant={variant}")[0]
+        start = spread_mass(sample_particles(scene), scene.grid_size, scene.particle_mass)
+        # As many particle masses as the files of the release hold, however few the scene has.
+        scale = 10000 * scene.particle_mass / start.sum()
+        np.save(tmp_path / f"Move3D-v{variant}.npy", scale * np.roll(start, 2, axis=0))
+    shifted = command.moments("Move", [*overrides[1:], f"targets.source={tmp_path}"])
+    np.testing.assert_allclose(shifted["mass"], 10000, rtol=1e-6)
+    assert shifted["moved"].between(0.2, 0.5).all()
+    assert shifted["distance"].between(0.003, 0.02).all()
+    own = command.moments("Move", overrides[1:])
+    assert (own["moved"] > 0.9).all() and (own["distance"] > 0.1).all()
+
+
 def test_a_folder_of_release_files_has_none_for_random_variants(tmp_path):
     with pytest.raises(ConfigError, match="no files for variant=random"):
         load_config(["variant=random", f"targets.source={tmp_path}"])

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from plab.config import Config
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem", "build_scenes", "build_simulator"]
+__all__ = ["Episodes", "Problem", "build_scenes", "build_simulator", "make_targets"]
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Problem:
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])
         self.labels = {f"loss_{term.name}": f"{term.label} [{term.unit}]" for term in self.simulator.terms}
-        self.target_mass = _targets([cfgs[first[kind]] for kind in kinds], self.scenes, self.simulator)
+        self.target_mass = make_targets([cfgs[first[kind]] for kind in kinds], self.simulator)
         # Distances to equal targets are equal.
         distances = {kind: _distance(self.target_mass[k]) for kind, k in first.items()}
         self.simulator.set_target(self.target_mass, np.stack([distances[kind] for kind in kinds]))
@@ -196,16 +196,25 @@ def _distance(mass: np.ndarray) -> np.ndarray:
         raise TargetError(f"{error}: raise sim.particles_scale or lower sim.grid_size") from None
 
 
-def _targets(cfgs: Sequence[Config], scenes: Sequence[Scene], simulator: Simulator) -> np.ndarray:
-    """Return the mass tensors of the targets, shape [batch, n, n, n], built or from the release's files.
+def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool = False) -> np.ndarray:
+    """Build the targets of some configurations, or load them from the release's files.
 
-    Equal scenes are one object, as are their configurations.
+    Args:
+        cfgs: One configuration per environment, one object where they are alike.
+        simulator: Simulator of their scenes.
+        rebuild: Simulate even what is cached.
+
+    Returns:
+        Mass tensors, shape [batch, n, n, n].
+
+    Raises:
+        plab.targets.TargetError: If a target cannot be built or loaded.
     """
     source = cfgs[0].targets.source
     if source is None:
         targets = {id(cfg): variant_task(cfg).target for cfg in cfgs}
-        return build_targets(simulator, [targets[id(cfg)] for cfg in cfgs])
-    pairs = zip(scenes, cfgs, strict=True)
+        return build_targets(simulator, [targets[id(cfg)] for cfg in cfgs], rebuild=rebuild)
+    pairs = zip(simulator.scenes, cfgs, strict=True)
     return np.stack([load_release_target(source, scene, cfg.variant) for scene, cfg in pairs])
 
 

@@ -5,7 +5,8 @@ python -m plab.targets --task Torus,Rope     only these
 python -m plab.targets --rebuild             simulate even what is cached
 python -m plab.targets --csv moments.csv     write what is printed to a file, too
 
-More overrides of the configuration, such as sim.device=cuda, may follow.
+More overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it describes the
+targets of the original release.
 """
 
 from __future__ import annotations
@@ -18,16 +19,18 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
 from plab.arguments import refuse_task, to_write
 from plab.cache import cache_dir
 from plab.command import answered
-from plab.config import build_scene, load_config, variant_task
+from plab.config import build_scene, load_config
+from plab.objective import target_sdf
+from plab.problem import make_targets
 from plab.sim import Simulator
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
-from plab.targets import build_targets
+
+SMOOTHING = 1 / 32
+"""Standard deviation of the Gaussian that hides where single particles were drawn [domain units]."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
-    _show(table)
+    print(table.to_string(index=False, float_format="{:.4g}".format))
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if args.csv is not None:
         _write(table, args.csv)
@@ -55,18 +58,23 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
 
     Returns:
         A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and
-        standard deviation along x, y, z [domain units], seconds that building took on average.
+        standard deviation along x, y, z [domain units], share of the mass that has to move from the start,
+        mean distance of the start's mass from the target [domain units], seconds that building took on
+        average.
     """
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
     sim = cfgs[0].sim
     scenes = [build_scene(cfg) for cfg in cfgs]
     start = time.perf_counter()
     simulator = Simulator(scenes, precision=sim.precision, device=sim.device)
-    masses = build_targets(simulator, [variant_task(cfg).target for cfg in cfgs], rebuild=rebuild)
+    masses = make_targets(cfgs, simulator, rebuild=rebuild)
     seconds = (time.perf_counter() - start) / len(cfgs)
+    starts = simulator.mass_tensor()
     rows = [
-        {"task": task, "variant": variant, **_moments(mass / scene.particle_mass), "seconds": seconds}
-        for variant, mass, scene in zip(SUITE_VARIANTS, masses, scenes, strict=True)
+        {"task": task, "variant": variant}
+        | _moments(mass / scene.particle_mass)
+        | {"moved": _moved(first, mass), "distance": _distance(first, mass), "seconds": seconds}
+        for variant, mass, first, scene in zip(SUITE_VARIANTS, masses, starts, scenes, strict=True)
     ]
     return pd.DataFrame(rows)
 
@@ -81,13 +89,18 @@ def _moments(mass: np.ndarray) -> dict[str, float]:
     return {"mass": float(mass.sum()), "peak": float(mass.max())} | {k: float(v) for k, v in named}
 
 
-def _show(table: pd.DataFrame) -> None:
-    printed = Table(title="Targets")
-    for name in table.columns:
-        printed.add_column(name)
-    for row in table.to_numpy():
-        printed.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row))
-    Console().print(printed)
+def _moved(start: np.ndarray, mass: np.ndarray) -> float:
+    """Share of the mass that has to move, of a target of any mass; both [n, n, n], smoothed."""
+    # Imported here: SciPy's start-up would be paid by every `--help`.
+    from scipy.ndimage import gaussian_filter
+
+    change = mass / mass.sum() - start / start.sum()
+    return 0.5 * float(np.abs(gaussian_filter(change, SMOOTHING * len(mass), mode="constant")).sum())
+
+
+def _distance(start: np.ndarray, mass: np.ndarray) -> float:
+    """Mean distance of the start's mass from the target [domain units]; both [n, n, n]."""
+    return float((start / start.sum() * target_sdf(mass)).sum())
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:

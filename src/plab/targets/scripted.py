@@ -76,6 +76,10 @@ class Track:
         """Stay where it is until so many steps are over."""
         self._actions += [np.zeros_like(self._scale)] * (until - len(self))
 
+    def delay(self) -> None:
+        """Put the whole way off, so that it ends with the episode."""
+        self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
+
     def actions(self) -> np.ndarray:
         """Return the actions of a whole episode, shape [EPISODE_STEPS, A].
 
@@ -186,14 +190,18 @@ class DrawTarget(Script):
 
 @dataclass
 class DentTarget(Script):
-    """A sphere pushes dents into the first body, each towards its centre from a random direction.
+    """A sphere pushes dents into the first body, each towards its centre.
 
     Attributes:
         dents: Range of their number, both ends included.
+        elevation: Range of the angle above the horizontal that they come from [rad].
+        azimuth: Range of the angle about the vertical that they come from, from x towards z [rad].
         depth: Range of a dent's depth [domain units].
     """
 
     dents: list[int]
+    elevation: list[float]
+    azimuth: list[float]
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
@@ -206,14 +214,14 @@ class DentTarget(Script):
         clear = float(np.linalg.norm(half)) + radius
         at = np.asarray(tool.position) - centre
         for _ in range(_count(rng, "dents", self.dents)):
-            direction = rng.normal(size=3)
-            direction[1] = abs(direction[1])
-            direction /= np.linalg.norm(direction)
+            up, around = _draw(rng, "elevation", self.elevation), _draw(rng, "azimuth", self.azimuth)
+            direction = np.array(
+                [math.cos(up) * math.cos(around), math.sin(up), math.cos(up) * math.sin(around)]
+            )
             for point in _arc(at, clear * direction):
                 track.go(point - at)
                 at = point
-            # The sphere touches the face that the direction leaves through.
-            touch = float(np.min((half + radius) / np.maximum(np.abs(direction), 1e-9)))
+            touch = _touch(half, direction, radius)
             inner = (touch - _draw(rng, "depth", self.depth)) * direction
             track.go(inner - at)
             track.go(at - inner)
@@ -249,27 +257,30 @@ class RollTarget(Script):
 
 @dataclass
 class LiftTarget(Script):
-    """Chopsticks lift the first body, move it sideways and turn it.
+    """Chopsticks lift the first body, move it sideways and turn it, so that its ends hang and trail.
 
     Attributes:
         height: Range of how far they lift [domain units].
         turn: Range of the turn about the vertical, to either side [rad].
-        shift: Range of the way along x and along z [domain units].
+        x: Range of the way along x, to either side [domain units].
+        z: Range of the way along z [domain units].
     """
 
     height: list[float]
     turn: list[float]
-    shift: list[float]
+    x: list[float]
+    z: list[float]
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         (track, *_) = tracks
-        height, turn = _draw(rng, "height", self.height), _draw(rng, "turn", self.turn)
-        turn *= rng.choice([-1.0, 1.0])
-        x, z = _draw(rng, "shift", self.shift, 2)
-        lift = 10
+        height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
+        turn, x = _draw(rng, "turn", self.turn), _draw(rng, "x", self.x)
+        sides = rng.choice([-1.0, 1.0], size=2)
+        # Any faster, and the body slips through.
+        lift = 20
         track.go([0.0, height, 0.0, 0.0, 0.0, 0.0, 0.0], lift)
-        track.go([x, 0.0, z, 0.0, turn, 0.0, 0.0], EPISODE_STEPS - 10 - lift)
+        track.go([sides[0] * x, 0.0, z, 0.0, sides[1] * turn, 0.0, 0.0], EPISODE_STEPS - 10 - lift)
 
 
 @dataclass
@@ -307,15 +318,18 @@ class CarryTarget(Script):
 
 @dataclass
 class PushTarget(Script):
-    """A sphere between the legs of a table pushes one of them outwards.
+    """A sphere between the legs of a table pushes one of them outwards, at the end of the episode: the rest
+    of the table stays where it is.
 
     Attributes:
         legs: So many of the scene's first bodies are legs.
         distance: Range of how far it goes on after it has met the leg [domain units].
+        steps: Environment steps that this takes at least; with more, the table follows.
     """
 
     legs: int
     distance: list[float]
+    steps: int
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
@@ -329,7 +343,8 @@ class PushTarget(Script):
         edge = float(np.min(leg.half_extent() / np.maximum(np.abs(direction), 1e-9)))
         meet = length - edge - tool.size[0]
         track.go(meet * direction)
-        track.go(_draw(rng, "distance", self.distance) * direction, 20)
+        track.go(_draw(rng, "distance", self.distance) * direction, self.steps)
+        track.delay()
 
 
 @overload
@@ -368,6 +383,19 @@ def _below(tool: Manipulator) -> float:
     if reach is None:
         raise TargetError(f"the recipe needs a Sphere, Capsule or Torus, not a {tool.shape}")
     return float(np.dot(reach, tool.size))
+
+
+def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
+    """Distance from a box's centre at which a sphere on its way there meets it [domain units].
+
+    Args:
+        half: Half of the box's edges, shape [3].
+        direction: Unit vector from the centre to the sphere, shape [3].
+        radius: The sphere's.
+    """
+    ways = np.linspace(0.0, np.linalg.norm(half) + radius, 1000)
+    gaps = np.linalg.norm(np.maximum(ways[:, None] * np.abs(direction) - half, 0.0), axis=1)
+    return float(np.interp(radius, gaps, ways))
 
 
 def _arc(start: np.ndarray, end: np.ndarray) -> list[np.ndarray]:
