@@ -42,6 +42,7 @@ def make_config(folder: Path, **changes) -> dict:
             "start": "plab",
             "numbers": "plab",
             "floor": "plab",
+            "score": "best",
             "contact": "nearest",
         },
         "sim": {"device": "cpu", "precision": "float64"},
@@ -75,6 +76,17 @@ def test_hash_of_protocols(tmp_path: Path) -> None:
     assert len(hashes) == 4
     # The contact term acts by what the method says.
     assert config_hash(config | {"protocol": config["protocol"] | {"contact": "all"}}) in hashes
+
+
+def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> None:
+    config = make_config(tmp_path)
+    task = config["task"] | {"variants": {"1": {"target": {"seed": 1}, "gravity": [0.0, -30.0, 0.0]}}}
+    changed = task | {"target": {"recipe": "other"}, "variants": {"1": {"gravity": [0.0, -30.0, 0.0]}}}
+    for source, same in ((None, False), ("files", True)):
+        hashes = [config_hash(config | {"task": t, "targets": {"source": source}}) for t in (task, changed)]
+        assert (hashes[0] == hashes[1]) is same
+    moon = changed | {"variants": {"1": {"gravity": [0.0, -5.0, 0.0]}}}
+    assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
 def test_runs_from_before_protocols_are_of_plabs_own(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.selection import lookup
+
 __all__ = [
     "ARCHIVE_SUFFIX",
     "COLUMNS",
@@ -154,7 +156,17 @@ def config_hash(cfg: Any) -> str:
         plain["protocol"] = chosen
     # Always empty.
     plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
+    if isinstance(lookup(plain, "targets.source"), str):
+        # The target comes from a file, whatever the task's recipe is.
+        plain["task"] = _without_recipe(plain["task"])
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def _without_recipe(task: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a task's configuration without the recipe of its target, the variants' included."""
+    variants = {name: _without_recipe(own) for name, own in task.get("variants", {}).items()}
+    kept = {key: value for key, value in task.items() if key != "target"}
+    return kept | ({"variants": variants} if variants else {})
 
 
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
