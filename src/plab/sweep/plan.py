@@ -22,9 +22,9 @@ __all__ = ["plan"]
 def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
     """Put configurations into batches.
 
-    Together go runs of one task by methods that differ in optimiser and contact model only: any variants, any
-    seeds, any material. Runs of methods that cannot share a simulator are batches of one, those of a kind one
-    after the other.
+    Together go runs of one task by methods that differ in optimiser and contact model only, or that learn from
+    rewards and do not differ: any variants, any seeds, any material. Runs of methods that cannot share a
+    simulator are batches of one, those of a kind one after the other.
 
     Args:
         cfgs: The composed and checked configurations.
@@ -50,16 +50,22 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
     kind = [cfg.task.name, cfg.method.family, *shared, loss]
-    if not family(cfg.method.family).batching:
+    own = family(cfg.method.family)
+    if not (own.batching or own.joins_populations(cfg.method)):
         return [*kind, cfg.variant, asdict(cfg.task), method]
-    # Runs of other lengths would have environments wait for each other.
-    return [*kind, method["iterations"], scene.particle_count, [m.shape for m in scene.manipulators]]
+    # Runs of other lengths would have environments wait for each other, and agents learn in step.
+    alike = method["iterations"] if own.batching else method
+    return [*kind, alike, scene.particle_count, [m.shape for m in scene.manipulators]]
 
 
 def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
-    if not family(cfg.method.family).batching:
+    own = family(cfg.method.family)
+    if not (own.batching or own.joins_populations(cfg.method)):
         return 1
-    return size or batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
+    if size is not None:
+        return size
+    environments = batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
+    return max(1, environments // getattr(cfg.method, "num_envs", 1))
 
 
 def _split(group: Sequence[Config], limit: int) -> list[list[Config]]:
