@@ -67,8 +67,8 @@ class Family:
         columns: Columns of the results beside those that all methods have.
         may_be_nan: Those of them with entries for which there is no number.
         batching: Whether runs can share a simulator; else each runs alone.
-        population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they share a
-            simulator if they have the same section ``method``. ``runner`` carries out the others.
+        population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they
+            share a simulator if they have the same section ``method``. ``runner`` carries out the others.
         rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
         methods: Appearance of methods by name; others appear in grey, by their names.
@@ -94,16 +94,14 @@ class Family:
         """
         return _loaded(self.rules[name].what, kind)
 
-    def agents(self, name: str, kind: type[Kind]) -> type[Kind]:
-        """Return the agents of a rule, a subclass of a kind.
+    def agents(self, name: str) -> type:
+        """Return the agents of a rule.
 
         Raises:
             plab.config.ConfigError: If they cannot be imported.
             KeyError: If there is no such rule.
         """
-        found = _loaded(self.rules[name].agents, type)
-        assert issubclass(found, kind)
-        return found
+        return _loaded(self.rules[name].agents, type)
 
     def joins_populations(self, method: Any) -> bool:
         """Whether a sweep's runs with this section ``method`` are agents of a population."""

@@ -19,16 +19,17 @@ if TYPE_CHECKING:
 __all__ = ["plan"]
 
 
-def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
+def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) -> list[list[Config]]:
     """Put configurations into batches.
 
-    Together go runs of one task by methods that differ in optimiser and contact model only, or that learn from
-    rewards and do not differ: any variants, any seeds, any material. Runs of methods that cannot share a
+    Together go runs of one task by methods that differ in optimiser and contact model only, or that learn
+    from rewards and do not differ: any variants, any seeds, any material. Runs of methods that cannot share a
     simulator are batches of one, those of a kind one after the other.
 
     Args:
         cfgs: The composed and checked configurations.
         size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
+        processes: How many carry out batches at a time: each is to have one, if there are runs enough.
 
     Returns:
         Batches, each as evenly filled as the others of its kind.
@@ -40,7 +41,8 @@ def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
     first = {id(cfg): scene for cfg, scene in zip(cfgs, scenes, strict=True)}
     batches = []
     for group in groups.values():
-        batches += _split(group, _limit(group[0], first[id(group[0])], size))
+        limit = _limit(group[0], first[id(group[0])], size)
+        batches += _split(group, max(-(-len(group) // limit), -(-processes // len(groups))))
     return batches
 
 
@@ -68,8 +70,8 @@ def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
     return max(1, environments // getattr(cfg.method, "num_envs", 1))
 
 
-def _split(group: Sequence[Config], limit: int) -> list[list[Config]]:
-    """Split a group into as few parts as possible, of even size."""
-    count = -(-len(group) // limit)
+def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
+    """Split a group into some parts, of even size and not empty."""
+    count = min(count, len(group))
     bounds = [len(group) * k // count for k in range(count + 1)]
     return [list(group[a:b]) for a, b in pairwise(bounds)]

@@ -1,8 +1,8 @@
-"""What agents of all algorithms share: stacks, random numbers, and the state of each that a checkpoint holds."""
+"""What agents of all algorithms share: stacks, random numbers, and the state that a checkpoint holds."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
@@ -57,14 +57,14 @@ def trained_policy(cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> Bas
     """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`."""
     method = cfg.method_as(RlConfig)
     policy = first_policy(cfg, spaces)
-    kind = family(method.family).agents(method.algorithm, Agents)
+    kind: type[Agents] = family(method.family).agents(method.algorithm)
     networks = Networks([policy], kind.PARTS, torch.device("cpu"))
     fill(networks.parameters(), torch.from_numpy(state["networks"])[None])
     networks.write_to(policy, 0)
     return policy
 
 
-class Agents(ABC):
+class Agents:
     """K agents that stand at the same step; each is what an agent alone is.
 
     Attributes:
@@ -102,7 +102,7 @@ class Agents(ABC):
         self._updates: dict[str, CapturedUpdate] = {}
 
     def begin(self, observations: Tensor) -> None:
-        """Take the very first observations of the training, shape [agent, env, entry]."""
+        """Take the observations with which the training begins, shape [agent, env, entry]."""
 
     @abstractmethod
     def act(self, observations: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ class Agents(ABC):
         return self._blocks[-1]
 
     def _captured(self, update: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Call a function of tensors that is recorded on CUDA; what it returns is overwritten by the next call."""
+        """Call a function that is recorded on CUDA; what it returns is overwritten by the next call."""
         return self._updates.setdefault(update.__name__, CapturedUpdate(update))(*arguments)
 
 

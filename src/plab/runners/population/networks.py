@@ -14,7 +14,8 @@ from plab.runners.captured import require_capturable
 __all__ = ["Networks", "Part", "adam", "descend", "fill", "flat", "follow", "linear", "mlp", "twin_values"]
 
 Part = dict[str, Tensor]
-"""Parameters by their names in the module that they come from, each of shape [stack, ...]."""
+"""Parameters by their names in the module that they come from, each of shape [stack, ...]; weights are
+transposed, [stack, in, out], so that neither products nor gradients have to be."""
 
 
 class Networks:
@@ -42,7 +43,7 @@ class Networks:
             # Of a module "a.b" the parameter "a.b.weight" is "weight", of a parameter "a" itself the name "".
             names = [n[len(modules[0]) :] for n in named[0] if f"{n}.".startswith(f"{modules[0]}.")]
             self.parts[part] = {
-                name.lstrip("."): torch.stack([own[m + name].detach() for own in named for m in modules])
+                name.lstrip("."): torch.stack([_turned(own[m + name]) for own in named for m in modules])
                 .to(device)
                 .requires_grad_()
                 for name in names
@@ -63,7 +64,11 @@ class Networks:
                 for name, tensor in self.parts[part].items():
                     rows = tensor.reshape(self._count, len(modules), *tensor.shape[1:])[agent]
                     for module, row in zip(modules, rows, strict=True):
-                        own[f"{module}.{name}".rstrip(".")].copy_(row)
+                        own[f"{module}.{name}".rstrip(".")].copy_(_turned(row))
+
+
+def _turned(parameter: Tensor) -> Tensor:
+    return parameter.detach().mT if parameter.ndim == 2 else parameter.detach()
 
 
 def flat(tensors: Sequence[Tensor], agents: int) -> Tensor:
@@ -80,8 +85,8 @@ def fill(tensors: Sequence[Tensor], rows: Tensor) -> None:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Return x W^T + b of each network: shapes [stack, row, in], [stack, out, in], [stack, out]."""
-    return torch.baddbmm(bias.unsqueeze(1), x, weight.transpose(1, 2))
+    """Return x W + b of each network: shapes [stack, row, in], [stack, in, out], [stack, out]."""
+    return torch.baddbmm(bias.unsqueeze(1), x, weight)
 
 
 def mlp(x: Tensor, part: Part, name: str, activation: nn.Module, *, last: bool) -> Tensor:
@@ -136,15 +141,14 @@ def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> No
         agents = len(losses)
         norms = torch.linalg.vector_norm(flat(gradients, agents), dim=1)
         scale = (longest / (norms + 1e-6)).clamp(max=1.0)
-        gradients = tuple(
-            (g.reshape(agents, -1) * scale.unsqueeze(1)).reshape(g.shape) for g in gradients
-        )
+        gradients = tuple((g.reshape(agents, -1) * scale.unsqueeze(1)).reshape(g.shape) for g in gradients)
     for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
+        # A step of all at once takes the numbers as they lie in memory.
+        parameter.grad = gradient.contiguous()
     optimizer.step()
 
 
-def follow(targets: Sequence[Tensor], sources: Sequence[Tensor], tau: float) -> None:
+def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
     """Let targets follow: target <- (1 - tau) target + tau source."""
     with torch.no_grad():
         torch._foreach_mul_(targets, 1.0 - tau)

@@ -76,7 +76,7 @@ class Population:
         self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
         self._total, self._cycle = (size(method, self._horizon) for size in (total_steps, cycle_steps))
         batch = training.batch
-        kind = family(method.family).agents(method.algorithm, Agents)
+        kind: type[Agents] = family(method.family).agents(method.algorithm)
         size = len(cfgs) if self._device.type == "cuda" else 1
         spaces = Spaces(batch.observation_space, batch.action_space)
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
@@ -104,6 +104,9 @@ class Population:
 
     def train(self, episodes: int) -> None:
         """Train until each agent has done some episodes, or all its transitions."""
+        if self.steps == 0:
+            for stack, part in zip(self.stacks, self._split(self._observations), strict=True):
+                stack.begin(part)
         while self.episodes < episodes and self.steps < self._total:
             for _ in range(self._cycle // self._envs):
                 self._step()
@@ -113,7 +116,8 @@ class Population:
         columns = episode_columns(self._evaluation.batch.problem.term_names)
         observations = self._own(self._evaluation.reset(), 1)
         sums: dict[str, Tensor] = {}
-        actions, failures = [], {}
+        actions: list[Tensor] = []
+        failures: dict[int, str] = {}
         for _ in range(self._horizon):
             parts = zip(self.stacks, self._split(observations), strict=True)
             actions.append(torch.cat([stack.decide(part) for stack, part in parts]))
@@ -164,15 +168,10 @@ class Population:
         """Put agents and environments where they were."""
         observations = self._own(self._training.reset(), self._envs)
         self._reward = torch.zeros((len(states), self._envs), dtype=torch.float64, device=self._device)
-        known = [state for state in states if state is not None]
-        if not known:
-            for stack, part in zip(self.stacks, self._split(observations), strict=True):
-                stack.begin(part)
-        else:
-            first = 0
-            for stack in self.stacks:
-                stack.restore(known[first : first + stack.count])
-                first += stack.count
+        if known := [state for state in states if state is not None]:
+            for place in range(0, len(known), self.stacks[0].count):
+                stack, _ = self.place(place)
+                stack.restore(known[place : place + stack.count])
             acted = np.stack([state["episode_actions"] for state in known], axis=1)
             for actions in torch.from_numpy(acted).to(self._device):
                 observations = self._own(self._advance_training(actions).observation, self._envs)
@@ -213,7 +212,7 @@ class Population:
         return env.step(everyone.flatten(0, 1), strict=False)
 
     def _own(self, table: Tensor, envs: int) -> Tensor:
-        """Return the agents' rows of all environments', shape [agent, env, entry], entry 1 if there is none."""
+        """Return the agents' rows of a table of all environments, shape [agent, env, entry or 1]."""
         rows = table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
         return rows.index_select(0, self._numbers)
 

@@ -127,6 +127,11 @@ class Replay:
             self._rewards.view(-1).index_select(0, place).view(numbers.shape),
         )
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all agents' buffers."""
+        return 4 * self._agents * self._capacity * self._sizes.entries
+
     def write(self, agent: int, path: Path) -> None:
         """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew.
 

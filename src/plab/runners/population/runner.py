@@ -169,7 +169,7 @@ class PopulationRunner(Runner):
             stack.replay.write(number, _replay_path(track))
 
     def _require_memory(self) -> None:
-        """Find out whether there is room for all replay buffers; those of one run are always tried on the CPU.
+        """Find out whether there is room for all replay buffers; on the CPU there always is for one.
 
         Raises:
             RunError: If there is not.
@@ -184,8 +184,8 @@ class PopulationRunner(Runner):
             room = max(cfg.sim.memory_mb * 1e6, each)
         if len(self.tracks) * each > room:
             raise RunError(
-                f"no room for {len(self.tracks)} replay buffers of {each / 1e9:.1f} GB: {room / 1e9:.1f} GB are "
-                "free; set a smaller method.buffer_size or method.torch_device=cpu"
+                f"no room for {len(self.tracks)} replay buffers of {each / 1e9:.1f} GB: "
+                f"{room / 1e9:.1f} GB are free; set a smaller method.buffer_size or method.torch_device=cpu"
             )
 
     def _least(self, tracks: Sequence[Track]) -> int:

@@ -112,6 +112,5 @@ class SacAgents(OffPolicyAgents):
         return actions, (density - torch.log(1.0 - actions.square() + EPSILON)).sum(2)
 
 
-
 def _layer(part: Part, name: str) -> tuple[Tensor, Tensor]:
     return part[f"{name}.weight"], part[f"{name}.bias"]

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from plab.config_types import Td3Config
 from plab.runners.population.agents import OffPolicyAgents, Spaces
-from plab.runners.population.networks import Part, adam, descend, follow, mlp, twin_values
+from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.population.replay import Samples
 
 if TYPE_CHECKING:
@@ -89,9 +89,9 @@ class Td3Agents(OffPolicyAgents):
             smoothing = (noise * self.method.target_noise).clamp(-reach, reach)
             next_actions = self._actor("actor_target", samples.next_observations) + smoothing
             next_actions = next_actions.clamp(-1.0, 1.0)
-            values = twin_values(self.networks["targets"], samples.next_observations, next_actions).min(1).values
+            values = twin_values(self.networks["targets"], samples.next_observations, next_actions)
             # An episode ends by truncation only: the value of the next observation always counts.
-            targets = samples.rewards + self.method.gamma * values
+            targets = samples.rewards + self.method.gamma * values.min(1).values
         judged = twin_values(self.networks["critics"], samples.observations, samples.actions)
         loss = (judged - targets.unsqueeze(1)).square().mean(2).sum(1)
         descend(self.optimizers["critics"], loss)
