@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict, deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from plab.runners import run_batch, run_config
 from plab.runners.common import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.population.agents import Agents, Spaces
+from plab.runners.population.draws import Block
 from plab.runners.population.population import Population
 from plab.runners.population.replay import Replay, Sizes
 from plab.runners.rl_models import CLIP, model_kind
@@ -77,29 +79,25 @@ class Script(gymnasium.Env):
         return next(self._observations), next(self._rewards), False, self._step == HORIZON, {}
 
 
-class Tape:
-    """Draws, and keeps what it drew."""
+class OneByOne:
+    """Takes the place of a block of random numbers."""
 
     def __init__(self, draw: Any, *shape: int) -> None:
-        self._draw, self._shape, self.drawn = draw, shape, []
+        self._draw, self._shape = draw, shape
 
     def next(self) -> torch.Tensor:
-        self.drawn.append(self._draw(*self._shape))
-        return self.drawn[-1]
-
-    def drop(self) -> None:
-        pass
+        return self._draw(*self._shape)
 
 
-def learner(name: str, seeds: list[int]) -> tuple[Agents, list[Config]]:
+def learner(name: str, seeds: list[int], device: str = "cpu") -> tuple[Agents, list[Config]]:
     words = ("task=Move", f"sim.horizon={HORIZON}", f"method.num_envs={ENVS}", "method.episodes=16")
     cfgs = [load_config([*words, "method.hidden=[8,8]", *LEARNERS[name], f"seed={seed}"]) for seed in seeds]
     method = cfgs[0].method
-    return family("rl").agents(method.algorithm)(cfgs, SPACES, torch.device("cpu")), cfgs
+    return family("rl").agents(method.algorithm)(cfgs, SPACES, torch.device(device)), cfgs
 
 
-def taped(agents: Agents) -> dict[str, list[Any]]:
-    """Let agents draw from tapes; return the tapes of numbers, in the order of use."""
+def taped_and_played(agents: Agents, scripts: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, list[Any]]:
+    """Let agents learn from scripts, and return the random numbers that they drew, in the order of use."""
     tapes: dict[str, list[Any]] = {"normal": [], "uniform": [], "integers": [], "permutation": []}
     for kind, drawn in tapes.items():
         original = getattr(agents.draws, kind)
@@ -109,17 +107,25 @@ def taped(agents: Agents) -> dict[str, list[Any]]:
             return drawn[-1]
 
         setattr(agents.draws, kind, draw)
-    for name, block in list(vars(agents).items()):
-        if type(block).__name__ == "Block":
-            _, *shape = block._shape
-            setattr(agents, name, Tape(getattr(agents.draws, block._draw.__name__), *shape))
+    without_blocks(agents)
+    play(agents, scripts)
     return tapes
+
+
+def without_blocks(agents: Agents) -> None:
+    """Let agents draw number by number."""
+    for name, block in list(vars(agents).items()):
+        if isinstance(block, Block):
+            _, *shape = block._shape
+            setattr(agents, name, OneByOne(getattr(agents.draws, block._draw.__name__), *shape))
 
 
 def play(agents: Agents, scripts: list[tuple[np.ndarray, np.ndarray]]) -> None:
     """Let agents learn from scripts; each has observations [read, env, entry] and rewards [step, env]."""
-    observations = [torch.from_numpy(np.stack(rows)) for rows in zip(*(s[0] for s in scripts), strict=True)]
-    rewards = [torch.from_numpy(np.stack(rows)) for rows in zip(*(s[1] for s in scripts), strict=True)]
+    observations, rewards = (
+        [torch.from_numpy(np.stack(rows)).to(agents.device) for rows in zip(*parts, strict=True)]
+        for parts in zip(*scripts, strict=True)
+    )
     told = iter(observations)
     now = next(told)
     agents.begin(now)
@@ -183,24 +189,27 @@ def feed(model: BaseAlgorithm, tapes: dict[str, list[Any]], agent: int, patch: p
     model.action_space.sample = lambda: each("uniform")
 
 
-@pytest.mark.parametrize("count", [1, 3])
-@pytest.mark.parametrize("name", LEARNERS)
-def test_agents_learn_what_stable_baselines3_learns(name: str, count: int, monkeypatch) -> None:
-    """From the same first networks, observations, rewards and random numbers, over 27 updates and more."""
+def make_scripts(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(0)
     reads = 1 + STEPS + STEPS // HORIZON
-    scripts = [
+    return [
         (
             (3 * rng.normal(size=(reads, ENVS, OBSERVED))).astype(np.float32),
             rng.normal(size=(STEPS, ENVS)).astype(np.float32),
         )
         for _ in range(count)
     ]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_agents_learn_what_stable_baselines3_learns(name: str, count: int, monkeypatch) -> None:
+    """From the same first networks, observations, rewards and random numbers, over 27 updates and more."""
+    scripts = make_scripts(count)
     agents, cfgs = learner(name, list(range(count)))
     first = [p.clone() for p in agents.networks.parameters()]
-    tapes = taped(agents)
     with torch_settings(1):
-        play(agents, scripts)
+        tapes = taped_and_played(agents, scripts)
     assert agents.steps == STEPS * ENVS and agents.updates >= 4
     assert all(not torch.equal(a, b) for a, b in zip(first, agents.networks.parameters(), strict=True))
     for agent, (cfg, script) in enumerate(zip(cfgs, scripts, strict=True)):
@@ -221,6 +230,29 @@ def test_agents_learn_what_stable_baselines3_learns(name: str, count: int, monke
         if name == "sac":
             entropy = model.log_ent_coef[0]
             torch.testing.assert_close(agents.tensors["log_ent_coef"][agent], entropy, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", LEARNERS)
+def test_stacks_on_cuda_learn_what_those_on_the_cpu_learn(name: str) -> None:
+    """From the same data and random numbers; updates are recorded after the third and replayed."""
+    scripts = make_scripts(3)
+    agents, _ = learner(name, [0, 1, 2])
+    others, _ = learner(name, [0, 1, 2], "cuda")
+    first = [p.detach().clone() for p in agents.networks.parameters()]
+    with torch_settings(1):
+        played = {kind: deque(drawn) for kind, drawn in taped_and_played(agents, scripts).items()}
+        for kind, drawn in played.items():
+            setattr(others.draws, kind, lambda *shape, drawn=drawn: drawn.popleft().cuda())
+        without_blocks(others)
+        play(others, scripts)
+    after = [p.detach().cpu() for p in others.networks.parameters()]
+    pairs = list(zip(agents.networks.parameters(), after, strict=True))
+    apart = max(float((a.detach() - b).abs().max()) for a, b in pairs)
+    way = max(float((a - b).abs().max()) for a, b in zip(first, after, strict=True))
+    assert (others.steps, others.updates) == (agents.steps, agents.updates)
+    # Adam's steps are of a size of their own, however wrong the gradient: they are to go the same way.
+    assert apart < min(2e-3, 0.3 * way), (apart, way)
 
 
 @pytest.mark.parametrize("buffer_size", [1000, 24])
@@ -327,23 +359,26 @@ def files(folder: Path) -> set[str]:
     return {path.name for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.fixture(scope="module", params=METHODS)
-def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[RunResult]:
-    """Each run as a population of one."""
-    cfgs = configs(tmp_path_factory.mktemp("alone"), request.param)
-    for cfg in cfgs:
-        (ended,) = carry([cfg])
-        assert ended.status == "finished", ended.message
-    return [read(result_path(cfg)) for cfg in cfgs]
+@pytest.fixture(scope="module")
+def lone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[RunResult]]:
+    """What each run of a method gives as a population of one."""
+    known: dict[str, list[RunResult]] = {}
 
+    def results(method: str) -> list[RunResult]:
+        if method not in known:
+            cfgs = configs(tmp_path_factory.mktemp("alone"), method)
+            assert [one.status for cfg in cfgs for one in carry([cfg])] == ["finished"] * 3
+            known[method] = [read(result_path(cfg)) for cfg in cfgs]
+        return known[method]
 
-def method_of(alone: list[RunResult]) -> str:
-    return alone[0].config["method"]["name"]
+    return results
 
 
 @pytest.mark.physics
-def test_a_population_is_that_many_populations_of_one(tmp_path: Path, alone) -> None:
-    cfgs = configs(tmp_path, method_of(alone))
+@pytest.mark.parametrize("method", METHODS)
+def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, method) -> None:
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     ended = carry(cfgs)
     for cfg, want, one in zip(cfgs, alone, ended, strict=True):
         got = assert_same_numbers(cfg, want)
@@ -357,9 +392,11 @@ def test_a_population_is_that_many_populations_of_one(tmp_path: Path, alone) -> 
 
 
 @pytest.mark.physics
-def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, alone) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, lone, method) -> None:
     """The single run is Stable-Baselines3's: the same first policy, the same rows, other random numbers."""
-    cfg = configs(tmp_path, method_of(alone))[0]
+    alone = lone(method)
+    cfg = configs(tmp_path, method)[0]
     run_config(cfg, CACHES[0])
     single = read(result_path(cfg))
     assert "population" not in single.provenance and alone[0].provenance["population"]
@@ -372,9 +409,11 @@ def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, alo
 
 
 @pytest.mark.physics
-def test_the_trained_policy_is_beside_the_result(tmp_path: Path, alone) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_the_trained_policy_is_beside_the_result(tmp_path: Path, lone, method) -> None:
     """Its episode is that of the last row, but for rounding: the library multiplies otherwise."""
-    cfg = configs(tmp_path, method_of(alone))[0]
+    alone = lone(method)
+    cfg = configs(tmp_path, method)[0]
     done = policy_episode(EpisodeBatch([cfg]), load_policy(alone[0].path))
     last = alone[0].iterations.iloc[-1]
     for name, value in done.measures.items():
@@ -394,13 +433,14 @@ def break_off(monkeypatch: pytest.MonkeyPatch, after: int, error: BaseException)
 
 
 @pytest.mark.physics
-@pytest.mark.parametrize("after", [2, 15, 27])
+@pytest.mark.parametrize("method", METHODS)
 def test_a_population_that_breaks_off_goes_on_to_the_same_numbers(
-    tmp_path, alone, monkeypatch, after
+    tmp_path, lone, monkeypatch, method
 ) -> None:
-    cfgs = configs(tmp_path, method_of(alone))
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     with monkeypatch.context() as patch:
-        break_off(patch, after, OSError("gone"))
+        break_off(patch, 15, OSError("gone"))
         assert [one.status for one in carry(cfgs)] == ["failed"] * 3
     left = read(result_path(cfgs[0]).with_suffix(".partial.h5"))
     assert (left.status, left.message) == ("failed", "OSError: gone") and len(left.iterations) in (1, 2, 3)
@@ -410,8 +450,10 @@ def test_a_population_that_breaks_off_goes_on_to_the_same_numbers(
 
 
 @pytest.mark.physics
-def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, alone, monkeypatch) -> None:
-    cfgs = configs(tmp_path, method_of(alone))
+@pytest.mark.parametrize("method", ["sac", "ppo"])
+def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone, method, monkeypatch) -> None:
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     intact, calls = RunFile.record, iter(range(100))
 
     def record(self, *arguments, **changes):
@@ -433,9 +475,11 @@ def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, alone
 
 
 @pytest.mark.physics
-def test_states_are_written_as_often_as_asked_for(tmp_path, alone, monkeypatch) -> None:
+@pytest.mark.parametrize("method", ["td3"])
+def test_states_are_written_as_often_as_asked_for(tmp_path, lone, method, monkeypatch) -> None:
     """What is lost is done again, to the same numbers; a replay buffer may hold more than the state knows."""
-    cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, method_of(alone))]
+    alone = lone(method)
+    cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, method)]
     with monkeypatch.context() as patch:
         break_off(patch, 27, KeyboardInterrupt())
         # As if the process were killed.
@@ -449,9 +493,11 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, alone, monkeypatch) 
 
 
 @pytest.mark.physics
-def test_a_run_that_breaks_off_leaves_the_others_alone(tmp_path, alone, monkeypatch) -> None:
+@pytest.mark.parametrize("method", ["sac", "ppo"])
+def test_a_run_that_breaks_off_leaves_the_others_alone(tmp_path, lone, method, monkeypatch) -> None:
     """NaN inside the simulator, in an environment of the second run, in training."""
-    cfgs = configs(tmp_path, method_of(alone))
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     intact, calls = Population._step, iter(range(10_000))
 
     def step(self: Population) -> None:
@@ -475,8 +521,10 @@ def test_a_run_that_breaks_off_leaves_the_others_alone(tmp_path, alone, monkeypa
 
 
 @pytest.mark.physics
-def test_networks_that_are_not_finite_end_their_run_only(tmp_path, alone, monkeypatch) -> None:
-    cfgs = configs(tmp_path, method_of(alone))
+@pytest.mark.parametrize("method", ["td3"])
+def test_networks_that_are_not_finite_end_their_run_only(tmp_path, lone, method, monkeypatch) -> None:
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     intact = Population.train
 
     def train(self: Population, episodes: int) -> None:
@@ -519,10 +567,10 @@ def test_replay_buffers_for_which_there_is_no_room_are_shared_out(tmp_path, monk
 
 
 @pytest.mark.physics
-def test_a_full_disk_ends_its_run_only(tmp_path, alone, monkeypatch) -> None:
-    if method_of(alone) == "ppo":
-        pytest.skip("ppo has no replay buffer")
-    cfgs = configs(tmp_path, method_of(alone))
+@pytest.mark.parametrize("method", ["sac"])
+def test_a_full_disk_ends_its_run_only(tmp_path, lone, method, monkeypatch) -> None:
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     bad, intact = result_path(cfgs[2]).with_suffix(".replay"), Replay.write
 
     def write(self: Replay, agent: int, path: Path) -> None:
@@ -537,10 +585,26 @@ def test_a_full_disk_ends_its_run_only(tmp_path, alone, monkeypatch) -> None:
         assert_same_numbers(cfgs[k], alone[k])
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("method", METHODS)
+def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch, method) -> None:
+    cfgs = configs(tmp_path, method, "sim.device=cuda", "method.torch_device=cuda")
+    with monkeypatch.context() as patch:
+        break_off(patch, 15, OSError("gone"))
+        assert [one.status for one in run_batch(cfgs)] == ["failed"] * 3
+    assert [one.status for one in run_batch(cfgs)] == ["finished"] * 3
+    for cfg in cfgs:
+        result = read(result_path(cfg))
+        assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
+        assert np.isfinite(result.iterations[1:].to_numpy()).all()
+        assert load_policy(result.path, "cuda").network.device.type == "cuda"
+
+
 @pytest.mark.slow
 @pytest.mark.physics
-def test_a_sweep_killed_at_random_moments_ends_with_the_same_numbers(tmp_path, alone) -> None:
-    method = method_of(alone)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_sweep_killed_at_random_moments_ends_with_the_same_numbers(tmp_path, lone, method) -> None:
+    alone = lone(method)
     sweep = [sys.executable, "-m", "plab.run", "-m", *COARSE, f"method={method}", *METHODS[method]]
     sweep += ["seed=0,1", f"results_dir={tmp_path}"]
     rng = np.random.default_rng()
@@ -558,17 +622,18 @@ def test_a_sweep_killed_at_random_moments_ends_with_the_same_numbers(tmp_path, a
 
 def test_runs_that_learn_alike_make_a_population() -> None:
     words = ["task=Move", "method=sac"]
-    cfgs = [load_config([*words, f"variant={v}", f"seed={s}"]) for v in (1, 2) for s in (0, 1)]
+    cfgs = [replace(load_config([*words, f"variant={v}"]), seed=s) for v in (1, 2) for s in (0, 1)]
     cfgs += [load_config([*words, "task.yield_stress=20"])]
     assert [len(batch) for batch in plan(cfgs)] == [2, 3]
     assert [len(batch) for batch in plan(cfgs, 5)] == [5]
     other = [load_config([*words, "method.tau=0.1"]), load_config(["task=Move", "method=td3"])]
     assert [len(batch) for batch in plan(cfgs + other, 50)] == [5, 1, 1]
     # What is logged is what Stable-Baselines3 does.
-    logged = [load_config([*words, "method.tensorboard=true", f"seed={s}"]) for s in (0, 1)]
+    logged = [replace(load_config([*words, "method.tensorboard=true"]), seed=s) for s in (0, 1)]
     assert [len(batch) for batch in plan(logged, 50)] == [1, 1]
     # Each of several processes is to have a part, if there are runs enough.
     assert [len(batch) for batch in plan(cfgs, 50, processes=2)] == [2, 3]
     assert [len(batch) for batch in plan(cfgs + other, 50, processes=8)] == [1, 2, 2, 1, 1]
-    many = [load_config([*words, "sim.device=cuda", "method.num_envs=16", f"seed={s}"]) for s in range(9)]
+    one = load_config([*words, "sim.device=cuda", "method.num_envs=16"])
+    many = [replace(one, seed=s) for s in range(9)]
     assert [len(batch) for batch in plan(many)] == [1, 2, 2, 2, 2]

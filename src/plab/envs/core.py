@@ -36,6 +36,7 @@ __all__ = [
     "check_render_mode",
     "compose_configs",
     "refuse_options",
+    "spaces",
 ]
 
 Array: TypeAlias = Any
@@ -182,10 +183,9 @@ class EpisodeBatch:
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
         scenes = self.problem.scenes
-        self._stride = max(scenes[0].particle_count // OBSERVED_PARTICLES, 1)
+        self._stride = _stride(scenes[0])
         self._pose_entries = _pose_entries(scenes[0])
-        self.observation_space = _observation_space(scenes, self._stride)
-        self.action_space = Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
+        self.observation_space, self.action_space = spaces(scenes)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
         self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
@@ -321,18 +321,24 @@ def _pose_entries(scene: Scene) -> np.ndarray:
     return np.flatnonzero(observed)
 
 
-def _observation_space(scenes: Sequence[Scene], stride: int) -> Box:
-    """Return the space that holds the observations of all scenes."""
-    observed = len(range(0, scenes[0].particle_count, stride))
+def _stride(scene: Scene) -> int:
+    """Return the distance of the observed particles' numbers."""
+    return max(scene.particle_count // OBSERVED_PARTICLES, 1)
+
+
+def spaces(scenes: Sequence[Scene]) -> tuple[Box, Box]:
+    """Return the spaces that hold the observations and the actions of all scenes."""
+    observed = len(range(0, scenes[0].particle_count, _stride(scenes[0])))
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
-    return Box(
+    observation = Box(
         np.concatenate([low * observed, bounds[:, 0].min(axis=0)]).astype(np.float32),
         np.concatenate([high * observed, bounds[:, 1].max(axis=0)]).astype(np.float32),
         dtype=np.float32,
     )
+    return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
 
 
 def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:

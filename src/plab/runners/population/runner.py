@@ -17,6 +17,8 @@ import torch
 
 from plab.config import RlConfig
 from plab.config_types import OffPolicyConfig
+from plab.envs.core import spaces
+from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.runners.common import environment_key, torch_settings
 from plab.runners.jobs import RunError
@@ -51,6 +53,11 @@ class PopulationRunner(Runner):
         check_torch_device(self._method)
         cfgs, method = [track.cfg for track in self.tracks], self._method
         kinds = (method.num_envs, method.contact), (1, "hard")
+        self._spaces = Spaces(*spaces(build_scenes(cfgs)))
+        (observed,), (actions,) = (space.shape for space in self._spaces)
+        self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
+        self._total = total_steps(method, self._sizes.horizon)
+        self._require_memory()
 
         def build() -> list[TensorEnv]:
             return [
@@ -66,12 +73,6 @@ class PopulationRunner(Runner):
         key = "population", kinds, tuple(environment_key(cfg) for cfg in cfgs)
         self._training, self._evaluation = self.cache.get(key, build, check=start_again)
         self.problem = self._evaluation.batch.problem
-        batch = self._training.batch
-        self._spaces = Spaces(batch.observation_space, batch.action_space)
-        (observed,), (actions,) = (space.shape for space in self._spaces)
-        self._sizes = Sizes(method.num_envs, batch.horizon, observed, actions)
-        self._total = total_steps(method, batch.horizon)
-        self._require_memory()
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """See that the replay buffer is there; the networks are made with those of the others."""
