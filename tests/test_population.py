@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from torch.distributions import normal
 
+from plab.bench import rl as bench
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import family
@@ -347,12 +348,22 @@ def assert_same_numbers(cfg: Config, want: RunResult) -> RunResult:
     return got
 
 
-CACHES: dict[int, SimulatorCache] = defaultdict(SimulatorCache)
-"""Simulators by what they are for, so that tests need not wait for kernels: 3 has all runs, others one."""
+class KeepsAll(SimulatorCache):
+    """All simulators of these tests, so that none waits for kernels twice."""
+
+    def get(self, key, build, *, check):
+        if key in self._kept:
+            check(self._kept[key])
+        else:
+            self._kept[key] = build()
+        return self._kept[key]
+
+
+CACHE = KeepsAll()
 
 
 def carry(cfgs: list[Config]) -> list[Outcome]:
-    return run_batch(cfgs, cache=CACHES[cfgs[0].seed if len(cfgs) == 1 else len(cfgs)])
+    return run_batch(cfgs, cache=CACHE)
 
 
 def files(folder: Path) -> set[str]:
@@ -397,7 +408,7 @@ def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, lon
     """The single run is Stable-Baselines3's: the same first policy, the same rows, other random numbers."""
     alone = lone(method)
     cfg = configs(tmp_path, method)[0]
-    run_config(cfg, CACHES[0])
+    run_config(cfg, CACHE)
     single = read(result_path(cfg))
     assert "population" not in single.provenance and alone[0].provenance["population"]
     assert set(single.iterations) == set(alone[0].iterations)
@@ -468,7 +479,7 @@ def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone,
     left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in cfgs]
     assert [len(one.iterations) for one in left] == [2, 1, 1]
     # The single run goes on as it was begun.
-    run_config(cfgs[0], CACHES[0])
+    run_config(cfgs[0], CACHE)
     carry(cfgs)
     for cfg, want in zip(cfgs, alone, strict=True):
         assert_same_numbers(cfg, want)
@@ -559,10 +570,11 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.physics
-def test_replay_buffers_for_which_there_is_no_room_are_shared_out(tmp_path, monkeypatch) -> None:
-    """A population is halved until the buffers fit ``sim.memory_mb``; one agent is always tried."""
-    cfgs = configs(tmp_path, "sac", "sim.memory_mb=0.01")
-    assert [one.status for one in carry(cfgs)] == ["finished"] * 3
+def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
+    """Until they fit ``sim.memory_mb``; one is always tried."""
+    first = configs(tmp_path, "sac", "sim.memory_mb=0.01")[0]
+    cfgs = [replace(first, seed=seed) for seed in (0, 1)]
+    assert [one.status for one in carry(cfgs)] == ["finished"] * 2
     assert {read(result_path(cfg)).provenance["batch"] for cfg in cfgs} == {1}
 
 
@@ -598,6 +610,20 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
         assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
         assert np.isfinite(result.iterations[1:].to_numpy()).all()
         assert load_policy(result.path, "cuda").network.device.type == "cuda"
+
+
+@pytest.mark.physics
+def test_benchmark_measures_every_part(tmp_path: Path) -> None:
+    table = tmp_path / "agents.csv"
+    words = [*COARSE[:6], "method.hidden=[8]", "--methods", "ppo", "sac", "--agents", "2", "--envs", "1"]
+    assert bench.main([*words, "--batches", "1", "--csv", str(table)]) == 0
+    rows = pd.read_csv(table)
+    assert rows["method"].tolist() == ["ppo", "sac"] and set(rows["agents"]) == {2}
+    assert (rows[["steps_per_s", *(f"{part}_ms" for part in bench.PARTS)]] > 0).all(axis=None)
+    # A replay buffer of 10,000 episodes of four steps: five observations each, four actions and rewards.
+    observed = EpisodeBatch([configs(tmp_path, "sac")[0]]).observation_space.shape[0]
+    expected = [0.0, 10_000 * 4 * (5 * observed + 4 * 7) / 1e6]
+    assert rows["agent_mb"].tolist() == pytest.approx(expected, abs=0.1)
 
 
 @pytest.mark.slow

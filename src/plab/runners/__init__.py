@@ -105,12 +105,12 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
     parties: dict[Any, list[Job]] = {}
     try:
         for number, job in enumerate(jobs):
-            own = family(job.cfg.method.family)
             try:
+                own = family(job.cfg.method.family)
                 kind = _runner(job, in_sweep=in_sweep)
                 shares = own.batching or kind is not own.runner_type()
                 parties.setdefault((kind, None if shares else number), []).append(job)
-            except ConfigError as error:
+            except Exception as error:
                 job.fail(error)
         for (kind, _), together in parties.items():
             _carry_out(together, kind, note, cache)

@@ -61,15 +61,12 @@ def carry_on(names: Sequence[str]) -> Carrier:
                     for worker in workers:
                         if waiting and not worker.batch:
                             worker.give(waiting.pop(), progress())
-                    for worker in _heard(workers):
+                    for worker in _heard([worker for worker in workers if worker.batch]):
                         for kind, *content in worker.messages():
                             if kind == "progress":
                                 report(f"GPU {worker.name}", *content)
-                                continue
-                            for one in content[0]:
-                                if one.status == "finished":
-                                    print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
-                                yield one
+                            else:
+                                yield from _told(*content)
         finally:
             for worker in workers:
                 worker.end()
@@ -99,6 +96,8 @@ class _Worker:
 
     def give(self, batch: list[Config], note: str) -> None:
         """Let it carry out a batch."""
+        if not self.process.is_alive():
+            self._start()
         self.batch = batch
         self.connection.send((batch, note))
 
@@ -115,7 +114,6 @@ class _Worker:
             self.process.join()
             outcomes = [look_up(cfg) for cfg in self.batch]
             self.batch = []
-            self._start()
             yield "ended", outcomes
 
     def end(self) -> None:
@@ -125,6 +123,14 @@ class _Worker:
             self.process.terminate()
         self.process.join(PATIENCE)
         self.process.kill()
+
+
+def _told(outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
+    """Say which runs have finished, and pass on how each ended."""
+    for one in outcomes:
+        if one.status == "finished":
+            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
+        yield one
 
 
 def _heard(workers: Sequence[_Worker]) -> list[_Worker]:

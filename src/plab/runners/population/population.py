@@ -73,6 +73,8 @@ class Population:
         self._training, self._evaluation = training, evaluation
         self._device = torch.device(method.torch_device)
         self._numbers = torch.tensor(numbers, device=self._device)
+        # Whether there are no environments but theirs.
+        self._alone = len(cfgs) == evaluation.batch.size
         self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
         self._total, self._cycle = (size(method, self._horizon) for size in (total_steps, cycle_steps))
         batch = training.batch
@@ -191,13 +193,14 @@ class Population:
 
     def _advance_training(self, actions: Tensor) -> Transition:
         """Advance the environments of the training, and note what an episode adds up to."""
-        self._broken |= ~actions.isfinite().all(2).all(1)
         done = self._advance(self._training, actions)
         for env, text in done.failures.items():
             self._failures.setdefault(env // self._envs, text)
         self._reward += self._own(done.reward, self._envs).squeeze(2)
         self._episode_actions.append(actions)
         if done.truncated:
+            # Networks that are not finite stay so: once an episode is soon enough.
+            self._broken |= ~actions.isfinite().all(2).all(1)
             score = self._own(done.info["score"], self._envs).squeeze(2)
             self._ended.append(torch.stack([self._reward, score]))
             self._reward.zero_()
@@ -206,15 +209,16 @@ class Population:
 
     def _advance(self, env: TensorEnv, actions: Tensor) -> Transition:
         """Advance environments; those of agents that are not here rest."""
-        rows = env.batch.size // actions.shape[1]
-        everyone = torch.zeros((rows, *actions.shape[1:]), dtype=torch.float64, device=self._device)
-        everyone[self._numbers] = actions.double().nan_to_num()
+        everyone = actions.double().nan_to_num()
+        if not self._alone:
+            own, size = everyone, env.batch.size // actions.shape[1]
+            everyone = own.new_zeros((size, *own.shape[1:])).index_copy_(0, self._numbers, own)
         return env.step(everyone.flatten(0, 1), strict=False)
 
     def _own(self, table: Tensor, envs: int) -> Tensor:
         """Return the agents' rows of a table of all environments, shape [agent, env, entry or 1]."""
         rows = table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
-        return rows.index_select(0, self._numbers)
+        return rows if self._alone else rows.index_select(0, self._numbers)
 
     def _split(self, table: Tensor) -> list[Tensor]:
         return list(table.split([stack.count for stack in self.stacks]))

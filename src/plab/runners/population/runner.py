@@ -180,7 +180,8 @@ class PopulationRunner(Runner):
             return
         each = 4 * self._sizes.entries * self._sizes.capacity(method, self._total)
         if method.torch_device == "cuda":
-            room = float(torch.cuda.mem_get_info()[0])
+            # The simulators and the networks take little beside them.
+            room = 0.9 * torch.cuda.mem_get_info()[0]
         else:
             room = max(cfg.sim.memory_mb * 1e6, each)
         if len(self.tracks) * each > room:
