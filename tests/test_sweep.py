@@ -273,8 +273,7 @@ def test_batches_hold_what_one_simulator_can_serve() -> None:
     assert [[cfgs.index(cfg) for cfg in batch] for batch in batches] == [
         [0, 1, 3],
         [2],
-        [4],
-        [8],
+        [4, 8],
         [5],
         [6],
         [7],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -16,7 +17,9 @@ import pandas as pd
 import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
+from rich.console import Console
 
+from plab import progress
 from plab.config import Config, load_config
 from plab.results import RunResult, read, result_path
 from plab.run import main
@@ -24,10 +27,20 @@ from plab.runners import run_batch
 
 pytestmark = pytest.mark.physics
 
-LAUNCHERS = {"batch_joblib": "loky", "batch_submitit_local": "submitit", "batch_ray": "ray::"}
+LAUNCHERS = {
+    "batch_joblib": "loky",
+    "batch_submitit_local": "submitit",
+    "batch_ray": "ray::",
+    "batch_gpus": "spawn_main",
+}
 """Launcher to a word in the command lines of its jobs' processes."""
 
-NEEDED = {"batch_joblib": "joblib", "batch_submitit_local": "submitit", "batch_ray": "ray"}
+NEEDED = {
+    "batch_joblib": "joblib",
+    "batch_submitit_local": "submitit",
+    "batch_ray": "ray",
+    "batch_gpus": "torch",
+}
 """Launcher to the package that it needs. Ray cannot be installed next to today's joblib."""
 
 COARSE = (
@@ -51,9 +64,10 @@ def files(folder: Path) -> set[Path]:
 
 
 @pytest.fixture(params=LAUNCHERS)
-def launcher(request: pytest.FixtureRequest) -> str:
-    """A launcher that is installed."""
+def launcher(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A launcher that is installed; on two GPUs that are none, as the runs compute on the CPU."""
     pytest.importorskip(NEEDED[request.param])
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
     return request.param
 
 
@@ -62,9 +76,44 @@ def test_a_sweep_through_another_launcher(tmp_path: Path, launcher: str) -> None
     done = subprocess.run(sweep, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    assert any(line.startswith("3 runs go to ") and line.endswith(" in 2 jobs") for line in lines)
+    if launcher == "batch_gpus":
+        assert sum(line.startswith("finished: score ") for line in lines) == 3
+    else:
+        assert any(line.startswith("3 runs go to ") and line.endswith(" in 2 jobs") for line in lines)
     assert lines[-1] == "3 runs: 3 finished, 0 finished before"
     assert len(files(tmp_path)) == 3
+
+
+def test_each_gpu_has_a_process_and_all_are_shown_together(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    sweep = [one for one in command("batch_gpus", "seed=0,1,2", "method.iterations=2") if "=false" not in one]
+    sweep.remove("hydra.launcher.batch_size=2")
+    done = subprocess.run(sweep, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    for name in ("3", "5"):
+        shown = [line for line in lines if line.startswith(f"GPU {name} [0/3 runs] ")]
+        assert shown and " 2/2, 0:00:00 left, " in shown[-1]
+    # Without batch_size each process has its share.
+    assert any(" Rope, 2 runs " in line for line in lines) and any(" Rope-v1 adam " in line for line in lines)
+    assert {read(path).provenance["batch"] for path in files(tmp_path)} == {1, 2}
+
+
+def test_without_gpus_there_is_nobody_to_compute(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert main(["-m", "hydra/launcher=batch_gpus", "seed=0,1"]) == 2
+    message = "plab: hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out\n"
+    assert capsys.readouterr().err == message
+
+
+def test_bars_of_several_processes_on_a_terminal(monkeypatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(progress, "Console", lambda: Console(file=screen, force_terminal=True, width=120))
+    with progress.show_several(["GPU 0", "GPU 1"]) as report:
+        report("GPU 1", "Rope, 2 runs", 0, 8, 10, 3, "loss 2")
+    last = screen.getvalue().rsplit("GPU 0", 1)[1]
+    assert "GPU 1 Rope, 2 runs" in last and "3/8" in last and "loss 2" in last
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch, capsys) -> None:

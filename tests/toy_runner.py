@@ -88,7 +88,7 @@ class ToyRunner(Runner):
 
 def toy_family(name: str) -> Family:
     """Return one of plab's families with this runner."""
-    return replace(FAMILIES[name], runner=ToyRunner)
+    return replace(FAMILIES[name], runner=ToyRunner, population=ToyRunner)
 
 
 def _count(job: Job) -> int:

@@ -39,15 +39,16 @@ class BatchLauncher(Launcher):
     Hydra gives a launcher no other way to tell the command line.
     """
 
-    def __init__(self, batch_size: int | None, inner: DictConfig | None) -> None:
+    def __init__(self, batch_size: int | None, inner: DictConfig | None, on_gpus: bool) -> None:
         """Keep the settings.
 
         Args:
             batch_size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
             inner: Configuration of the launcher that carries out the batches, as jobs of its own; this
                 process does if None.
+            on_gpus: Whether a process for each GPU does.
         """
-        self._size, self._inner = batch_size, inner
+        self._size, self._inner, self._on_gpus = batch_size, inner, on_gpus
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Take what Hydra gives to launchers."""
@@ -60,6 +61,7 @@ class BatchLauncher(Launcher):
         from plab.results import result_path
         from plab.sweep.carry import carry_here, run_sweep
         from plab.sweep.compose import Refused, compose_jobs
+        from plab.sweep.gpus import carry_on, gpus
         from plab.tally import Outcome, Tally
 
         if self._size is not None and self._size < 1:
@@ -71,18 +73,21 @@ class BatchLauncher(Launcher):
             raise ConfigError(refused[0].reason)
         cfgs = {n: entry for n, entry in enumerate(entries) if not isinstance(entry, Refused)}
         paths = {n: str(result_path(cfg)) for n, cfg in cfgs.items()}
-        carry = carry_here
+        carry, processes = carry_here, 1
         if self._inner is not None:
             carry = self._carry_elsewhere({paths[n]: job_overrides[n] for n in cfgs})
         else:
             for cfg in cfgs.values():
                 check_device(cfg)
                 check_packages(cfg)
+        if self._on_gpus:
+            names = gpus()
+            carry, processes = carry_on(names), len(names)
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]
         scores: dict[str, float] = {}
-        for one in run_sweep(list(cfgs.values()), carry, self._size):
+        for one in run_sweep(list(cfgs.values()), carry, self._size, processes):
             tally.outcomes.append(one)
             scores[one.path] = one.score
         return [_job_return(scores[paths[n]] if n in paths else math.nan) for n in range(len(entries))]

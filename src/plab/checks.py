@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from plab.config import Config, ConfigError, build_scene
 from plab.targets import check_target, load_release_target
 
-__all__ = ["check_device", "check_packages", "check_sources", "cuda_is_usable"]
+__all__ = ["check_device", "check_packages", "check_sources", "cuda_devices", "cuda_is_usable"]
 
 
 def check_sources(cfg: Config) -> None:
@@ -48,11 +48,16 @@ def check_packages(cfg: Config) -> None:
 
 
 def cuda_is_usable() -> bool:
-    """Return whether there is a CUDA device, by asking the driver: there is no library to import."""
+    """Return whether there is a CUDA device."""
+    return cuda_devices() > 0
+
+
+def cuda_devices() -> int:
+    """Return how many CUDA devices there are, by asking the driver: there is no library to import."""
     count = ctypes.c_int(0)
     try:
         driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
-        return False
+        return 0
     answered = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
-    return answered and count.value > 0
+    return count.value if answered else 0

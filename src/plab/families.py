@@ -19,6 +19,7 @@ RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
 
 _TYPES = "plab.config_types"
+_AGENTS = "plab.runners.population"
 
 Kind = TypeVar("Kind")
 
@@ -45,10 +46,13 @@ class Rule:
     Attributes:
         what: It, or its ``module:NAME``; of which kind it is, is up to the family's runner.
         config: Type of the section ``method``, or its ``module:NAME``; None: the family's.
+        agents: What learns in a population, many agents at once, or its ``module:NAME``; see
+            :attr:`Family.population`.
     """
 
     what: Any
     config: type | str | None = None
+    agents: type | str | None = None
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,8 @@ class Family:
         columns: Columns of the results beside those that all methods have.
         may_be_nan: Those of them with entries for which there is no number.
         batching: Whether runs can share a simulator; else each runs alone.
+        population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they
+            share a simulator if they have the same section ``method``. ``runner`` carries out the others.
         rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
         methods: Appearance of methods by name; others appear in grey, by their names.
@@ -74,6 +80,7 @@ class Family:
     columns: tuple[str, ...] = ()
     may_be_nan: tuple[str, ...] = ()
     batching: bool = False
+    population: type | str | None = None
     rules: Mapping[str, Rule] = field(default_factory=dict)
     kind: str = ""
     methods: Mapping[str, Appearance] = field(default_factory=dict)
@@ -87,6 +94,21 @@ class Family:
         """
         return _loaded(self.rules[name].what, kind)
 
+    def agents(self, name: str) -> type:
+        """Return the agents of a rule.
+
+        Raises:
+            plab.config.ConfigError: If they cannot be imported.
+            KeyError: If there is no such rule.
+        """
+        return _loaded(self.rules[name].agents, type)
+
+    def joins_populations(self, method: Any) -> bool:
+        """Whether a sweep's runs with this section ``method`` are agents of a population."""
+        rule = self.rules.get(getattr(method, "algorithm", ""))
+        # TensorBoard's events are what Stable-Baselines3 logs.
+        return rule is not None and rule.agents is not None and not method.tensorboard
+
     def config_type(self, rule: str | None = None) -> type:
         """Return the type of the section ``method``, of a rule that has one of its own that.
 
@@ -96,13 +118,13 @@ class Family:
         own = self.rules[rule].config if rule is not None and rule in self.rules else None
         return _loaded(own or self.config, type)
 
-    def runner_type(self) -> type:
-        """Return the runner.
+    def runner_type(self, *, population: bool = False) -> type:
+        """Return the runner, or that of populations.
 
         Raises:
             plab.config.ConfigError: If it cannot be imported.
         """
-        return _loaded(self.runner, type)
+        return _loaded(self.population if population else self.runner, type)
 
 
 def _loaded(what: Any, kind: type[Kind]) -> Kind:
@@ -132,13 +154,14 @@ FAMILIES: dict[str, Family] = {
         label="a policy that learns from rewards",
         config=f"{_TYPES}:RlConfig",
         runner="plab.runners.rl:RlRunner",
+        population="plab.runners.population.runner:PopulationRunner",
         columns=("train_reward", "train_score"),
         # No episode of training may have ended.
         may_be_nan=("train_reward", "train_score"),
         rules={
-            "sac": Rule("plab.runners.rl_models:SAC", f"{_TYPES}:SacConfig"),
-            "td3": Rule("plab.runners.rl_models:TD3", f"{_TYPES}:Td3Config"),
-            "ppo": Rule("plab.runners.rl_models:PPO", f"{_TYPES}:PpoConfig"),
+            "sac": Rule("plab.runners.rl_models:SAC", f"{_TYPES}:SacConfig", f"{_AGENTS}.sac:SacAgents"),
+            "td3": Rule("plab.runners.rl_models:TD3", f"{_TYPES}:Td3Config", f"{_AGENTS}.td3:Td3Agents"),
+            "ppo": Rule("plab.runners.rl_models:PPO", f"{_TYPES}:PpoConfig", f"{_AGENTS}.ppo:PpoAgents"),
         },
         kind=RL,
         methods={

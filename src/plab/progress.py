@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 
@@ -18,13 +18,24 @@ from rich.progress import (
 )
 from rich.table import Column
 
-__all__ = ["Report", "show_progress"]
+__all__ = ["Report", "forward_to", "show_progress", "show_several"]
 
 Report = Callable[[int, str], None]
 """Takes the number of steps done and a short text about how it goes."""
 
+Forward = Callable[[str, int, int, int, int, str], None]
+"""Takes title, first step, steps to do, steps between two plain lines, steps done, and text."""
+
+_forward: Forward | None = None
+
 PLAIN_EVERY = 10
 """Steps between two lines where there is no terminal, unless asked for otherwise."""
+
+
+def forward_to(forward: Forward) -> None:
+    """Let another process show what this one has to show from now on."""
+    global _forward
+    _forward = forward
 
 
 @contextmanager
@@ -46,12 +57,49 @@ def show_progress(
     console = Console()
     if not enabled:
         yield lambda done, text: None
+    elif (forward := _forward) is not None:
+        yield lambda done, text: forward(title, start, total, plain_every, done, text)
     elif not console.is_terminal:
         yield _plain(title, start, total, plain_every)
     else:
         with Progress(*_columns(), console=console, expand=True) as progress:
             task = progress.add_task(title, total=total, completed=start, text="")
             yield lambda done, text: progress.update(task, completed=done, text=text)
+
+
+@contextmanager
+def show_several(
+    names: Sequence[str], *, enabled: bool = True
+) -> Iterator[Callable[[str, str, int, int, int, int, str], None]]:
+    """Show how far several processes have come while the ``with`` block lasts, a bar each.
+
+    Args:
+        names: Names of the processes.
+        enabled: Whether to show anything.
+
+    Yields:
+        Function of a name and what the process has forwarded.
+    """
+    console = Console()
+    if not (enabled and console.is_terminal):
+        lines: dict[tuple[str, str], Report] = {}
+
+        def say(name: str, title: str, start: int, total: int, every: int, done: int, text: str) -> None:
+            if enabled:
+                key = name, title
+                lines.setdefault(key, _plain(f"{name} {title}", start, total, every))(done, text)
+
+        yield say
+        return
+    with Progress(*_columns(), console=console, expand=True) as progress:
+        tasks = {name: progress.add_task(name, total=None, text="") for name in names}
+
+        def draw(name: str, title: str, _start: int, total: int, _every: int, done: int, text: str) -> None:
+            progress.update(
+                tasks[name], description=f"{name} {title}", total=total, completed=done, text=text
+            )
+
+        yield draw
 
 
 def _columns() -> tuple[ProgressColumn, ...]:

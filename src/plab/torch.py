@@ -217,11 +217,13 @@ class TensorEnv:
         observation, _info = self.batch.reset(self._like)
         return torch.as_tensor(observation)
 
-    def step(self, actions: torch.Tensor) -> Transition:
+    def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
         """Advance all environments by one step.
 
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1].
+            strict: Whether an environment that breaks off is an error; see
+                :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
             Tensors; observations are float32, the others have the type of the actions.
@@ -229,12 +231,12 @@ class TensorEnv:
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
             gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
-            plab.sim.SimulationError: If a state stops being finite.
+            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
         actions = actions.detach().to(self.device)
         if self.device.type == "cuda":
-            return self.batch.step(actions)
-        done = self.batch.step(actions.double().numpy())
+            return self.batch.step(actions, strict=strict)
+        done = self.batch.step(actions.double().numpy(), strict=strict)
         info = {name: torch.as_tensor(values).to(actions) for name, values in done.info.items()}
         reward = torch.as_tensor(done.reward).to(actions)
-        return Transition(torch.as_tensor(done.observation), reward, done.truncated, info)
+        return replace(done, observation=torch.as_tensor(done.observation), reward=reward, info=info)

@@ -2,10 +2,13 @@
 
     python -m plab.bench.rl task=Move --methods ppo sac --envs 1 16
     python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256
+    python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
 
 prints a row per method and number of environments: transitions per second, and the milliseconds that each
 part takes per step of all environments; each is waited for before the next one begins. What runs is the
 training of plab.run, an update after every batch of episodes for ppo, in minibatches of the profile's size.
+With --agents it is populations, as in sweeps: the transitions per second are those of all agents together and
+of a training that waits for nothing, evaluations and states of checkpoints included, without their files.
 """
 
 from __future__ import annotations
@@ -15,8 +18,9 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +37,30 @@ from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES
 from plab.runners.common import torch_settings
+from plab.runners.population.agents import OffPolicyAgents
+from plab.runners.population.population import Population
 from plab.runners.rl_trainer import Trainer
+from plab.torch import TensorEnv
 
-__all__ = ["main", "measure"]
+__all__ = ["main", "measure", "measure_population"]
+
+SIMULATOR_PARTS = (
+    ("step", "simulate"),
+    ("measure", "judge"),
+    ("observe", "observe"),
+    ("poses", "observe"),
+)
+"""Methods of the simulator, and the parts that they are of."""
 
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
 """Simulator's step; loss and IoU; observations and their copy from the device; actions; learning."""
+
+POPULATION = (
+    *("task", "device", "method", "agents", "num_envs", "steps_per_s", *(f"{p}_ms" for p in PARTS)),
+    *("evaluate_s", "state_s", "agent_mb"),
+)
+"""Columns of populations: seconds of an evaluation of all, and of making all states; memory per agent, on
+CUDA what torch has at most, on the CPU its replay buffer."""
 
 COLUMNS = ("task", "device", "method", "num_envs", "threads", "steps_per_s", *(f"{p}_ms" for p in PARTS))
 
@@ -75,21 +97,81 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
     } | {f"{part}_ms": round(seconds[part] / steps * 1e3, 2) for part in PARTS}
 
 
+def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, object]:
+    """Train a population for some batches of episodes, twice, and return a row of the table.
+
+    Args:
+        cfg: The configuration of each agent but for the seed.
+        agents: Number of agents.
+        batches: Batches of episodes to time, after one that compiles the kernels.
+    """
+    method, horizon = cfg.method_as(RlConfig), cfg.sim.horizon
+    cfgs = [replace(cfg, seed=seed) for seed in range(agents)]
+    with torch_settings(method.torch_threads):
+        training = TensorEnv([one for one in cfgs for _ in range(method.num_envs)], contact=method.contact)
+        evaluation = TensorEnv(cfgs)
+        population = Population(cfgs, range(agents), training, evaluation, [None] * agents)
+        population.evaluate()
+        population.train(2 * method.num_envs)
+        more = batches * method.num_envs
+        trained = _seconds(lambda: population.train(population.episodes + more))
+        evaluated, stated = _seconds(population.evaluate), _seconds(population.states)
+        parts: dict[str, float] = defaultdict(float)
+        simulator = training.batch.problem.simulator
+        timed: list[tuple[Any, str, str]] = [(simulator, name, part) for name, part in SIMULATOR_PARTS]
+        learning = ("act", "policy"), ("learn", "update")
+        timed += [(stack, name, part) for stack in population.stacks for name, part in learning]
+        with _timing(timed, parts):
+            total = _seconds(lambda: population.train(population.episodes + more))
+        parts["rest"] = total - sum(parts.values())
+    share = more / method.evaluate_every
+    return {
+        "task": cfg.task.name,
+        "device": f"{cfg.sim.device}/{method.torch_device}",
+        "method": method.name,
+        "agents": agents,
+        "num_envs": method.num_envs,
+        "steps_per_s": round(agents * more * horizon / (trained + share * (evaluated + stated)), 1),
+        "evaluate_s": round(evaluated, 3),
+        "state_s": round(stated, 3),
+        "agent_mb": round(_memory(population) / agents / 1e6, 1),
+    } | {f"{part}_ms": round(parts[part] / (batches * horizon) * 1e3, 2) for part in PARTS}
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Return how long a call takes, with the work on CUDA that it only queues."""
+    _synchronise()
+    start = time.perf_counter()
+    call()
+    _synchronise()
+    return time.perf_counter() - start
+
+
+def _memory(population: Population) -> int:
+    if torch.cuda.is_initialized():
+        return torch.cuda.max_memory_allocated()
+    return sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
+
+
 @contextmanager
 def _timed(batch: EpisodeBatch, trainer: Trainer, seconds: dict[str, float]) -> Iterator[None]:
     """Add up the time spent in each part inside the ``with`` block."""
     simulator, model = batch.problem.simulator, trainer.model
     parts: list[tuple[Any, str, str]] = [
-        (simulator, "step", "simulate"),
-        (simulator, "measure", "judge"),
-        (simulator, "observe", "observe"),
-        (simulator, "poses", "observe"),
+        *((simulator, name, part) for name, part in SIMULATOR_PARTS),
         (model, "train", "update"),
         (model, "predict", "policy"),
         (model.policy, "forward", "policy"),
     ]
     # Those of the off-policy methods are called by predict, which is timed already.
     parts = parts[:-1] if getattr(model, "replay_buffer", None) is not None else parts
+    with _timing(parts, seconds):
+        yield
+
+
+@contextmanager
+def _timing(parts: Sequence[tuple[Any, str, str]], seconds: dict[str, float]) -> Iterator[None]:
+    """Add up the time spent in methods, given with their owners and the parts that they are of."""
     for owner, name, part in parts:
         setattr(owner, name, _timer(getattr(owner, name), part, seconds))
     try:
@@ -104,20 +186,25 @@ def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Ca
         start = time.perf_counter()
         result = call(*args, **kwargs)
         # Work on CUDA is only queued: the next part that waits would be charged with it.
-        ti.sync()
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
+        _synchronise()
         seconds[part] += time.perf_counter() - start
         return result
 
     return timed
 
 
-def _config(overrides: list[str], method: str, num_envs: int, batches: int) -> Config:
-    """Return a training of a few batches of episodes, each followed by its share of updates."""
+def _synchronise() -> None:
+    ti.sync()
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def _config(overrides: list[str], method: str, num_envs: int, batches: int, *, whole: bool = False) -> Config:
+    """Return a training of a few batches of episodes, or of all, each followed by its share of updates."""
     cfg = load_config([*overrides, f"method={method}", f"method.num_envs={num_envs}"])
     own = cfg.method_as(RlConfig)
-    own.episodes = num_envs * (batches + 1)
+    if not whole:
+        own.episodes = num_envs * (batches + 1)
     if isinstance(own, OffPolicyConfig):
         # Learning begins with the batch that is timed.
         own.learning_starts = num_envs * cfg.sim.horizon
@@ -137,6 +224,7 @@ def main(argv: list[str] | None = None) -> int:
     methods = tuple(FAMILIES["rl"].rules)
     parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
     parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
+    parser.add_argument("--agents", type=positive, nargs="+", help="numbers of agents of populations")
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
@@ -144,6 +232,16 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.agents:
+        batches = options.batches
+        rows = (
+            measure_population(_config(options.overrides, method, num_envs, batches, whole=True), k, batches)
+            for k in options.agents
+            for num_envs in options.envs
+            for method in options.methods
+        )
+        report(POPULATION, rows, options.csv)
+        return 0
     table = (
         measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
         for num_envs in options.envs

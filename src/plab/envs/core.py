@@ -7,7 +7,7 @@ asks for, and add nothing of their own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -20,7 +20,7 @@ from plab.config import Config, load_config
 from plab.objective import OBSERVED_PARTICLES, batch_scores, score_scale, total_loss
 from plab.problem import Problem
 from plab.scene import Scene
-from plab.sim import CONTACT_MODELS, Simulator
+from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ __all__ = [
     "check_render_mode",
     "compose_configs",
     "refuse_options",
+    "spaces",
 ]
 
 Array: TypeAlias = Any
@@ -140,12 +141,15 @@ class Transition:
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         truncated: Whether the episodes are over.
         info: The entries of ``info``, each of shape [batch], in type like the rewards.
+        failures: Environments that have broken off in the episode, and when and why; their numbers mean
+            nothing. Empty unless the step was not ``strict``.
     """
 
     observation: Array
     reward: Array
     truncated: bool
     info: dict[str, Array]
+    failures: Mapping[int, str] = field(default_factory=dict)
 
 
 class EpisodeBatch:
@@ -179,10 +183,9 @@ class EpisodeBatch:
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
         scenes = self.problem.scenes
-        self._stride = max(scenes[0].particle_count // OBSERVED_PARTICLES, 1)
+        self._stride = _stride(scenes[0])
         self._pose_entries = _pose_entries(scenes[0])
-        self.observation_space = _observation_space(scenes, self._stride)
-        self.action_space = Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
+        self.observation_space, self.action_space = spaces(scenes)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
         self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
@@ -228,17 +231,19 @@ class EpisodeBatch:
         # Copies: a caller may keep and change what it is given.
         return self._initial_observation.copy(), {name: v.copy() for name, v in self._initial_info.items()}
 
-    def step(self, actions: Array) -> Transition:
+    def step(self, actions: Array, *, strict: bool = True) -> Transition:
         """Advance all sub-environments by one step.
 
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes back
                 are tensors on the same device, and no array crosses to the host.
+            strict: Whether a sub-environment that breaks off is an error, instead of an entry in
+                ``failures``; the others go on, and it is whole again after :meth:`reset`.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
             gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
-            plab.sim.SimulationError: If a state stops being finite.
+            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         simulator = self._simulator
@@ -249,10 +254,17 @@ class EpisodeBatch:
         simulator.step(actions, check=False)
         # Queued before the wait for the measures.
         observation = self._observe(actions)
-        info = self._info(actions)
+        failures: Mapping[int, str] = {}
+        try:
+            info = self._info(actions)
+        except SimulationError as error:
+            if strict:
+                raise
+            # Told once a step: asked again, the measures are those of the others.
+            failures, info = error.failures, self._info(actions)
         self._step += 1
         reward = self._initial_loss.like(actions) - info["loss"]
-        return Transition(observation, reward, self._step == self.horizon, info)
+        return Transition(observation, reward, self._step == self.horizon, info, failures)
 
     def frames(self) -> tuple[np.ndarray, ...]:
         """Draw the current states.
@@ -309,18 +321,24 @@ def _pose_entries(scene: Scene) -> np.ndarray:
     return np.flatnonzero(observed)
 
 
-def _observation_space(scenes: Sequence[Scene], stride: int) -> Box:
-    """Return the space that holds the observations of all scenes."""
-    observed = len(range(0, scenes[0].particle_count, stride))
+def _stride(scene: Scene) -> int:
+    """Return the distance of the observed particles' numbers."""
+    return max(scene.particle_count // OBSERVED_PARTICLES, 1)
+
+
+def spaces(scenes: Sequence[Scene]) -> tuple[Box, Box]:
+    """Return the spaces that hold the observations and the actions of all scenes."""
+    observed = len(range(0, scenes[0].particle_count, _stride(scenes[0])))
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
-    return Box(
+    observation = Box(
         np.concatenate([low * observed, bounds[:, 0].min(axis=0)]).astype(np.float32),
         np.concatenate([high * observed, bounds[:, 1].max(axis=0)]).astype(np.float32),
         dtype=np.float32,
     )
+    return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
 
 
 def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from plab.config_errors import ConfigError
 from plab.families import family
@@ -43,7 +43,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
     job = Job(cfg, RunFile(cfg))
     before = job.run.finished
     if not before:
-        _carry_out([job], "", cache or SimulatorCache())
+        _carry_out_all([job], "", cache or SimulatorCache(), in_sweep=False)
     if job.error is not None:
         raise job.error
     score = job.run.result.score
@@ -74,9 +74,9 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
         except ResultsError as error:
             ended[number] = outcome(cfg, "refused", message=str(error))
     before = {number for number, job in jobs.items() if job.run.finished}
-    if todo := [job for number, job in jobs.items() if number not in before]:
-        _carry_out(todo, note, cache or SimulatorCache())
-        _print_bugs(todo)
+    todo = [job for number, job in jobs.items() if number not in before]
+    _carry_out_all(todo, note, cache or SimulatorCache(), in_sweep=True)
+    _print_bugs(todo)
     for number, job in jobs.items():
         ended[number] = one = _outcome(job, "before" if number in before else "finished")
         if one.status == "finished":
@@ -100,11 +100,30 @@ def _print_bugs(jobs: Sequence[Job]) -> None:
             traceback.print_exception(error)
 
 
-def _carry_out(jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
+def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_sweep: bool) -> None:
+    """Run jobs to their ends, those together that one runner can carry out together."""
+    parties: dict[Any, list[Job]] = {}
+    try:
+        for number, job in enumerate(jobs):
+            try:
+                own = family(job.cfg.method.family)
+                kind = _runner(job, in_sweep=in_sweep)
+                shares = own.batching or kind is not own.runner_type()
+                parties.setdefault((kind, None if shares else number), []).append(job)
+            except Exception as error:
+                job.fail(error)
+        for (kind, _), together in parties.items():
+            _carry_out(together, kind, note, cache)
+    finally:
+        for job in jobs:
+            job.run.release()
+
+
+def _carry_out(jobs: Sequence[Job], kind: type[Runner], note: str, cache: SimulatorCache) -> None:
     """Run jobs to their ends; afterwards each has finished or has an error, and holds no lock."""
     halves: list[Sequence[Job]] = []
     try:
-        _runner(jobs[0].cfg.method.family)(jobs, note, cache).run()
+        kind(jobs, note, cache).run()
     except KeyboardInterrupt:
         for job in jobs:
             if job.open:
@@ -124,11 +143,17 @@ def _carry_out(jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
                 job.run.release()
     # Not in the handler: there the error still refers to the simulator that was too large.
     for half in halves:
-        _carry_out(half, note, cache)
+        _carry_out(half, kind, note, cache)
 
 
-def _runner(name: str) -> type[Runner]:
-    kind = family(name).runner_type()
+def _runner(job: Job, *, in_sweep: bool) -> type[Runner]:
+    """Return who carries out a run: whoever has begun it goes on."""
+    name, result = job.cfg.method.family, job.run.result
+    own = family(name)
+    population = in_sweep and own.joins_populations(job.cfg.method)
+    if result.resume is not None:
+        population = bool(result.provenance.get("population", False))
+    kind = own.runner_type(population=population)
     if not issubclass(kind, Runner):
         raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
     return kind

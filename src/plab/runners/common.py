@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLUMNS",
+    "LAST",
     "PolicyEpisode",
+    "environment_key",
     "episode_columns",
     "measures",
     "policy_episode",
@@ -36,7 +38,7 @@ COLUMNS = ("loss", "reward", "iou", "score")
 """Columns of the results that every method has: what an episode is measured by, beside the terms of its
 loss."""
 
-_LAST = ("iou", "score")
+LAST = ("iou", "score")
 """Columns that judge the last state; the others are sums over the steps."""
 
 
@@ -95,7 +97,7 @@ def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarra
         observation, values = step.observation, step.info | {"reward": step.reward}
         for name in sums:
             sums[name] += float(values[name][0])
-    last = {name: float(values[name][0]) for name in _LAST}
+    last = {name: float(values[name][0]) for name in LAST}
     return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
 
 
@@ -111,6 +113,14 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
     return Problem(cfgs, cache.get(key, build, check=Simulator.reset))
 
 
+def environment_key(cfg: Config) -> str:
+    """Return a text that is the same for configurations whose environments are alike."""
+    method = asdict(cfg.method)
+    loss = [method["loss_weights"], method["loss_terms"]]
+    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+    return json.dumps([*sections, loss, cfg.variant])
+
+
 def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
     """Return environments of a configuration, those kept from the last run if they fit.
 
@@ -122,9 +132,6 @@ def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) 
     Returns:
         One batch per kind, in its initial state.
     """
-    method = asdict(cfg.method)
-    loss = [method["loss_weights"], method["loss_terms"]]
-    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
 
     def build() -> list[EpisodeBatch]:
         return [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]
@@ -134,7 +141,7 @@ def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) 
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
 
-    return cache.get(json.dumps([*sections, loss, kinds, cfg.variant]), build, check=start_again)
+    return cache.get((environment_key(cfg), kinds), build, check=start_again)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from plab.results import ResultsError
 from plab.results.files import replace_file
 from plab.runners.rl_models import CLIP, model_kind
 
-__all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
+__all__ = ["Policy", "load_policy", "model_policy", "policy_path", "save_policy"]
 
 EPSILON = 1e-8
 """Added to variances of observations, as Stable-Baselines3 does."""
@@ -60,17 +60,13 @@ def policy_path(result: Path) -> Path:
     return result.with_suffix(".policy.npz")
 
 
-def save_policy(result: Path, family: str, algorithm: str, state: Mapping[str, Any]) -> None:
-    """Write the policy of a checkpoint beside the result.
+def model_policy(family: str, algorithm: str, state: Mapping[str, Any]) -> BasePolicy:
+    """Return the policy of a checkpoint.
 
     Args:
-        result: The run's result file.
         family: Family of the method, as ``method.family`` names it.
         algorithm: Learning algorithm, as ``method.algorithm`` names it.
         state: The checkpoint, a :meth:`plab.runners.rl_trainer.Trainer.state`.
-
-    Raises:
-        ResultsError: If the file cannot be written.
     """
     # The replay buffer of a training that is over is not to be looked for.
     without_buffer: dict[str, Any] = {
@@ -80,17 +76,39 @@ def save_policy(result: Path, family: str, algorithm: str, state: Mapping[str, A
     }
     kind: type[BaseAlgorithm] = model_kind(family, algorithm).model
     model = kind.load(io.BytesIO(state["model"].tobytes()), device="cpu", custom_objects=without_buffer)
+    return model.policy
+
+
+def save_policy(
+    result: Path,
+    family: str,
+    algorithm: str,
+    policy: BasePolicy,
+    moments: tuple[np.ndarray, np.ndarray] | None,
+) -> None:
+    """Write a policy beside the result.
+
+    Args:
+        result: The run's result file.
+        family: Family of the method, as ``method.family`` names it.
+        algorithm: Learning algorithm, as ``method.algorithm`` names it.
+        policy: Stable-Baselines3's policy.
+        moments: Means and variances of the observations that scale them, shape [entry]; None if they were not
+            scaled.
+
+    Raises:
+        ResultsError: If the file cannot be written.
+    """
     buffer = io.BytesIO()
     # torch takes files as it takes paths.
-    model.policy.save(cast(str, buffer))
+    policy.save(cast(str, buffer))
     arrays: dict[str, Any] = {
         "family": np.array(family),
         "algorithm": np.array(algorithm),
         "policy": np.frombuffer(buffer.getvalue(), np.uint8),
     }
-    if state["statistics"]:
-        moments = state["statistics"]["observation"]
-        arrays |= {"mean": np.asarray(moments["mean"]), "variance": np.asarray(moments["var"])}
+    if moments is not None:
+        arrays |= {"mean": np.asarray(moments[0]), "variance": np.asarray(moments[1])}
     packed = io.BytesIO()
     np.savez(packed, **arrays)
     replace_file(policy_path(result), packed.getvalue(), sync=True)

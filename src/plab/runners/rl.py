@@ -23,19 +23,16 @@ from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results import RunFile
 from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
-from plab.runners.policy import save_policy
+from plab.runners.policy import model_policy, save_policy
 from plab.runners.rl_models import total_steps
 from plab.runners.rl_trainer import Trainer
 from plab.runners.runner import Runner, Step, Track
 
-__all__ = ["RlRunner"]
+__all__ = ["RlRunner", "check_torch_device"]
 
 
 class RlRunner(Runner):
     """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy."""
-
-    # Each time: the replay buffer's file follows the training, and the state has to follow it.
-    KEEP_ALL = True
 
     _trainer: Trainer | None = None
     _watch: _Watch | None = None
@@ -48,7 +45,7 @@ class RlRunner(Runner):
         """Make the environments of the training, and the one in the hard contact model that judges."""
         cfg = self.tracks[0].cfg
         check_packages(cfg)
-        _check_torch_device(self._method)
+        check_torch_device(self._method)
         kinds = (self._method.num_envs, self._method.contact), (1, "hard")
         self._training, self._evaluation = shared_batches(self.cache, cfg, *kinds)
         self.problem = self._evaluation.problem
@@ -74,7 +71,9 @@ class RlRunner(Runner):
         done = self.episode(trainer)
         trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
         measured = done.measures | trainer.take_statistics()
-        return Step(measured, done.actions, trainer.state(), trainer.episodes, trainer.steps)
+        # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
+        counts = trainer.episodes, trainer.steps
+        return Step(measured, done.actions, trainer.state(), *counts, keep=True)
 
     def episode(self, trainer: Trainer) -> PolicyEpisode:
         """Run an episode of the deterministic policy."""
@@ -97,7 +96,11 @@ class RlRunner(Runner):
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last checkpoint, after which nothing is sampled any more."""
         state = cast("dict[str, Any]", track.job.run.result.resume)
-        save_policy(track.job.run.path, self._method.family, self._method.algorithm, state)
+        family, algorithm = self._method.family, self._method.algorithm
+        moments = None
+        if state["statistics"]:
+            moments = state["statistics"]["observation"]["mean"], state["statistics"]["observation"]["var"]
+        save_policy(track.job.run.path, family, algorithm, model_policy(family, algorithm, state), moments)
         self._replay_path.unlink(missing_ok=True)
 
     def _train(self, trainer: Trainer, track: Track) -> None:
@@ -151,8 +154,12 @@ def _logger(method: RlConfig, run: RunFile) -> Logger:
     return configure(str(run.path.with_suffix(".tensorboard")), ["tensorboard"])
 
 
-def _check_torch_device(method: RlConfig) -> None:
-    """Find out before anything is built whether torch has the device."""
+def check_torch_device(method: RlConfig) -> None:
+    """Find out before anything is built whether torch has the device.
+
+    Raises:
+        ConfigError: If not.
+    """
     if method.torch_device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"

@@ -29,6 +29,7 @@ __all__ = [
     "cycle_steps",
     "model_kind",
     "off_policy",
+    "rollout_steps",
     "total_steps",
 ]
 
@@ -102,7 +103,8 @@ def total_steps(method: RlConfig, horizon: int) -> int:
     return math.ceil(method.episodes * horizon / cycle) * cycle
 
 
-def _rollout_steps(method: PpoConfig) -> int:
+def rollout_steps(method: PpoConfig) -> int:
+    """Return the steps of all environments of an update of PPO."""
     return math.ceil(method.steps_per_update / method.num_envs)
 
 
@@ -140,7 +142,7 @@ def _td3(method: Td3Config, env: VecEnv) -> dict[str, Any]:
 
 
 def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
-    steps = _rollout_steps(method)
+    steps = rollout_steps(method)
     return {
         "learning_rate": LinearDecay(method.lr) if method.lr_decay else method.lr,
         "gamma": method.gamma,
@@ -163,5 +165,5 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
 
 SAC = ModelKind(CapturedSAC, _sac)
 TD3 = ModelKind(CapturedTD3, _td3)
-PPO = ModelKind(CapturedPPO, _ppo, _rollout_steps)
+PPO = ModelKind(CapturedPPO, _ppo, rollout_steps)
 """The learning algorithms; the names that ``method.algorithm`` gives them are in :mod:`plab.families`."""

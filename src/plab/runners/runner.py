@@ -43,6 +43,7 @@ class Step:
             iteration.
         steps: Environment steps that they have cost; None: those of the episodes.
         seconds: The run's share of the wall time; None: all of it.
+        keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
     """
 
     measures: Mapping[str, float]
@@ -51,6 +52,7 @@ class Step:
     episodes: int | None = None
     steps: int | None = None
     seconds: float | None = None
+    keep: bool = False
 
 
 class Track:
@@ -80,13 +82,12 @@ class Track:
         """Break the run off in its current iteration; the others of the batch go on."""
         self.job.fail(RunError(f"iteration {self.iteration}: {why}"))
 
-    def record(self, step: Step, columns: Sequence[str], *, keep: bool) -> dict[str, float]:
+    def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
         """Write an iteration to the file; return its row.
 
         Args:
             step: What the iteration gave.
             columns: Which of the measures.
-            keep: Write the state in any case, instead of every ``checkpoint_seconds``.
 
         Raises:
             ResultsError: If the file cannot be written.
@@ -103,7 +104,7 @@ class Track:
             "best_iteration": self.iteration,
             "best_loss": row["loss"],
         }
-        self.job.run.record(row, step.state, keep=keep, **(best if better else {}))
+        self.job.run.record(row, step.state, keep=step.keep, **(best if better else {}))
         self.iteration += 1
         if better:
             self.best_loss, self.best_actions = row["loss"], step.actions
@@ -118,14 +119,11 @@ class Runner:
     while any :meth:`has_more`, :meth:`close`, :meth:`conclude` of each run, :meth:`judge`.
 
     Attributes:
-        tracks: The runs; of a family that is not ``batching`` there is one.
+        tracks: The runs; there is one where runs cannot share a simulator.
         problem: What the best actions are judged in, an environment per run; :meth:`build` sets it.
         cache: Simulators of earlier runs.
         report: Takes how far the batch has come and a short text; see :mod:`plab.progress`.
     """
-
-    KEEP_ALL = False
-    """Whether the state is written after every iteration, instead of every ``checkpoint_seconds``."""
 
     problem: Problem
     report: Report
@@ -211,9 +209,9 @@ class Runner:
 
     # ------------------------------------------------------------------------------------ what hooks may use
 
-    def enter(self, phase: str) -> None:
-        """Count the wall time from now on as that of another phase."""
-        self._clock.enter(phase)
+    def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
+        """Count the wall time from now on as that of another phase, of other runs if some are given."""
+        self._clock.enter(phase, tracks)
 
     def actions_at_rest(self) -> np.ndarray:
         """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
@@ -280,7 +278,7 @@ class Runner:
             if step.seconds is None:
                 step = replace(step, seconds=time.perf_counter() - start)
             try:
-                rows.append(track.record(step, columns, keep=self.KEEP_ALL))
+                rows.append(track.record(step, columns))
             except ResultsError as error:
                 track.job.fail(error)
             start = time.perf_counter()

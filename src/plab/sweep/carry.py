@@ -26,7 +26,9 @@ Carrier = Callable[[list[list["Config"]], Callable[[], str]], Iterator[Outcome]]
 """Carries out batches: takes them and a function that says how far the sweep has come, yields outcomes."""
 
 
-def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -> Iterator[Outcome]:
+def run_sweep(
+    cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1
+) -> Iterator[Outcome]:
     """Carry out the runs of a sweep that are not finished, and yield how each ended.
 
     Runs that another process computes are left to it. Should it end before they do, they are taken up here.
@@ -35,6 +37,7 @@ def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -
         cfgs: The composed and checked configurations.
         carry: Who computes.
         size: Runs of a batch, at most; as many as fit the memory if None.
+        processes: How many carry out batches at a time.
     """
     # The same run given twice is one run.
     wanted = {result_path(cfg): cfg for cfg in cfgs}
@@ -55,7 +58,7 @@ def run_sweep(cfgs: Sequence[Config], carry: Carrier, size: int | None = None) -
 
     while todo:
         away = []
-        for one in carry(plan(todo, size), progress):
+        for one in carry(plan(todo, size, processes), progress):
             if one.status == "elsewhere":
                 away.append(one)
             else:

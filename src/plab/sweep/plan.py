@@ -19,16 +19,17 @@ if TYPE_CHECKING:
 __all__ = ["plan"]
 
 
-def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
+def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) -> list[list[Config]]:
     """Put configurations into batches.
 
-    Together go runs of one task by methods that differ in optimiser and contact model only: any variants, any
-    seeds, any material. Runs of methods that cannot share a simulator are batches of one, those of a kind one
-    after the other.
+    Together go runs of one task by methods that differ in optimiser and contact model only, or that learn
+    from rewards and do not differ: any variants, any seeds, any material. Runs of methods that cannot share a
+    simulator are batches of one, those of a kind one after the other.
 
     Args:
         cfgs: The composed and checked configurations.
         size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
+        processes: How many carry out batches at a time: each is to have one, if there are runs enough.
 
     Returns:
         Batches, each as evenly filled as the others of its kind.
@@ -40,7 +41,8 @@ def plan(cfgs: Sequence[Config], size: int | None = None) -> list[list[Config]]:
     first = {id(cfg): scene for cfg, scene in zip(cfgs, scenes, strict=True)}
     batches = []
     for group in groups.values():
-        batches += _split(group, _limit(group[0], first[id(group[0])], size))
+        limit = _limit(group[0], first[id(group[0])], size)
+        batches += _split(group, max(-(-len(group) // limit), -(-processes // len(groups))))
     return batches
 
 
@@ -50,20 +52,26 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
     kind = [cfg.task.name, cfg.method.family, *shared, loss]
-    if not family(cfg.method.family).batching:
+    own = family(cfg.method.family)
+    if not (own.batching or own.joins_populations(cfg.method)):
         return [*kind, cfg.variant, asdict(cfg.task), method]
-    # Runs of other lengths would have environments wait for each other.
-    return [*kind, method["iterations"], scene.particle_count, [m.shape for m in scene.manipulators]]
+    # Runs of other lengths would have environments wait for each other, and agents learn in step.
+    alike = method["iterations"] if own.batching else method
+    return [*kind, alike, scene.particle_count, [m.shape for m in scene.manipulators]]
 
 
 def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
-    if not family(cfg.method.family).batching:
+    own = family(cfg.method.family)
+    if not (own.batching or own.joins_populations(cfg.method)):
         return 1
-    return size or batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
+    if size is not None:
+        return size
+    environments = batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
+    return max(1, environments // getattr(cfg.method, "num_envs", 1))
 
 
-def _split(group: Sequence[Config], limit: int) -> list[list[Config]]:
-    """Split a group into as few parts as possible, of even size."""
-    count = -(-len(group) // limit)
+def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
+    """Split a group into some parts, of even size and not empty."""
+    count = min(count, len(group))
     bounds = [len(group) * k // count for k in range(count + 1)]
     return [list(group[a:b]) for a, b in pairwise(bounds)]

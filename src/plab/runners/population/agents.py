@@ -1,0 +1,231 @@
+"""What agents of all algorithms share: stacks, random numbers, and the state that a checkpoint holds."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor
+from torch.optim import Adam
+
+from plab.config_types import OffPolicyConfig, RlConfig
+from plab.families import family
+from plab.runners.captured import CapturedUpdate
+from plab.runners.population.draws import Block, Draws
+from plab.runners.population.networks import Networks, fill, flat
+from plab.runners.population.replay import Replay, Sizes
+from plab.runners.rl_models import model_kind, total_steps
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["Agents", "OffPolicyAgents", "Spaces", "first_policy", "trained_policy"]
+
+BLOCK = 50
+"""Entries that are drawn at once."""
+
+
+class Spaces(NamedTuple):
+    """Spaces of environments.
+
+    Attributes:
+        observation_space: That of an observation.
+        action_space: That of an action.
+    """
+
+    observation_space: Box
+    action_space: Box
+
+
+def first_policy(cfg: Config, spaces: Spaces) -> BasePolicy:
+    """Return the policy with which Stable-Baselines3 would begin a run, on the CPU."""
+    method = cfg.method_as(RlConfig)
+    kind = model_kind(method.family, method.algorithm)
+    options = kind.arguments(method, cast(Any, spaces))["policy_kwargs"]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(cfg.seed)
+        return kind.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
+
+
+def trained_policy(cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
+    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`."""
+    method = cfg.method_as(RlConfig)
+    policy = first_policy(cfg, spaces)
+    kind: type[Agents] = family(method.family).agents(method.algorithm)
+    networks = Networks([policy], kind.PARTS, torch.device("cpu"))
+    fill(networks.parameters(), torch.from_numpy(state["networks"])[None])
+    networks.write_to(policy, 0)
+    return policy
+
+
+class Agents:
+    """K agents that stand at the same step; each is what an agent alone is.
+
+    Attributes:
+        sizes: Sizes of their episodes.
+        steps: Transitions of each so far.
+        updates: Updates of each so far.
+        networks: Their parameters.
+        optimizers: Adam of parts of them, by name.
+        tensors: What else a checkpoint has to hold, by name, each of shape [agent, ...].
+    """
+
+    PARTS: ClassVar[Mapping[str, Sequence[str]]]
+    """Modules of Stable-Baselines3's policy, by the parts of :class:`Networks`."""
+
+    optimizers: dict[str, Adam]
+
+    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
+        """Begin with untrained networks.
+
+        Args:
+            cfgs: One configuration per agent; all have the same section ``method``.
+            spaces: Spaces of an observation and of an action.
+            device: Where everything is.
+        """
+        self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
+        horizon = cfgs[0].sim.horizon
+        (observed,), (actions,) = (space.shape for space in spaces)
+        self.sizes = Sizes(self.method.num_envs, horizon, observed, actions)
+        self.total_steps = total_steps(self.method, horizon)
+        self.steps = self.updates = 0
+        self.draws = Draws([cfg.seed for cfg in cfgs], device)
+        self.networks = Networks([first_policy(cfg, spaces) for cfg in cfgs], self.PARTS, device)
+        self.tensors: dict[str, Tensor] = {}
+        self._blocks: list[Block] = []
+        self._updates: dict[str, CapturedUpdate] = {}
+
+    def begin(self, observations: Tensor) -> None:
+        """Take the observations with which the training begins, shape [agent, env, entry]."""
+
+    @abstractmethod
+    def act(self, observations: Tensor) -> Tensor:
+        """Return actions to learn from, shape [agent, env, action], for observations, shape [agent, env,
+        entry]."""
+
+    @abstractmethod
+    def decide(self, observations: Tensor) -> Tensor:
+        """Return the deterministic policy's actions, shape [agent, row, action], in [-1, 1]."""
+
+    @abstractmethod
+    def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
+        """Take what the latest actions led to, and make the updates that are due.
+
+        Args:
+            rewards: Rewards, shape [agent, env].
+            last: Observations after the step, shape [agent, env, entry].
+            observations: What the next step starts from: the same, unless the episodes are over.
+            over: Whether they are.
+        """
+
+    def states(self) -> list[dict[str, Any]]:
+        """Return each agent's state: all that further training depends on, except a replay buffer."""
+        for block in self._blocks:
+            block.drop()
+        tables: dict[str, Any] = {"networks": flat(self.networks.parameters(), self.count)}
+        tables |= {name: tensor.reshape(self.count, -1) for name, tensor in self.tensors.items()}
+        for name, optimizer in self.optimizers.items():
+            for moment in ("exp_avg", "exp_avg_sq"):
+                own = [optimizer.state[p][moment] for p in optimizer.param_groups[0]["params"]]
+                tables[f"{name}_{moment}"] = flat(own, self.count)
+        rows = {name: table.detach().cpu().numpy() for name, table in tables.items()}
+        shared = {"steps": self.steps, "updates": self.updates}
+        shared |= {f"{name}_steps": self._optimizer_steps(name) for name in self.optimizers}
+        return [
+            {**shared, **{name: table[k].copy() for name, table in rows.items()}, "random": random}
+            for k, random in enumerate(self.draws.states())
+        ]
+
+    def restore(self, states: Sequence[Mapping[str, Any]]) -> None:
+        """Return to :meth:`states`, of agents that stand at the same step."""
+        first = states[0]
+        self.steps, self.updates = int(first["steps"]), int(first["updates"])
+
+        def table(name: str) -> Tensor:
+            return torch.from_numpy(np.stack([state[name] for state in states])).to(self.device)
+
+        fill(self.networks.parameters(), table("networks"))
+        for name, tensor in self.tensors.items():
+            fill([tensor], table(name))
+        for name, optimizer in self.optimizers.items():
+            parameters = optimizer.param_groups[0]["params"]
+            for moment in ("exp_avg", "exp_avg_sq"):
+                fill([optimizer.state[p][moment] for p in parameters], table(f"{name}_{moment}"))
+            for parameter in parameters:
+                optimizer.state[parameter]["step"].fill_(int(first[f"{name}_steps"]))
+        self.draws.restore([state["random"] for state in states])
+
+    def _optimizer_steps(self, name: str) -> int:
+        optimizer = self.optimizers[name]
+        return int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
+
+    def _block(self, draw: Callable[..., Tensor], *shape: int) -> Block:
+        """Return blocks of random numbers of which a checkpoint drops the rest."""
+        self._blocks.append(Block(draw, BLOCK, *shape))
+        return self._blocks[-1]
+
+    def _captured(self, update: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
+        """Call a function that is recorded on CUDA; what it returns is overwritten by the next call."""
+        return self._updates.setdefault(update.__name__, CapturedUpdate(update))(*arguments)
+
+
+class OffPolicyAgents(Agents):
+    """What the agents that learn from a replay buffer share."""
+
+    method: OffPolicyConfig
+
+    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
+        """Begin with untrained networks and empty buffers."""
+        super().__init__(cfgs, spaces, device)
+        window = max(self.method.buffer_size // self.sizes.envs, 1)
+        capacity = self.sizes.capacity(self.method, self.total_steps)
+        self.replay = Replay(self.count, self.sizes, capacity, window, device)
+        explored = self.sizes.envs, self.sizes.actions
+        self._anything = self._block(self.draws.uniform, *explored)
+        self._noise = self._block(self.draws.normal, *explored)
+        self._numbers = self._block(self.draws.integers, self.method.batch_size)
+
+    @abstractmethod
+    def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Return the policy's actions with noise, which is standard normal and of their shape."""
+
+    @abstractmethod
+    def update(self) -> None:
+        """Make one update."""
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Return random actions at first, then those of the policy with noise."""
+        self._observations = observations
+        if self.steps < self.method.learning_starts:
+            self._actions = self.explore_at_random(self._anything.next())
+        else:
+            self._actions = self._captured(self._explore, observations, self._noise.next()).clone()
+        return self._actions
+
+    def explore_at_random(self, actions: Tensor) -> Tensor:
+        """Return the actions before learning starts, given uniformly random ones."""
+        return actions
+
+    def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
+        """Keep the transitions, and make an update for each, or as many as ``gradient_steps`` says."""
+        self.replay.add(self._observations, self._actions, rewards, last)
+        self.steps += self.sizes.envs
+        if self.steps > self.method.learning_starts:
+            wanted = self.method.gradient_steps
+            for _ in range(self.sizes.envs if wanted < 0 else wanted):
+                self.updates += 1
+                self.update()
+
+    def read_replay(self, paths: Sequence[Path]) -> None:
+        """Take the replay buffers as they were at :attr:`steps`."""
+        self.replay.read(paths, self.steps // self.sizes.envs)
+
+    def _explore(self, observations: Tensor, noise: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self.explore(observations, noise)

@@ -1,0 +1,155 @@
+"""Networks of many agents as one: parameters of Stable-Baselines3's policies, stacked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam
+
+from plab.runners.captured import require_capturable
+
+__all__ = ["Networks", "Part", "adam", "descend", "fill", "flat", "follow", "linear", "mlp", "twin_values"]
+
+Part = dict[str, Tensor]
+"""Parameters by their names in the module that they come from, each of shape [stack, ...]; weights are
+transposed, [stack, in, out], so that neither products nor gradients have to be."""
+
+
+class Networks:
+    """The parameters of K policies of one kind, stacked; a part is a module, or several of the same shape.
+
+    Modules that are evaluated together, such as two critics, are one part, whose stack is K times as many:
+    those of the first agent, then those of the second.
+    """
+
+    def __init__(
+        self, policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
+    ) -> None:
+        """Stack copies of the policies' parameters.
+
+        Args:
+            policies: One policy per agent.
+            parts: Names of the modules of each part in a policy.
+            device: Where the stacks are to be.
+        """
+        named = [dict(policy.named_parameters()) for policy in policies]
+        self._modules = {part: tuple(modules) for part, modules in parts.items()}
+        self._count = len(policies)
+        self.parts: dict[str, Part] = {}
+        for part, modules in parts.items():
+            # Of a module "a.b" the parameter "a.b.weight" is "weight", of a parameter "a" itself the name "".
+            names = [n[len(modules[0]) :] for n in named[0] if f"{n}.".startswith(f"{modules[0]}.")]
+            self.parts[part] = {
+                name.lstrip("."): torch.stack([_turned(own[m + name]) for own in named for m in modules])
+                .to(device)
+                .requires_grad_()
+                for name in names
+            }
+
+    def __getitem__(self, part: str) -> Part:
+        return self.parts[part]
+
+    def parameters(self, *parts: str) -> list[Tensor]:
+        """Return the stacked parameters of some parts; of all if none is named."""
+        return [tensor for part in parts or self.parts for tensor in self.parts[part].values()]
+
+    def write_to(self, policy: nn.Module, agent: int) -> None:
+        """Give a policy the parameters of an agent."""
+        own = dict(policy.named_parameters())
+        with torch.no_grad():
+            for part, modules in self._modules.items():
+                for name, tensor in self.parts[part].items():
+                    rows = tensor.reshape(self._count, len(modules), *tensor.shape[1:])[agent]
+                    for module, row in zip(modules, rows, strict=True):
+                        own[f"{module}.{name}".rstrip(".")].copy_(_turned(row))
+
+
+def _turned(parameter: Tensor) -> Tensor:
+    return parameter.detach().mT if parameter.ndim == 2 else parameter.detach()
+
+
+def flat(tensors: Sequence[Tensor], agents: int) -> Tensor:
+    """Return what stacked tensors hold as one row per agent, shape [agent, number]."""
+    return torch.cat([tensor.detach().reshape(agents, -1) for tensor in tensors], dim=1)
+
+
+def fill(tensors: Sequence[Tensor], rows: Tensor) -> None:
+    """Write rows, as :func:`flat` returns them, back into stacked tensors."""
+    with torch.no_grad():
+        sizes = [tensor.numel() // len(rows) for tensor in tensors]
+        for tensor, part in zip(tensors, rows.split(sizes, dim=1), strict=True):
+            tensor.copy_(part.reshape(tensor.shape))
+
+
+def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return x W + b of each network: shapes [stack, row, in], [stack, in, out], [stack, out]."""
+    return torch.baddbmm(bias.unsqueeze(1), x, weight)
+
+
+def mlp(x: Tensor, part: Part, name: str, activation: nn.Module, *, last: bool) -> Tensor:
+    """Evaluate stacked ``nn.Sequential`` of linear layers with an activation after each.
+
+    Args:
+        x: Shape [stack, row, in].
+        part: The parameters.
+        name: Name of the sequence in the part, empty if it is the part.
+        activation: Function after each layer.
+        last: Whether the last layer has none after it.
+    """
+    prefix = f"{name}." if name else ""
+    numbers = [int(n[len(prefix) : -len(".weight")]) for n in part if n.startswith(prefix) and "weight" in n]
+    for number in sorted(numbers):
+        x = linear(x, part[f"{prefix}{number}.weight"], part[f"{prefix}{number}.bias"])
+        x = x if last and number == max(numbers) else activation(x)
+    return x
+
+
+def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
+    """Return the values that two stacked critics give, shape [agent, 2, row]."""
+    pairs = torch.cat([observations, actions], dim=2).repeat_interleave(2, dim=0)
+    return mlp(pairs, part, "", nn.ReLU(), last=True).view(len(observations), 2, -1)
+
+
+def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
+    """Return Adam for stacked parameters, whose state is there from the start: one step serves all agents."""
+    optimizer = Adam(parameters, lr=lr, fused=True, **options)
+    for parameter in parameters:
+        optimizer.state[parameter] = {
+            "step": torch.zeros((), device=parameter.device),
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+        }
+    if parameters[0].is_cuda:
+        require_capturable(optimizer, lr)
+    return optimizer
+
+
+def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> None:
+    """Make one step of an optimiser against the loss of each agent.
+
+    Args:
+        optimizer: Adam of stacked parameters.
+        losses: Shape [agent]; none depends on another agent's parameters.
+        longest: Largest norm of an agent's gradient, longer ones are scaled down; None sets no limit.
+    """
+    parameters = optimizer.param_groups[0]["params"]
+    gradients = torch.autograd.grad(losses.sum(), parameters)
+    if longest is not None:
+        agents = len(losses)
+        norms = torch.linalg.vector_norm(flat(gradients, agents), dim=1)
+        scale = (longest / (norms + 1e-6)).clamp(max=1.0)
+        gradients = tuple((g.reshape(agents, -1) * scale.unsqueeze(1)).reshape(g.shape) for g in gradients)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        # A step of all at once takes the numbers as they lie in memory.
+        parameter.grad = gradient.contiguous()
+    optimizer.step()
+
+
+def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
+    """Let targets follow: target <- (1 - tau) target + tau source."""
+    with torch.no_grad():
+        torch._foreach_mul_(targets, 1.0 - tau)
+        torch._foreach_add_(targets, sources, alpha=tau)

@@ -1,0 +1,224 @@
+"""A population: agents and their environments in one simulator, trained and evaluated together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from plab.config_types import RlConfig
+from plab.families import family
+from plab.runners.common import LAST, episode_columns
+from plab.runners.population.agents import Agents, Spaces
+from plab.runners.rl_models import cycle_steps, total_steps
+from plab.torch import TensorEnv
+
+if TYPE_CHECKING:
+    from plab.config import Config
+    from plab.envs.core import Transition
+
+__all__ = ["Evaluation", "Population"]
+
+NOT_FINITE = "the policy's actions are not finite"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an episode of an agent's deterministic policy gave.
+
+    Attributes:
+        measures: Values of :func:`plab.runners.common.episode_columns`.
+        actions: Actions, shape [T, A].
+        failure: Why it broke off, empty if it did not.
+    """
+
+    measures: dict[str, float]
+    actions: np.ndarray
+    failure: str
+
+
+class Population:
+    """Agents that stand at the same step, with environments that may be more than theirs.
+
+    On CUDA the agents' parameters are stacked. On the CPU each agent is a stack of its own: there libraries
+    choose their kernels by shape, and an agent would not have the bits that it has alone.
+
+    Attributes:
+        stacks: The agents.
+        episodes: Complete episodes of each agent so far.
+    """
+
+    def __init__(
+        self,
+        cfgs: Sequence[Config],
+        numbers: Sequence[int],
+        training: TensorEnv,
+        evaluation: TensorEnv,
+        states: Sequence[Mapping[str, Any] | None],
+    ) -> None:
+        """Build the agents; those with a replay buffer have to read it afterwards.
+
+        Args:
+            cfgs: One configuration per agent, alike in ``method``.
+            numbers: Number of each agent among those for whom there are environments.
+            training: Environments, N for each number.
+            evaluation: Environments of the evaluation, one for each number.
+            states: One of :meth:`states` per agent, or None for all of them.
+        """
+        method = cfgs[0].method_as(RlConfig)
+        self._training, self._evaluation = training, evaluation
+        self._device = torch.device(method.torch_device)
+        self._numbers = torch.tensor(numbers, device=self._device)
+        # Whether there are no environments but theirs.
+        self._alone = len(cfgs) == evaluation.batch.size
+        self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
+        self._total, self._cycle = (size(method, self._horizon) for size in (total_steps, cycle_steps))
+        batch = training.batch
+        kind: type[Agents] = family(method.family).agents(method.algorithm)
+        size = len(cfgs) if self._device.type == "cuda" else 1
+        spaces = Spaces(batch.observation_space, batch.action_space)
+        parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
+        self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
+        self._broken = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
+        self._failures: dict[int, str] = {}
+        self._episode_actions: list[Tensor] = []
+        self._ended: list[Tensor] = []
+        self._start(states)
+
+    @property
+    def steps(self) -> int:
+        """Transitions of each agent so far."""
+        return self.stacks[0].steps
+
+    @property
+    def episodes(self) -> int:
+        """Complete episodes of each agent so far."""
+        return self.steps // self._horizon
+
+    def place(self, agent: int) -> tuple[Agents, int]:
+        """Return the stack that an agent is in, and its number there."""
+        stack, number = divmod(agent, self.stacks[0].count)
+        return self.stacks[stack], number
+
+    def train(self, episodes: int) -> None:
+        """Train until each agent has done some episodes, or all its transitions."""
+        if self.steps == 0:
+            for stack, part in zip(self.stacks, self._split(self._observations), strict=True):
+                stack.begin(part)
+        while self.episodes < episodes and self.steps < self._total:
+            for _ in range(self._cycle // self._envs):
+                self._step()
+
+    def evaluate(self) -> list[Evaluation]:
+        """Run an episode of each agent's deterministic policy."""
+        columns = episode_columns(self._evaluation.batch.problem.term_names)
+        observations = self._own(self._evaluation.reset(), 1)
+        sums: dict[str, Tensor] = {}
+        actions: list[Tensor] = []
+        failures: dict[int, str] = {}
+        for _ in range(self._horizon):
+            parts = zip(self.stacks, self._split(observations), strict=True)
+            actions.append(torch.cat([stack.decide(part) for stack, part in parts]))
+            done = self._advance(self._evaluation, actions[-1])
+            failures = dict(done.failures) | failures
+            values = done.info | {"reward": done.reward}
+            sums = {n: values[n] if n in LAST or n not in sums else sums[n] + values[n] for n in columns}
+            observations = self._own(done.observation, 1)
+        # From the device at once.
+        rows = torch.stack([sums[name] for name in columns]).cpu().numpy()
+        ran = torch.stack(actions, dim=1).squeeze(2).cpu().numpy()
+        evaluations = []
+        for own, k in zip(ran, self._numbers.tolist(), strict=True):
+            failure = failures.get(k, "") if np.isfinite(own).all() else NOT_FINITE
+            evaluations.append(Evaluation(dict(zip(columns, rows[:, k].tolist(), strict=True)), own, failure))
+        return evaluations
+
+    def take_statistics(self) -> list[dict[str, float]]:
+        """Return each agent's means over the episodes that ended since the last call, NaN if none has."""
+        names = ("train_reward", "train_score")
+        if not self._ended:
+            return [dict.fromkeys(names, np.nan) for _ in range(len(self._numbers))]
+        # By episode, measure, agent and environment; summed agent by agent, for the same bits in any company.
+        ended = torch.stack(self._ended).cpu().numpy()
+        self._ended = []
+        agents = range(ended.shape[2])
+        return [{n: float(np.mean(ended[:, i, k].copy())) for i, n in enumerate(names)} for k in agents]
+
+    def take_failures(self) -> dict[int, str]:
+        """Return why agents broke off in training since the last call, by their numbers."""
+        numbers = self._numbers.tolist()
+        failures = {number: text for number, text in self._failures.items() if number in numbers}
+        for place in torch.nonzero(self._broken).flatten().tolist():
+            failures.setdefault(numbers[place], NOT_FINITE)
+        self._failures = {}
+        return failures
+
+    def states(self) -> list[dict[str, Any]]:
+        """Return each agent's state: all that further training depends on, except a replay buffer."""
+        states = [state for stack in self.stacks for state in stack.states()]
+        shape = (0, len(states), self._envs, self.stacks[0].sizes.actions)
+        acted = torch.stack(self._episode_actions) if self._episode_actions else torch.zeros(shape)
+        for k, state in enumerate(states):
+            state["episode_actions"] = acted[:, k].cpu().numpy()
+        return states
+
+    def _start(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """Put agents and environments where they were."""
+        observations = self._own(self._training.reset(), self._envs)
+        self._reward = torch.zeros((len(states), self._envs), dtype=torch.float64, device=self._device)
+        if known := [state for state in states if state is not None]:
+            for place in range(0, len(known), self.stacks[0].count):
+                stack, _ = self.place(place)
+                stack.restore(known[place : place + stack.count])
+            acted = np.stack([state["episode_actions"] for state in known], axis=1)
+            for actions in torch.from_numpy(acted).to(self._device):
+                observations = self._own(self._advance_training(actions).observation, self._envs)
+        self._observations = observations
+
+    def _step(self) -> None:
+        """Make one step of all environments, and what the agents learn from it."""
+        parts = zip(self.stacks, self._split(self._observations), strict=True)
+        done = self._advance_training(torch.cat([stack.act(part) for stack, part in parts]))
+        last = self._own(done.observation, self._envs)
+        observations = self._own(self._training.reset(), self._envs) if done.truncated else last
+        rewards = self._own(done.reward, self._envs).squeeze(2).float()
+        gained = (self._split(part) for part in (rewards, last, observations))
+        for stack, *part in zip(self.stacks, *gained, strict=True):
+            stack.learn(*part, over=done.truncated)
+        self._observations = observations
+
+    def _advance_training(self, actions: Tensor) -> Transition:
+        """Advance the environments of the training, and note what an episode adds up to."""
+        done = self._advance(self._training, actions)
+        for env, text in done.failures.items():
+            self._failures.setdefault(env // self._envs, text)
+        self._reward += self._own(done.reward, self._envs).squeeze(2)
+        self._episode_actions.append(actions)
+        if done.truncated:
+            # Networks that are not finite stay so: once an episode is soon enough.
+            self._broken |= ~actions.isfinite().all(2).all(1)
+            score = self._own(done.info["score"], self._envs).squeeze(2)
+            self._ended.append(torch.stack([self._reward, score]))
+            self._reward.zero_()
+            self._episode_actions = []
+        return done
+
+    def _advance(self, env: TensorEnv, actions: Tensor) -> Transition:
+        """Advance environments; those of agents that are not here rest."""
+        everyone = actions.double().nan_to_num()
+        if not self._alone:
+            own, size = everyone, env.batch.size // actions.shape[1]
+            everyone = own.new_zeros((size, *own.shape[1:])).index_copy_(0, self._numbers, own)
+        return env.step(everyone.flatten(0, 1), strict=False)
+
+    def _own(self, table: Tensor, envs: int) -> Tensor:
+        """Return the agents' rows of a table of all environments, shape [agent, env, entry or 1]."""
+        rows = table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
+        return rows if self._alone else rows.index_select(0, self._numbers)
+
+    def _split(self, table: Tensor) -> list[Tensor]:
+        return list(table.split([stack.count for stack in self.stacks]))

@@ -1,0 +1,237 @@
+"""Proximal policy optimisation, many agents at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from plab.config_types import PpoConfig
+from plab.runners.captured import require_capturable
+from plab.runners.population.agents import Agents, Spaces
+from plab.runners.population.networks import adam, descend, linear, mlp
+from plab.runners.rl_models import CLIP, rollout_steps
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["PpoAgents", "Statistics"]
+
+EPSILON = 1e-8
+"""Added to variances and standard deviations, as in Stable-Baselines3."""
+
+TANH = nn.Tanh()
+
+
+class Statistics:
+    """Running means and variances of many agents, as Stable-Baselines3's ``RunningMeanStd``, float64.
+
+    Attributes:
+        mean: Shape [agent, ...].
+        var: Shape [agent, ...].
+        count: Rows so far, shape [agent, 1].
+    """
+
+    def __init__(self, agents: int, *shape: int, device: torch.device) -> None:
+        """Begin with mean 0 and variance 1, of next to no rows."""
+        self.mean = torch.zeros((agents, *shape), dtype=torch.float64, device=device)
+        self.var = torch.ones_like(self.mean)
+        self.count = torch.full((agents, 1), 1e-4, dtype=torch.float64, device=device)
+
+    def update(self, rows: Tensor) -> None:
+        """Take rows, shape [agent, row, ...]."""
+        rows, count = rows.double(), rows.shape[1]
+        mean, var = rows.mean(1), rows.var(1, correction=0)
+        delta, total = mean - self.mean, self.count + count
+        spread = self.var * self.count + var * count + delta.square() * self.count * count / total
+        self.mean.add_(delta * count / total)
+        self.var.copy_(spread / total)
+        self.count.copy_(total)
+
+
+class PpoAgents(Agents):
+    """Agents of PPO; observations and rewards are scaled by running statistics if the method wants it."""
+
+    PARTS: ClassVar = {
+        # Both as wide: evaluated as one.
+        "hidden": ("mlp_extractor.policy_net", "mlp_extractor.value_net"),
+        "mean": ("action_net",),
+        "value": ("value_net",),
+        "log_std": ("log_std",),
+    }
+
+    method: PpoConfig
+
+    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
+        """Begin with untrained networks."""
+        super().__init__(cfgs, spaces, device)
+        agents, envs = self.count, self.sizes.envs
+        self._length = rollout_steps(self.method)
+        self._seen = Statistics(agents, self.sizes.observed, device=device)
+        self._earned = Statistics(agents, 1, device=device)
+        self._returns = torch.zeros((agents, envs), dtype=torch.float64, device=device)
+        for name, kept in (("observation", self._seen), ("return", self._earned)):
+            self.tensors |= {f"{name}_{part}": value for part, value in vars(kept).items()}
+        self.tensors["returns"] = self._returns
+        parameters = self.networks.parameters()
+        self.optimizers = {"policy": adam(parameters, self.method.lr, eps=self.method.adam_eps)}
+        self._noise = self._block(self.draws.normal, envs, self.sizes.actions)
+        rollout = agents, envs, self._length
+        self.observations = torch.zeros((*rollout, self.sizes.observed), device=device)
+        self.actions = torch.zeros((*rollout, self.sizes.actions), device=device)
+        names = ("values", "log_probs", "rewards", "advantages", "returns")
+        self.rollout = {name: torch.zeros(rollout, device=device) for name in names}
+        self._over: list[bool] = []
+
+    def begin(self, observations: Tensor) -> None:
+        """Take the very first observations into the statistics."""
+        if self.method.normalise:
+            self._seen.update(observations)
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Draw actions; they may lie beyond [-1, 1], which the environments do not."""
+        step = len(self._over)
+        seen = self.scaled(observations)
+        with torch.no_grad():
+            mean, values = self._evaluate(seen)
+            std = self.networks["log_std"][""].exp().unsqueeze(1)
+            actions = mean + std * self._noise.next()
+            self.observations[:, :, step], self.actions[:, :, step] = seen, actions
+            self.rollout["values"][:, :, step] = values
+            self.rollout["log_probs"][:, :, step] = self._log_prob(mean, actions)
+        return actions
+
+    def decide(self, observations: Tensor) -> Tensor:
+        """Return the most likely actions."""
+        with torch.no_grad():
+            return self._evaluate(self.scaled(observations))[0].clamp(-1.0, 1.0)
+
+    def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
+        """Keep the transitions, and make an update of every ``steps_per_update``."""
+        if self.method.normalise:
+            self._seen.update(observations)
+            self._returns.mul_(self.method.gamma).add_(rewards)
+            self._earned.update(self._returns.unsqueeze(2))
+            scale = (self._earned.var + EPSILON).sqrt()
+            rewards = (rewards / scale).clamp(-CLIP, CLIP).float()
+        if over:
+            # An episode ends by truncation only: the value of its last observation counts.
+            rewards = rewards + self.method.gamma * self._values(last)
+            self._returns.zero_()
+        self.rollout["rewards"][:, :, len(self._over)] = rewards
+        self._over.append(over)
+        if len(self._over) == self._length:
+            self._decay()
+            self.judge(self._values(observations), self._over)
+            self._improve()
+            self._over = []
+        self.steps += self.sizes.envs
+
+    def scaled(self, observations: Tensor) -> Tensor:
+        """Return observations as the networks want them, shape [agent, row, entry]."""
+        if not self.method.normalise:
+            return observations
+        mean, std = self._seen.mean.unsqueeze(1), (self._seen.var + EPSILON).sqrt().unsqueeze(1)
+        return ((observations - mean) / std).clamp(-CLIP, CLIP).float()
+
+    def judge(self, last_values: Tensor, over: Sequence[bool]) -> None:
+        """Compute advantages and returns of the rollout.
+
+        Args:
+            last_values: Values after the last step, shape [agent, env].
+            over: Whether the episodes were over after each step.
+        """
+        gamma, table = self.method.gamma, self.rollout
+        goes_on = 1.0 - torch.tensor(over, dtype=torch.float32, device=self.device)
+        values = table["values"]
+        after = torch.cat([values[:, :, 1:], last_values.unsqueeze(2)], dim=2)
+        gains = (table["rewards"] + gamma * after * goes_on - values).unbind(2)
+        advantage = torch.zeros_like(last_values)
+        advantages = []
+        for gain, ended in zip(reversed(gains), reversed(over), strict=True):
+            advantage = gain if ended else gain + gamma * self.method.gae_lambda * advantage
+            advantages.append(advantage)
+        table["advantages"].copy_(torch.stack(advantages[::-1], dim=2))
+        table["returns"].copy_(table["advantages"] + values)
+
+    def minibatch(self, numbers: Tensor) -> Tensor:
+        """Update from some transitions of the rollout.
+
+        Args:
+            numbers: Which, shape [agent, row]: step after step of the first environment, then the next.
+
+        Returns:
+            Losses of policy, value and entropy, shape [3, agent].
+        """
+        m = self.method
+        where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
+        observations, actions = (
+            table.view(-1, table.shape[-1]).index_select(0, where).view(*numbers.shape, -1)
+            for table in (self.observations, self.actions)
+        )
+        old_values, old_log_prob, advantages, returns = (
+            self.rollout[name].view(-1).index_select(0, where).view(numbers.shape)
+            for name in ("values", "log_probs", "advantages", "returns")
+        )
+        if numbers.shape[1] > 1:
+            spread = advantages.std(1, keepdim=True)
+            advantages = (advantages - advantages.mean(1, keepdim=True)) / (spread + EPSILON)
+        mean, values = self._evaluate(observations)
+        ratio = torch.exp(self._log_prob(mean, actions) - old_log_prob)
+        clipped = advantages * ratio.clamp(1.0 - m.clip_range, 1.0 + m.clip_range)
+        policy_loss = -torch.min(advantages * ratio, clipped).mean(1)
+        if m.value_clip_range is not None:
+            reach = m.value_clip_range
+            values = old_values + (values - old_values).clamp(-reach, reach)
+        value_loss = (returns - values).square().mean(1)
+        log_std = self.networks["log_std"][""]
+        entropy_loss = -(0.5 + 0.5 * math.log(2.0 * math.pi) + log_std).sum(1)
+        loss = policy_loss + m.entropy_coefficient * entropy_loss + m.value_coefficient * value_loss
+        descend(self.optimizers["policy"], loss, m.max_gradient_norm)
+        return torch.stack([part.detach() for part in (policy_loss, value_loss, entropy_loss)])
+
+    @property
+    def _size(self) -> int:
+        """Transitions of an agent's rollout."""
+        return self.sizes.envs * self._length
+
+    def _improve(self) -> None:
+        """Make the updates of a rollout."""
+        rows = math.ceil(self._size / self.method.minibatches)
+        for _ in range(self.method.epochs):
+            for numbers in self.draws.permutation(self._size).split(rows, dim=1):
+                self._captured(self.minibatch, numbers.contiguous())
+            self.updates += 1
+
+    def _decay(self) -> None:
+        """Set the learning rate of the cycle that began with the rollout."""
+        if not self.method.lr_decay:
+            return
+        began = self.steps + self.sizes.envs - self._size
+        lr = self.method.lr * (1.0 - began / self.total_steps)
+        if self.device.type == "cuda":
+            require_capturable(self.optimizers["policy"], lr)
+        else:
+            self.optimizers["policy"].param_groups[0]["lr"] = lr
+
+    def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means of actions, shape [agent, row, action], and values, shape [agent, row]."""
+        pairs = observations.repeat_interleave(2, dim=0)
+        latent = mlp(pairs, self.networks["hidden"], "", TANH, last=False)
+        latent = latent.view(self.count, 2, *latent.shape[1:])
+        mean, value = self.networks["mean"], self.networks["value"]
+        values = linear(latent[:, 1], value["weight"], value["bias"])
+        return linear(latent[:, 0], mean["weight"], mean["bias"]), values.squeeze(2)
+
+    def _values(self, observations: Tensor) -> Tensor:
+        with torch.no_grad():
+            return self._evaluate(self.scaled(observations))[1]
+
+    def _log_prob(self, mean: Tensor, actions: Tensor) -> Tensor:
+        """Return logarithms of the densities of actions, shape [agent, row]."""
+        log_std = self.networks["log_std"][""].unsqueeze(1)
+        distance = ((actions - mean) / log_std.exp()).square()
+        return (-0.5 * distance - log_std - 0.5 * math.log(2.0 * math.pi)).sum(2)

@@ -1,0 +1,196 @@
+"""Replay buffers of many agents on their device, and the files in which they outlive the process."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from plab.config_types import OffPolicyConfig
+from plab.results import ResultsError
+
+__all__ = ["Replay", "Samples", "Sizes", "require_file"]
+
+
+class Sizes(NamedTuple):
+    """Sizes of an agent's episodes.
+
+    Attributes:
+        envs: Environments of an agent, N.
+        horizon: Steps T of an episode.
+        observed: Entries of an observation.
+        actions: Components of an action.
+    """
+
+    envs: int
+    horizon: int
+    observed: int
+    actions: int
+
+    @property
+    def entries(self) -> int:
+        """Numbers, all float32, of one episode in all N environments."""
+        return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
+
+    def capacity(self, method: OffPolicyConfig, total_steps: int) -> int:
+        """Return how many episodes of N environments a buffer holds.
+
+        Args:
+            method: Has the transitions that can be sampled.
+            total_steps: Transitions of the whole training.
+        """
+        window = max(method.buffer_size // self.envs, 1)
+        # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
+        return min(math.ceil(total_steps / self.envs / self.horizon), math.ceil(window / self.horizon) + 1)
+
+
+class Samples(NamedTuple):
+    """Transitions to learn from, each of shape [agent, row, ...]; rewards have no third axis."""
+
+    observations: Tensor
+    actions: Tensor
+    next_observations: Tensor
+    rewards: Tensor
+
+
+class Replay:
+    """The transitions of K agents that stand at the same step; each observation is stored once.
+
+    Attributes:
+        added: Steps of all N environments that were added, the overwritten ones included.
+    """
+
+    def __init__(self, agents: int, sizes: Sizes, capacity: int, window: int, device: torch.device) -> None:
+        """Make room.
+
+        Args:
+            agents: Number of agents K.
+            sizes: Sizes of their episodes.
+            capacity: Episodes of N environments per agent.
+            window: Steps of N environments that can be sampled, the latest ones.
+            device: Where the buffers are.
+        """
+        self.added = 0
+        self._agents, self._sizes, self._capacity, self._window = agents, sizes, capacity, window
+        n, horizon = sizes.envs, sizes.horizon
+        shape = agents, capacity
+        self._observations = torch.empty((*shape, horizon + 1, n, sizes.observed), device=device)
+        self._actions = torch.empty((*shape, horizon, n, sizes.actions), device=device)
+        self._rewards = torch.empty((*shape, horizon, n), device=device)
+        # Where recorded updates find how much there is: first step that can be sampled, and how many can.
+        self._first = torch.zeros((), dtype=torch.int64, device=device)
+        self._count = torch.ones((), dtype=torch.int64, device=device)
+        self._agent = torch.arange(agents, device=device).unsqueeze(1)
+        # Episodes of N environments that each agent's file holds.
+        self._written = [0] * agents
+
+    def add(self, observations: Tensor, actions: Tensor, rewards: Tensor, next_observations: Tensor) -> None:
+        """Append one step of all environments; arguments of shape [agent, env, ...]."""
+        episode, step = divmod(self.added, self._sizes.horizon)
+        slot = episode % self._capacity
+        if step == 0:
+            self._observations[:, slot, 0] = observations
+        self._observations[:, slot, step + 1] = next_observations
+        self._actions[:, slot, step] = actions
+        self._rewards[:, slot, step] = rewards
+        self._count_to(self.added + 1)
+
+    def _count_to(self, added: int) -> None:
+        self.added = added
+        count = min(added, self._window)
+        self._first.fill_(added - count)
+        self._count.fill_(max(count, 1))
+
+    def sample(self, numbers: Tensor) -> Samples:
+        """Take transitions, uniformly from those that can be sampled.
+
+        Args:
+            numbers: Large random integers, shape [agent, row].
+        """
+        n, horizon = self._sizes.envs, self._sizes.horizon
+        env, steps = numbers % n, self._first + numbers // n % self._count
+        episode = self._agent * self._capacity + steps // horizon % self._capacity
+        step = steps % horizon
+        first = ((episode * (horizon + 1) + step) * n + env).reshape(-1)
+        place = ((episode * horizon + step) * n + env).reshape(-1)
+        observations = self._observations.view(-1, self._sizes.observed)
+        shape = *numbers.shape, -1
+        return Samples(
+            observations.index_select(0, first).view(shape),
+            self._actions.view(-1, self._sizes.actions).index_select(0, place).view(shape),
+            observations.index_select(0, first + n).view(shape),
+            self._rewards.view(-1).index_select(0, place).view(numbers.shape),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all agents' buffers."""
+        return 4 * self._agents * self._capacity * self._sizes.entries
+
+    def write(self, agent: int, path: Path) -> None:
+        """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew.
+
+        Args:
+            agent: Number of the agent.
+            path: The file.
+
+        Raises:
+            ResultsError: If it cannot be written.
+        """
+        since, last = self._written[agent], self.added // self._sizes.horizon
+        try:
+            with path.open("r+b" if since else "wb") as file:
+                file.seek(since * self._sizes.entries * 4)
+                for episode in range(since, last):
+                    for part in self._parts(agent, episode):
+                        file.write(part.cpu().numpy().data)
+        except OSError as error:
+            raise ResultsError(f"cannot write the replay buffer {path}: {error.strerror or error}") from error
+        self._written[agent] = last
+
+    def read(self, paths: Sequence[Path], added: int) -> None:
+        """Take what the agents' files hold.
+
+        Args:
+            paths: A file per agent.
+            added: Steps of N environments, in whole episodes, that were added by earlier processes.
+
+        Raises:
+            ResultsError: If a file cannot be read.
+        """
+        self._count_to(added)
+        last = added // self._sizes.horizon
+        self._written = [last] * self._agents
+        for agent, path in enumerate(paths):
+            try:
+                self._read(agent, path, range(max(0, last - self._capacity), last))
+            except (OSError, ValueError) as error:
+                raise ResultsError(f"cannot read the replay buffer {path}: {error}") from error
+
+    def _read(self, agent: int, path: Path, episodes: range) -> None:
+        with path.open("rb") as file:
+            file.seek(episodes.start * self._sizes.entries * 4)
+            for episode in episodes:
+                for part in self._parts(agent, episode):
+                    numbers = np.fromfile(file, np.float32, part.numel())
+                    part.copy_(torch.from_numpy(numbers).view(part.shape))
+
+    def _parts(self, agent: int, episode: int) -> list[Tensor]:
+        """Return an episode's places in the buffers, in the order in which they are in the file."""
+        tables = self._observations, self._actions, self._rewards
+        return [table[agent, episode % self._capacity] for table in tables]
+
+
+def require_file(path: Path, sizes: Sizes, episodes: int) -> None:
+    """Check that an agent's file holds some episodes of N environments.
+
+    Raises:
+        ResultsError: If it does not.
+    """
+    if episodes and (not path.exists() or path.stat().st_size < episodes * sizes.entries * 4):
+        raise ResultsError(f"{path}, the replay buffer of the run, is gone: start afresh with force=true")

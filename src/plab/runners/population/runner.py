@@ -1,0 +1,205 @@
+"""The runner of a sweep's runs by ``sac``, ``td3`` and ``ppo``: a population, and a file for each run.
+
+A run alternates between training, for some episodes, and one episode of the deterministic policy, as with
+:class:`plab.runners.rl.RlRunner`, which carries out single runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from plab.config import RlConfig
+from plab.config_types import OffPolicyConfig
+from plab.envs.core import spaces
+from plab.problem import build_scenes
+from plab.results import ResultsError
+from plab.runners.common import environment_key, torch_settings
+from plab.runners.jobs import RunError
+from plab.runners.policy import save_policy
+from plab.runners.population.agents import OffPolicyAgents, Spaces, trained_policy
+from plab.runners.population.population import Population
+from plab.runners.population.replay import Sizes, require_file
+from plab.runners.rl import check_torch_device
+from plab.runners.rl_models import total_steps
+from plab.runners.runner import Runner, Step, Track
+from plab.torch import TensorEnv
+
+__all__ = ["PopulationRunner"]
+
+
+class PopulationRunner(Runner):
+    """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
+
+    Runs that stand at different evaluations are trained one group after the other, until all are abreast.
+    """
+
+    _population: Population | None = None
+    _members: Sequence[Track] = ()
+    _rate = 0.0
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self._method.torch_threads)
+
+    def build(self) -> None:
+        """Make the environments of the training, and those in the hard contact model that judge."""
+        check_torch_device(self._method)
+        cfgs, method = [track.cfg for track in self.tracks], self._method
+        kinds = (method.num_envs, method.contact), (1, "hard")
+        self._spaces = Spaces(*spaces(build_scenes(cfgs)))
+        (observed,), (actions,) = (space.shape for space in self._spaces)
+        self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
+        self._total = total_steps(method, self._sizes.horizon)
+        self._require_memory()
+
+        def build() -> list[TensorEnv]:
+            return [
+                TensorEnv([cfg for cfg in cfgs for _ in range(size)], contact=contact)
+                for size, contact in kinds
+            ]
+
+        def start_again(envs: list[TensorEnv]) -> None:
+            for env, (_, contact) in zip(envs, kinds, strict=True):
+                env.reset()
+                env.batch.problem.simulator.set_contact(contact, softness=method.softness)
+
+        key = "population", kinds, tuple(environment_key(cfg) for cfg in cfgs)
+        self._training, self._evaluation = self.cache.get(key, build, check=start_again)
+        self.problem = self._evaluation.batch.problem
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """See that the replay buffer is there; the networks are made with those of the others."""
+        track.job.run.result.provenance |= {"batch": len(self.tracks), "population": True}
+        if isinstance(self._method, OffPolicyConfig) and self.has_more(track):
+            try:
+                require_file(_replay_path(track), self._sizes, self._episodes(state) // self._sizes.envs)
+            except ResultsError as error:
+                track.job.fail(error)
+
+    def has_more(self, track: Track) -> bool:
+        """Whether there are steps to train for."""
+        state = track.job.run.result.resume
+        return state is None or int(state["steps"]) < self._total
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Train the runs that have come least far until their next evaluation is due, and evaluate them."""
+        start = time.perf_counter()
+        least = min(track.iteration for track in tracks)
+        members = [track for track in tracks if track.iteration == least]
+        population = self._population_of(members)
+        failures: dict[int, str] = {}
+        before = population.steps
+        # The first episode, of the untrained policies, compiles the kernels.
+        if least > 0:
+            self.enter("optimise", members)
+            rows = members[0].job.run.result.iterations
+            population.train(int(rows["episodes"].iloc[-1]) + self._method.evaluate_every)
+            failures = population.take_failures()
+            self.enter("evaluate", members)
+        evaluations, trained = population.evaluate(), population.take_statistics()
+        states = population.states()
+        share = (time.perf_counter() - start) / len(members)
+        self._rate = (population.steps - before) / share
+        for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
+            start = time.perf_counter()
+            if failure := failures.get(track.number) or done.failure:
+                track.fail(failure)
+                continue
+            try:
+                self._write_replay(population, place, track)
+            except ResultsError as error:
+                track.job.fail(error)
+                continue
+            seconds = share + time.perf_counter() - start
+            measured = done.measures | trained[place]
+            finished = population.steps >= self._total
+            counts = population.episodes, population.steps
+            yield track, Step(measured, done.actions, states[place], *counts, seconds, keep=finished)
+
+    def extent(self) -> tuple[int, int, int]:
+        """Return how many episodes of training there are, and after how many there is an evaluation."""
+        total = self._total // self._sizes.horizon
+        return self._least(self.tracks), total, self._method.evaluate_every
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report how the agents that were evaluated do on average, and the transitions of all per second."""
+        reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
+        text = f"mean reward {reward:.4g} score {score:.3f}"
+        self.report(self._least(tracks), f"{self._rate:.0f} steps/s {text}" if self._rate else text)
+
+    def close(self) -> None:
+        """Let go of networks and replay buffers."""
+        self._population = None
+
+    def conclude(self, track: Track) -> None:
+        """Keep the policy of the last evaluation, after which nothing is sampled any more."""
+        state = track.job.run.result.resume or {}
+        policy = trained_policy(track.cfg, self._spaces, state)
+        moments = None
+        if getattr(self._method, "normalise", False):
+            moments = state["observation_mean"], state["observation_var"]
+        save_policy(track.job.run.path, self._method.family, self._method.algorithm, policy, moments)
+        _replay_path(track).unlink(missing_ok=True)
+
+    def _population_of(self, members: Sequence[Track]) -> Population:
+        """Return the population of some runs, a new one if it is of others."""
+        numbers = [track.number for track in members]
+        if self._population is None or numbers != [track.number for track in self._members]:
+            # Let go of the old one first: there may be no room for two.
+            self._population = None
+            cfgs, states = [t.cfg for t in members], [t.job.run.result.resume for t in members]
+            self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
+            self._members = members
+            paths = [_replay_path(track) for track in members]
+            for stack in self._population.stacks:
+                own, paths = paths[: stack.count], paths[stack.count :]
+                if isinstance(stack, OffPolicyAgents) and stack.steps:
+                    stack.read_replay(own)
+        return self._population
+
+    def _write_replay(self, population: Population, agent: int, track: Track) -> None:
+        stack, number = population.place(agent)
+        if isinstance(stack, OffPolicyAgents):
+            stack.replay.write(number, _replay_path(track))
+
+    def _require_memory(self) -> None:
+        """Find out whether there is room for all replay buffers; on the CPU there always is for one.
+
+        Raises:
+            RunError: If there is not.
+        """
+        method, cfg = self._method, self.tracks[0].cfg
+        if not isinstance(method, OffPolicyConfig):
+            return
+        each = 4 * self._sizes.entries * self._sizes.capacity(method, self._total)
+        if method.torch_device == "cuda":
+            # The simulators and the networks take little beside them.
+            room = 0.9 * torch.cuda.mem_get_info()[0]
+        else:
+            room = max(cfg.sim.memory_mb * 1e6, each)
+        if len(self.tracks) * each > room:
+            raise RunError(
+                f"no room for {len(self.tracks)} replay buffers of {each / 1e9:.1f} GB: "
+                f"{room / 1e9:.1f} GB are free; set a smaller method.buffer_size or method.torch_device=cpu"
+            )
+
+    def _least(self, tracks: Sequence[Track]) -> int:
+        return min(self._episodes(track.job.run.result.resume) for track in tracks)
+
+    def _episodes(self, state: Mapping[str, Any] | None) -> int:
+        return 0 if state is None else int(state["steps"]) // self._sizes.horizon
+
+    @property
+    def _method(self) -> RlConfig:
+        return self.tracks[0].cfg.method_as(RlConfig)
+
+
+def _replay_path(track: Track) -> Path:
+    return track.job.run.path.with_suffix(".replay")

@@ -1,0 +1,116 @@
+"""Soft actor-critic with a learned entropy coefficient, many agents at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from plab.runners.population.agents import OffPolicyAgents, Spaces
+from plab.runners.population.networks import Part, adam, descend, follow, linear, mlp, twin_values
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["SacAgents"]
+
+LOG_STD = -20.0, 2.0
+"""Smallest and largest logarithm of a standard deviation."""
+
+EPSILON = 1e-6
+"""Added to 1 - a^2 in the density of actions a, as in Stable-Baselines3."""
+
+RELU = nn.ReLU()
+
+
+class SacAgents(OffPolicyAgents):
+    """Agents of soft actor-critic; targets follow at every update."""
+
+    PARTS: ClassVar = {
+        "actor": ("actor",),
+        "critics": ("critic.qf0", "critic.qf1"),
+        "targets": ("critic_target.qf0", "critic_target.qf1"),
+    }
+
+    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
+        """Begin with untrained networks and empty buffers."""
+        super().__init__(cfgs, spaces, device)
+        self.log_ent_coef = torch.zeros(self.count, device=device, requires_grad=True)
+        self.tensors["log_ent_coef"] = self.log_ent_coef
+        lr, networks = self.method.lr, self.networks
+        self.optimizers = {
+            "entropy": adam([self.log_ent_coef], lr),
+            "critics": adam(networks.parameters("critics"), lr),
+            "actor": adam(networks.parameters("actor"), lr),
+        }
+        drawn = self.method.batch_size, self.sizes.actions
+        self._now, self._next = (self._block(self.draws.normal, *drawn) for _ in range(2))
+
+    def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Draw actions."""
+        mean, log_std = self._gaussian(observations)
+        return torch.tanh(mean + log_std.exp() * noise)
+
+    def decide(self, observations: Tensor) -> Tensor:
+        """Return the most likely actions."""
+        with torch.no_grad():
+            return torch.tanh(self._gaussian(observations)[0])
+
+    def update(self) -> None:
+        """Make one update."""
+        self._captured(self.descent, self._numbers.next(), self._now.next(), self._next.next())
+
+    def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
+        """Update entropy coefficient, critics, actor and targets.
+
+        Args:
+            numbers: Which transitions; see :meth:`plab.runners.population.replay.Replay.sample`.
+            noise: Standard normal noise of the actions, shape [agent, row, action].
+            next_noise: That of the next actions.
+
+        Returns:
+            Entropy coefficient, its loss, and those of critics and actor, shape [4, agent].
+        """
+        networks = self.networks
+        observations, actions, next_observations, rewards = self.replay.sample(numbers)
+        own_actions, log_prob = self._drawn(observations, noise)
+        ent_coef = self.log_ent_coef.detach().exp().unsqueeze(1)
+        target_entropy = -float(self.sizes.actions)
+        entropy_loss = -self.log_ent_coef * (log_prob + target_entropy).detach().mean(1)
+        descend(self.optimizers["entropy"], entropy_loss)
+        with torch.no_grad():
+            next_actions, next_log_prob = self._drawn(next_observations, next_noise)
+            values = twin_values(networks["targets"], next_observations, next_actions).min(1).values
+            # An episode ends by truncation only: the value of the next observation always counts.
+            targets = rewards + self.method.gamma * (values - ent_coef * next_log_prob)
+        errors = twin_values(networks["critics"], observations, actions) - targets.unsqueeze(1)
+        critic_loss = 0.5 * errors.square().mean(2).sum(1)
+        descend(self.optimizers["critics"], critic_loss)
+        least = twin_values(networks["critics"], observations, own_actions).min(1).values
+        actor_loss = (ent_coef * log_prob - least).mean(1)
+        descend(self.optimizers["actor"], actor_loss)
+        follow(networks.parameters("targets"), networks.parameters("critics"), self.method.tau)
+        losses = ent_coef.squeeze(1), entropy_loss, critic_loss, actor_loss
+        return torch.stack([loss.detach() for loss in losses])
+
+    def _gaussian(self, observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and logarithm of the standard deviation of actions before tanh."""
+        actor = self.networks["actor"]
+        latent = mlp(observations, actor, "latent_pi", RELU, last=False)
+        mean, log_std = (linear(latent, *_layer(actor, name)) for name in ("mu", "log_std"))
+        return mean, log_std.clamp(*LOG_STD)
+
+    def _drawn(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions and the logarithms of their densities, shape [agent, row]."""
+        mean, log_std = self._gaussian(observations)
+        plain = mean + log_std.exp() * noise
+        actions = torch.tanh(plain)
+        density = -0.5 * ((plain - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
+        return actions, (density - torch.log(1.0 - actions.square() + EPSILON)).sum(2)
+
+
+def _layer(part: Part, name: str) -> tuple[Tensor, Tensor]:
+    return part[f"{name}.weight"], part[f"{name}.bias"]

@@ -1,0 +1,104 @@
+"""Twin delayed deep deterministic policy gradient, many agents at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from plab.config_types import Td3Config
+from plab.runners.population.agents import OffPolicyAgents, Spaces
+from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
+from plab.runners.population.replay import Samples
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["Td3Agents"]
+
+RELU = nn.ReLU()
+
+
+class Td3Agents(OffPolicyAgents):
+    """Agents of TD3; actor and targets follow every ``policy_delay``-th update of the critics."""
+
+    PARTS: ClassVar = {
+        "actor": ("actor.mu",),
+        "actor_target": ("actor_target.mu",),
+        "critics": ("critic.qf0", "critic.qf1"),
+        "targets": ("critic_target.qf0", "critic_target.qf1"),
+    }
+
+    method: Td3Config
+
+    def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
+        """Begin with untrained networks and empty buffers."""
+        super().__init__(cfgs, spaces, device)
+        self.optimizers = {
+            part: adam(self.networks.parameters(part), self.method.lr) for part in ("critics", "actor")
+        }
+        self._smoothing = self._block(self.draws.normal, self.method.batch_size, self.sizes.actions)
+
+    def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Add noise to the policy's actions."""
+        return self._noisy(self._actor("actor", observations), noise)
+
+    def explore_at_random(self, actions: Tensor) -> Tensor:
+        """Add noise to random actions, too, as Stable-Baselines3 does."""
+        return self._noisy(actions, self._noise.next())
+
+    def decide(self, observations: Tensor) -> Tensor:
+        """Return the policy's actions."""
+        with torch.no_grad():
+            return self._actor("actor", observations)
+
+    def update(self) -> None:
+        """Make one update of the critics, and of the actor if it is its turn."""
+        delayed = self.updates % self.method.policy_delay != 0
+        self._captured(self.critics if delayed else self.both, self._numbers.next(), self._smoothing.next())
+
+    def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
+        """Update the critics.
+
+        Args:
+            numbers: Which transitions; see :meth:`plab.runners.population.replay.Replay.sample`.
+            noise: Standard normal noise of the target policy, shape [agent, row, action].
+
+        Returns:
+            Their losses, shape [agent].
+        """
+        return self._update_critics(self.replay.sample(numbers), noise)
+
+    def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
+        """Update critics, actor and targets; arguments as of :meth:`critics`, losses of shape [2, agent]."""
+        samples = self.replay.sample(numbers)
+        critic_loss = self._update_critics(samples, noise)
+        actions = self._actor("actor", samples.observations)
+        actor_loss = -twin_values(self.networks["critics"], samples.observations, actions)[:, 0].mean(1)
+        descend(self.optimizers["actor"], actor_loss)
+        parameters = self.networks.parameters
+        for target, source in (("targets", "critics"), ("actor_target", "actor")):
+            follow(parameters(target), parameters(source), self.method.tau)
+        return torch.stack([critic_loss, actor_loss.detach()])
+
+    def _update_critics(self, samples: Samples, noise: Tensor) -> Tensor:
+        reach = self.method.target_noise_clip
+        with torch.no_grad():
+            smoothing = (noise * self.method.target_noise).clamp(-reach, reach)
+            next_actions = self._actor("actor_target", samples.next_observations) + smoothing
+            next_actions = next_actions.clamp(-1.0, 1.0)
+            values = twin_values(self.networks["targets"], samples.next_observations, next_actions)
+            # An episode ends by truncation only: the value of the next observation always counts.
+            targets = samples.rewards + self.method.gamma * values.min(1).values
+        judged = twin_values(self.networks["critics"], samples.observations, samples.actions)
+        loss = (judged - targets.unsqueeze(1)).square().mean(2).sum(1)
+        descend(self.optimizers["critics"], loss)
+        return loss.detach()
+
+    def _actor(self, part: str, observations: Tensor) -> Tensor:
+        return torch.tanh(mlp(observations, self.networks[part], "", RELU, last=True))
+
+    def _noisy(self, actions: Tensor, noise: Tensor) -> Tensor:
+        return (actions + noise * self.method.exploration_noise).clamp(-1.0, 1.0)

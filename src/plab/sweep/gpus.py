@@ -1,0 +1,171 @@
+"""A sweep on all GPUs of this computer: a process each, which is given a batch whenever it is free."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Any
+
+from plab import runners
+from plab.checks import cuda_devices
+from plab.config_errors import ConfigError
+from plab.progress import forward_to, show_several
+from plab.reuse import SimulatorCache
+from plab.sweep.carry import Carrier, look_up
+from plab.tally import Outcome
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["carry_on", "gpus"]
+
+VISIBLE = "CUDA_VISIBLE_DEVICES"
+"""The variable that tells a process which GPUs it has."""
+
+PATIENCE = 30.0
+"""How long processes may take to close their files after Ctrl-C [s]."""
+
+
+def gpus() -> list[str]:
+    """Return the names of the GPUs that this process may use.
+
+    Raises:
+        ConfigError: If there are none.
+    """
+    named = os.environ.get(VISIBLE)
+    found = range(cuda_devices()) if named is None else filter(None, named.split(","))
+    if not (names := [str(one).strip() for one in found]):
+        raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
+    return names
+
+
+def carry_on(names: Sequence[str]) -> Carrier:
+    """Return what carries out batches on some GPUs.
+
+    Args:
+        names: The GPUs, as ``CUDA_VISIBLE_DEVICES`` names them.
+    """
+
+    def carry(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
+        waiting = list(reversed(batches))
+        workers = [_Worker(name) for name in names[: len(batches)]]
+        shown = any(cfg.progress for batch in batches for cfg in batch)
+        try:
+            with show_several([f"GPU {worker.name}" for worker in workers], enabled=shown) as report:
+                while waiting or any(worker.batch for worker in workers):
+                    for worker in workers:
+                        if waiting and not worker.batch:
+                            worker.give(waiting.pop(), progress())
+                    for worker in _heard([worker for worker in workers if worker.batch]):
+                        for kind, *content in worker.messages():
+                            if kind == "progress":
+                                report(f"GPU {worker.name}", *content)
+                            else:
+                                yield from _told(*content)
+        finally:
+            for worker in workers:
+                worker.end()
+
+    return carry
+
+
+class _Worker:
+    """A process that carries out batches on a GPU; if it is killed, another takes its place.
+
+    Attributes:
+        name: The GPU.
+        batch: What it is carrying out, empty if nothing.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.batch: list[Config] = []
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(self.name, theirs), daemon=True)
+        self.process.start()
+        theirs.close()
+
+    def give(self, batch: list[Config], note: str) -> None:
+        """Let it carry out a batch."""
+        if not self.process.is_alive():
+            self._start()
+        self.batch = batch
+        self.connection.send((batch, note))
+
+    def messages(self) -> Iterator[tuple[Any, ...]]:
+        """Yield what it has said: how far it has come, or how the runs of its batch ended."""
+        try:
+            while self.connection.poll():
+                message = self.connection.recv()
+                if message[0] == "ended":
+                    self.batch = []
+                yield message
+        except (EOFError, OSError):
+            # Killed: the files know how far it came.
+            self.process.join()
+            outcomes = [look_up(cfg) for cfg in self.batch]
+            self.batch = []
+            yield "ended", outcomes
+
+    def end(self) -> None:
+        """Let it end; one that is at work is interrupted, and closes its files."""
+        self.connection.close()
+        if self.batch:
+            self.process.terminate()
+        self.process.join(PATIENCE)
+        self.process.kill()
+
+
+def _told(outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
+    """Say which runs have finished, and pass on how each ended."""
+    for one in outcomes:
+        if one.status == "finished":
+            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
+        yield one
+
+
+def _heard(workers: Sequence[_Worker]) -> list[_Worker]:
+    """Wait until workers have said something, and return those that have."""
+    ready = wait([worker.connection for worker in workers])
+    return [worker for worker in workers if worker.connection in ready]
+
+
+def _work(name: str, connection: Connection) -> None:
+    """Carry out batches until there are no more; runs in a process of its own."""
+    os.environ[VISIBLE] = name
+    # Ctrl-C reaches all processes of a terminal: the one that has started this one sees to it that it ends.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _interrupt)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # What is to be seen is shown by the process that has started this one.
+    sys.stdout = open(os.devnull, "w")
+    forward_to(lambda *content: connection.send(("progress", *content)))
+    cache = SimulatorCache()
+    try:
+        while True:
+            batch, note = connection.recv()
+            connection.send(("ended", runners.run_batch(batch, note, cache)))
+    except (EOFError, OSError, KeyboardInterrupt):
+        # Nobody is there any more, or nobody wants more.
+        return
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _end_with_parent() -> None:
+    """End this process, and its locks, as soon as the one that has started it is gone."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
