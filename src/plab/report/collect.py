@@ -42,6 +42,7 @@ _HARMLESS = (
     "force",
     "progress",
     "checkpoint_seconds",
+    "protocol.name",
     "sim.device",
     "sim.memory_mb",
     "method.tensorboard",
