@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs
-from plab.results import read_iterations
+from plab.results import BUDGETS, read_iterations
 
 __all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
 
@@ -68,7 +68,8 @@ def rows_on_axes(config: Mapping[str, Any], iterations: pd.DataFrame) -> pd.Data
     """Return the iterations of a run that has been read as :func:`load_series` does."""
     table, sim = iterations.copy(), config["sim"]
     table["seconds"] = table["seconds"].cumsum()
-    table["substeps"] = (table["steps"] + sim["horizon"]) * sim["substeps"]
+    own = [table[name] for name in BUDGETS if name in table]
+    table["substeps"] = (sum(own) if own else table["steps"] + sim["horizon"]) * sim["substeps"]
     table["episodes"] += 1
     return table
 

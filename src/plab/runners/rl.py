@@ -67,6 +67,7 @@ class RlRunner(Runner):
     def step(self, track: Track) -> Step:
         """Train until the next evaluation is due, except before the first, and run the policy once."""
         trainer = cast(Trainer, self._trainer)
+        before = trainer.steps
         # The first episode, of the untrained policy, compiles the kernels.
         if track.iteration > 0:
             self._train(trainer, track)
@@ -74,7 +75,8 @@ class RlRunner(Runner):
         done = self.episode(trainer)
         trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
         measured = done.measures | trainer.take_statistics()
-        return Step(measured, done.actions, trainer.state(), trainer.episodes, trainer.steps)
+        simulated = trainer.steps - before + len(done.actions)
+        return Step(measured, done.actions, trainer.state(), trainer.episodes, trainer.steps, simulated)
 
     def episode(self, trainer: Trainer) -> PolicyEpisode:
         """Run an episode of the deterministic policy."""

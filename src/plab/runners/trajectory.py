@@ -66,7 +66,8 @@ class TrajectoryRunner(Runner):
             sequence.step(gradient)
             measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
             seconds = share + time.perf_counter() - start
-            yield track, Step(measured, tried[number], sequence.state(), seconds=seconds)
+            cost = {"steps_forward": 0, "steps_gradient": len(gradient)}
+            yield track, Step(measured, tried[number], sequence.state(), seconds=seconds, **cost)
 
 
 def adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:

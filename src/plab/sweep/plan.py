@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.families import family
 from plab.problem import build_scenes
+from plab.results import row_count
 from plab.sim.memory import batch_limit
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     if not family(cfg.method.family).batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other.
-    return [*kind, method["iterations"], scene.particle_count, [m.shape for m in scene.manipulators]]
+    return [*kind, row_count(method), scene.particle_count, [m.shape for m in scene.manipulators]]
 
 
 def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
