@@ -197,9 +197,9 @@ class StagesConfig(MethodConfig):
                 raise ConfigError(
                     f"{path}.stages.{name} is no planner: start from one, as conf/method/solve.yaml"
                 )
-            stage.check(f"{path}.stages.{name}")
             for part in ("loss_weights", "loss_terms"):
                 if getattr(stage, part) != getattr(self, part):
                     raise ConfigError(
                         f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
                     )
+            stage.check(f"{path}.stages.{name}")
