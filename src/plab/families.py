@@ -146,12 +146,12 @@ FAMILIES: dict[str, Family] = {
             "stages": Rule(f"{_PLANNERS}.stages:Stages", f"{_TYPES}:StagesConfig"),
         },
         methods={
-            "multistart": Appearance("Multistart", "#332288"),
+            "multistart": Appearance("Multistart", "#6699CC"),
             "cem": Appearance("CEM", "#117733", "--"),
             "mppi": Appearance("MPPI", "#44AA99", "-."),
             "cmaes": Appearance("CMA-ES", "#882255"),
             "hybrid": Appearance("Hybrid", "#AA4499", "--"),
-            "solve": Appearance("Solve", "#000000"),
+            "solve": Appearance("Solve", "#332288"),
         },
     ),
     "rl": Family(

@@ -50,8 +50,8 @@ ARCHIVE_SUFFIX = ".plab.zip"
 _MEASURES = ("loss", "reward", "iou", "score")
 
 BUDGETS = ("steps_forward", "steps_gradient")
-"""Columns of what a run has simulated up to the end of a row, in environment steps: without a gradient, and with
-one. Older files have none."""
+"""Columns of what a run has simulated up to the end of a row, in environment steps: without a gradient, and
+with one. Older files have none."""
 
 COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 """Columns that the iterations of every method have, beside those of :func:`loss_columns`;

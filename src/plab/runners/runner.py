@@ -78,7 +78,8 @@ class Track:
         self.iteration, self.best_loss = len(rows), result.best_loss
         self.best_actions = result.best_actions
         self._by_score = family(job.cfg.method.family).ranking == "score"
-        self._best_score = float(rows["score"].iloc[result.best_iteration]) if len(rows) else -np.inf
+        known = self._by_score and len(rows) > 0
+        self._best_score = float(rows["score"].iloc[result.best_iteration]) if known else -np.inf
         # Files that were begun before there were budgets go on without.
         self._budget = {name: 0 for name in BUDGETS if name in rows or not len(rows)}
         self._budget |= {name: int(rows[name].iloc[-1]) for name in self._budget if len(rows)}
@@ -116,6 +117,7 @@ class Track:
         row["seconds"] = cast(float, step.seconds)
         # Written so that the first loss beats the NaN that stands for none.
         better = not row["loss"] >= self.best_loss
+        # Of several with the highest score the one of lowest loss.
         if self._by_score and row["score"] != self._best_score:
             better = row["score"] > self._best_score
         best: dict[str, Any] = {

@@ -142,8 +142,8 @@ def _rotation(tool: Manipulator) -> Rotation:
 
 
 def _action(tool: Manipulator, way: np.ndarray) -> np.ndarray:
-    """Return what takes a manipulator a way [3] [domain units], as far as it can without turning, one entry per
-    action component."""
+    """Return what takes a manipulator a way [3] [domain units] as far as it can without turning, one entry
+    per action component."""
     if MANIPULATOR_SHAPES[tool.shape].motion == "roll":
         axis = _rotation(tool).apply([0.0, 1.0, 0.0])
         return np.array([(axis[0] * way[2] - axis[2] * way[0]) / ROLL_RADIUS, 0.0, way[1]])
