@@ -424,3 +424,14 @@ def test_stages_share_one_loss(tmp_path: Path) -> None:
         method.check("method")
     want = "method.stages.search.loss_weights differs from method.loss_weights: all share one loss"
     assert str(caught.value) == want
+
+
+def test_the_composition_of_the_page_is_one(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "methods.md").read_text(encoding="utf-8")
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "mine.yaml").write_text(
+        page.split("```yaml\n")[1].split("```")[0], encoding="utf-8"
+    )
+    method = load_config(["method=mine"], tmp_path).method
+    assert [type(stage).__name__ for stage in method.stages.values()] == ["CemConfig", "MultistartConfig"]
+    assert method.stages["search"].loss_terms == {"contact": "soft"}

@@ -111,9 +111,12 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
 
 def _kinds(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal where configurations differ in method, seed and files only."""
-    return [
-        json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)]) for cfg in cfgs
-    ]
+    # A planner's batch has each configuration many times.
+    texts = {
+        id(cfg): json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)])
+        for cfg in {id(cfg): cfg for cfg in cfgs}.values()
+    }
+    return [texts[id(cfg)] for cfg in cfgs]
 
 
 class Problem:

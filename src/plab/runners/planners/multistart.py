@@ -55,7 +55,7 @@ class Multistart(Planner):
             self._replace(order, random)
         return self.show(actions, shown)
 
-    def found(self) -> Tensor:
+    def candidates(self) -> Tensor:
         """Return the candidates, the best of the last judgement first."""
         return self._actions()[self.memory["order"]]
 

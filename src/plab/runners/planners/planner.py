@@ -134,9 +134,13 @@ class Planner(ABC):
     def iterate(self, random: torch.Generator) -> Asking:
         """Do an iteration: ask for candidates to be tried, and return what it is told by."""
 
-    def found(self) -> Tensor:
+    @abstractmethod
+    def candidates(self) -> Tensor:
         """Return the last candidates, the best first, shape [P, T, A]."""
-        return self.memory["candidates"]
+
+    def found(self) -> Tensor:
+        """Return the best actions so far, and after them the last candidates, shape [1 + P, T, A]."""
+        return torch.cat([self.memory["champion"][None], self.candidates()])
 
     def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
         """Do the next iteration, the first one perhaps from what a stage before has found."""
@@ -149,7 +153,10 @@ class Planner(ABC):
 
     def show(self, actions: Tensor, answer: Answer) -> Shown:
         """Return the best of some candidates, by what they gave in the hard contact model."""
-        best = int(answer.cost("score").argmin())
+        cost = answer.cost("score")
+        best = int(cost.argmin())
+        if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
+            self.memory |= {"champion": actions[best].clone(), "cost": cost[best].clone()}
         return Shown(actions[best], {name: float(values[best]) for name, values in answer.measures.items()})
 
     def state(self) -> dict[str, Any]:

@@ -60,6 +60,10 @@ class Sampler(Planner):
         drawn = self.start.draw(self.method, self.method.population - len(kept), random)
         self.memory["candidates"] = torch.cat([kept, drawn])
 
+    def candidates(self) -> Tensor:
+        """Return the curves drawn last, the best first."""
+        return self.memory["candidates"]
+
     def iterate(self, random: torch.Generator) -> Asking:
         """Try the starts, later what is drawn, and learn from it."""
         method, first = self.method, self.iteration == 0
