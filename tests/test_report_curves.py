@@ -227,7 +227,7 @@ def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path,
     out, words = tmp_path / "out", ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac"]
     sources = ["--results", str(folder), str(tmp_path / "ablation")]
     assert main(["curves", *words, *sources, "--out", str(out)]) == 0
-    assert "10 figures" in capsys.readouterr().out
+    assert "11 figures" in capsys.readouterr().out
     for suffix in (".pdf", ".png", ".json"):
         assert {path.stem for path in out.glob(f"*{suffix}")} - {"runs"} == NAMES_OF_FIGURES
     for path in out.glob("*.pdf"):

@@ -442,7 +442,7 @@ def test_csv_has_all_digits(written: Path) -> None:
 def test_nothing_finished_gives_tables_without_numbers(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     tables = write_tables(gather(tmp_path / "empty"), tmp_path / "out", "command")
-    assert len(tables) == 17
+    assert len(tables) == 16
     ours = by_form([table for table in tables if table.name == "iou_per_task"])["ours"]
     assert set(ours.cells.drop(columns="task").to_numpy().ravel()) == {"0/15"}
 

@@ -179,12 +179,12 @@ def _finish(figure: Figure, absent: Sequence[str]) -> None:
 def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str) -> Figure:
     tasks, absent = _tasks_with_runs(runs)
     figure, panels = _panels(len(tasks))
-    for number, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
+    for place, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
         expected = len(runs.variants) * len(runs.seeds)
         panel.set_title(task)
         if _panel(panel, runs, _pick(series, task=task), axis, column, expected):
             log_axis(panel, label)
-        if number % 5 == 0:
+        if place % 5 == 0:
             panel.set_ylabel(title)
     _finish(figure, absent)
     return figure
