@@ -142,7 +142,7 @@ FAMILIES: dict[str, Family] = {
             "multistart": Rule(f"{_PLANNERS}.multistart:Multistart", f"{_TYPES}:MultistartConfig"),
             "cem": Rule(f"{_PLANNERS}.cem:Cem", f"{_TYPES}:CemConfig"),
             "mppi": Rule(f"{_PLANNERS}.mppi:Mppi", f"{_TYPES}:MppiConfig"),
-            "cmaes": Rule(f"{_PLANNERS}.covariance:Cmaes", f"{_TYPES}:CmaesConfig"),
+            "cmaes": Rule(f"{_PLANNERS}.cmaes:Cmaes", f"{_TYPES}:CmaesConfig"),
             "stages": Rule(f"{_PLANNERS}.stages:Stages", f"{_TYPES}:StagesConfig"),
         },
         methods={
