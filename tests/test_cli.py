@@ -33,7 +33,10 @@ def plab(*argv: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str
 
 REFUSED = [
     (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks,"),
-    (["method=a2c"], "choose from: adam, adam_h, apg, gd, ppo, sac, td3"),
+    (
+        ["method=a2c"],
+        "choose from: adam, adam_h, apg, cem, cmaes, gd, hybrid, mppi, multistart, ppo, sac, solve,",
+    ),
     (
         ["+experiment=yield_ablatoin"],
         "experiment 'yield_ablatoin' does not exist; did you mean yield_ablation?",

@@ -14,11 +14,12 @@ from scipy import stats
 import synthetic
 from plab.report.__main__ import main
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.budgets import at_budgets, score_at_budget, scores_at
 from plab.report.collect import NAMES, collect, collect_ablation
-from plab.report.curves import rewards, rl_scores, score_curves
+from plab.report.curves import budget_curves, rewards, rl_scores, score_curves
 from plab.report.figures import grid, log_axis, style
 from plab.report.methods import method, ordered
-from plab.report.series import band, load_series
+from plab.report.series import band, load_series, rows_on_axes
 from plab.selection import select
 from plab.suite import PAPER_METHODS
 
@@ -62,6 +63,59 @@ def test_axes_of_a_run(tmp_path: Path) -> None:
     assert table["episodes"].tolist() == [1, 2, 3, 4]
     assert table["substeps"].tolist() == [950, 1900, 2850, 3800]
     np.testing.assert_allclose(table["seconds"], np.cumsum(result.iterations["seconds"]))
+
+
+# ---------------------------------------------------------------------------------------------------- budgets
+
+
+def test_the_best_so_far_is_that_of_the_familys_ranking() -> None:
+    rows = pd.DataFrame({"loss": [5.0, 3.0, 4.0, 2.0], "score": [0.4, 0.1, 0.6, 0.3]})
+    rows = rows.assign(episodes=range(4), steps=range(4), seconds=1.0)
+    budgets = {"steps_forward": [10, 20, 30, 40], "steps_gradient": [0, 5, 5, 10]}
+    sim = {"horizon": 50, "substeps": 2}
+
+    def table(family: str, **columns: list[int]) -> pd.DataFrame:
+        return rows_on_axes({"method": {"family": family}, "sim": sim}, rows.assign(**columns))
+
+    assert table("trajectory")["best_score"].tolist() == [0.4, 0.1, 0.1, 0.3]
+    assert table("planner")["best_score"].tolist() == [0.4, 0.4, 0.6, 0.6]
+    assert table("planner")["simulated"].tolist() == [50, 51, 52, 53]
+    spent = table("planner", **budgets)
+    assert spent["simulated"].tolist() == [10, 25, 35, 50]
+    assert spent["substeps"].tolist() == [20, 50, 70, 100]
+    found = scores_at(spent, np.array([9.0, 10.0, 34.0, 35.0, 1e6]))
+    np.testing.assert_array_equal(found, [np.nan, 0.4, 0.4, 0.6, 0.6])
+
+
+def test_an_interval_over_seeds_within_variants() -> None:
+    scores = np.array([[0.1, 0.3, 0.2], [0.7, 0.8, 0.6]])
+    strata = [
+        [pd.DataFrame({"simulated": [100.0], "best_score": [s], "seconds": [1.0]}) for s in own]
+        for own in scores
+    ]
+    before, found = at_budgets(strata, np.array([99.0, 100.0]))
+    assert np.isnan(before.value)
+    # Two variances with two degrees of freedom each, equal here, so that they add up to four.
+    error = np.sqrt(scores.var(axis=1, ddof=1).sum() / 3) / 2
+    assert found.value == pytest.approx(scores.mean())
+    assert found.high - found.value == pytest.approx(stats.t.ppf(0.975, 4) * error)
+    single = at_budgets([strata[0][:1], strata[1]], np.array([100.0]))[0]
+    assert single.value == pytest.approx((0.1 + 0.7) / 2) and np.isnan(single.low)
+
+
+def test_table_of_scores_at_equal_budgets(tmp_path: Path) -> None:
+    for seed in range(2):
+        result = synthetic.run(tmp_path, method="adam", seed=seed)
+        synthetic.save(result)
+    runs = collect(tmp_path, select([], NAMES))
+    (table,) = score_at_budget(runs, load_series(runs))
+    (cells,) = table.cells.to_dict("records")
+    assert (cells["task"], cells["method"], cells["runs"]) == ("Rope", "Adam", "2")
+    data = table.data.set_index("steps")
+    assert data.index.tolist() == [1e3, 1e4, 1e5, 1e6]
+    # Four iterations of 50 steps: all is over before the first budget.
+    assert data["score"].nunique() == 1 and cells["1,000 steps"].startswith(f"{data['score'][1e3]:.2f} [")
+    assert data["seconds"][1e6] == pytest.approx(4.0, abs=0.4)
 
 
 # ------------------------------------------------------------------------------------------------- aggregates
@@ -158,6 +212,7 @@ NAMES_OF_FIGURES = {
     "reward_per_configuration",
     "score_against_time",
     "score_against_substeps",
+    "score_at_budget",
     "rl_scores",
     "agreement",
     "interquartile_mean",
@@ -172,7 +227,7 @@ def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path,
     out, words = tmp_path / "out", ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac"]
     sources = ["--results", str(folder), str(tmp_path / "ablation")]
     assert main(["curves", *words, *sources, "--out", str(out)]) == 0
-    assert "10 figures" in capsys.readouterr().out
+    assert "11 figures" in capsys.readouterr().out
     for suffix in (".pdf", ".png", ".json"):
         assert {path.stem for path in out.glob(f"*{suffix}")} - {"runs"} == NAMES_OF_FIGURES
     for path in out.glob("*.pdf"):
@@ -200,7 +255,7 @@ def test_tasks_without_runs_have_no_panel_but_a_mention(folder: Path) -> None:
     runs = collect(folder, select(["task=Rope,Torus", "method=adam"], NAMES))
     with style():
         per_task, per_configuration = rewards(runs, load_series(runs))
-        scores = score_curves(runs, load_series(runs))
+        scores = [*score_curves(runs, load_series(runs)), budget_curves(runs, load_series(runs))]
     for drawing in (per_task, per_configuration, *scores):
         titles = [axes.get_title() for axes in drawing.figure.axes]
         assert titles and all(title.startswith("Rope") for title in titles)
@@ -232,6 +287,10 @@ def test_nothing_finished_draws_nothing(tmp_path: Path, capsys) -> None:
 
 
 def test_every_method_has_a_look_of_its_own() -> None:
+    planners = ["multistart", "cem", "mppi", "cmaes", "hybrid", "solve"]
+    planned = [method(name) for name in ordered(planners)]
+    assert [known.name for known in planned] == [*PAPER_METHODS, *planners]
+    assert len({known.colour for known in planned}) == len(planned)
     methods = [method(name) for name in ordered(["apg"])]
     assert [known.name for known in methods] == [*PAPER_METHODS, "apg"]
     assert len({known.colour for known in methods}) == len(methods)

@@ -320,7 +320,7 @@ def test_times_say_how_many_runs_shared_a_simulator(tmp_path: Path) -> None:
 def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
     assert main(["tables", "--results", name, "--out", str(tmp_path)]) == 0
     count = len(load(example_archive(name)))
-    assert f"16 tables of {count} out of" in capsys.readouterr().out
+    assert f"17 tables of {count} out of" in capsys.readouterr().out
     assert f"--results {name}" in (tmp_path / "ours" / "iou_per_task.md").read_text(encoding="utf-8")
     assert resolve(f"./{name}") == Path(name)
     assert all(problem is None for _, problem in check(example_archive(name)))
@@ -442,7 +442,7 @@ def test_csv_has_all_digits(written: Path) -> None:
 def test_nothing_finished_gives_tables_without_numbers(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     tables = write_tables(gather(tmp_path / "empty"), tmp_path / "out", "command")
-    assert len(tables) == 15
+    assert len(tables) == 16
     ours = by_form([table for table in tables if table.name == "iou_per_task"])["ours"]
     assert set(ours.cells.drop(columns="task").to_numpy().ravel()) == {"0/15"}
 

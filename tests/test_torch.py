@@ -14,7 +14,7 @@ from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.objective import scores
 from plab.problem import Problem
-from plab.results import RunResult, read, result_path
+from plab.results import BUDGETS, RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
 from plab.torch import TensorEnv, rollout
@@ -109,10 +109,10 @@ def test_type_is_kept_and_no_gradient_is_computed_in_vain(problem: Problem, monk
     losses = rollout(problem, actions)
     losses.sum().backward()
     assert losses.dtype == actions.grad.dtype == torch.float32
-    wanted, intact = [], Problem.rollout
+    wanted, intact = [], Problem.try_out
     monkeypatch.setattr(
         Problem,
-        "rollout",
+        "try_out",
         lambda self, a, **options: (wanted.append(options["gradient"]), intact(self, a, **options))[1],
     )
     assert not rollout(problem, actions.detach()).requires_grad
@@ -167,7 +167,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
 def test_apg_lowers_the_loss(finished: RunResult) -> None:
     rows = finished.iterations
     assert rows["steps"].tolist() == [HORIZON * i for i in range(ITERATIONS)]
-    measured = set(episode_columns(["density", "sdf", "contact"]))
+    spent = rows["steps_forward"].tolist(), rows["steps_gradient"].tolist()
+    assert spent == ([HORIZON * (i + 1) for i in range(ITERATIONS)],) * 2
+    measured = set(episode_columns(["density", "sdf", "contact"])) | set(BUDGETS)
     assert measured | {"iteration", "episodes", "steps", "gradient_norm", "seconds"} == set(rows.columns)
     assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and (rows["gradient_norm"] > 0).all()
     assert finished.best_loss == rows["loss"].min()

@@ -20,6 +20,7 @@ RL, GRADIENT = "RL", "gradient"
 
 _TYPES = "plab.config_types"
 _AGENTS = "plab.runners.population"
+_PLANNERS = "plab.runners.planners"
 
 Kind = TypeVar("Kind")
 
@@ -66,6 +67,8 @@ class Family:
         runner: Subclass of :class:`plab.runners.runner.Runner`, or its ``module:NAME``.
         columns: Columns of the results beside those that all methods have.
         may_be_nan: Those of them with entries for which there is no number.
+        ranking: What the best actions of a run are chosen by: ``loss``, the lowest, or ``score``, the highest
+            (and of several the one of lowest loss).
         batching: Whether runs can share a simulator; else each runs alone.
         population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they
             share a simulator if they have the same section ``method``. ``runner`` carries out the others.
@@ -79,6 +82,7 @@ class Family:
     runner: type | str
     columns: tuple[str, ...] = ()
     may_be_nan: tuple[str, ...] = ()
+    ranking: str = "loss"
     batching: bool = False
     population: type | str | None = None
     rules: Mapping[str, Rule] = field(default_factory=dict)
@@ -131,7 +135,7 @@ def _loaded(what: Any, kind: type[Kind]) -> Kind:
     return load_object(what, kind) if isinstance(what, str) else what
 
 
-# Colours are Okabe and Ito's, which people with any colour vision can tell apart.
+# Colours are Okabe and Ito's, of planners Paul Tol's, which people with any colour vision can tell apart.
 FAMILIES: dict[str, Family] = {
     "trajectory": Family(
         label="a sequence of actions, improved by its gradient",
@@ -148,6 +152,28 @@ FAMILIES: dict[str, Family] = {
             "adam": Appearance("Adam", "#D55E00"),
             "gd": Appearance("GD", "#E69F00", "--"),
             "adam_h": Appearance("Adam-H", "#CC79A7", "-."),
+        },
+    ),
+    "planner": Family(
+        label="a sequence of actions, searched for with many candidates",
+        config=f"{_TYPES}:PlannerConfig",
+        runner="plab.runners.planners.planner:PlannerRunner",
+        ranking="score",
+        batching=True,
+        rules={
+            "multistart": Rule(f"{_PLANNERS}.multistart:Multistart", f"{_TYPES}:MultistartConfig"),
+            "cem": Rule(f"{_PLANNERS}.cem:Cem", f"{_TYPES}:CemConfig"),
+            "mppi": Rule(f"{_PLANNERS}.mppi:Mppi", f"{_TYPES}:MppiConfig"),
+            "cmaes": Rule(f"{_PLANNERS}.cmaes:Cmaes", f"{_TYPES}:CmaesConfig"),
+            "stages": Rule(f"{_PLANNERS}.stages:Stages", f"{_TYPES}:StagesConfig"),
+        },
+        methods={
+            "multistart": Appearance("Multistart", "#6699CC"),
+            "cem": Appearance("CEM", "#117733", "--"),
+            "mppi": Appearance("MPPI", "#44AA99", "-."),
+            "cmaes": Appearance("CMA-ES", "#882255"),
+            "hybrid": Appearance("Hybrid", "#AA4499", "--"),
+            "solve": Appearance("Solve", "#332288"),
         },
     ),
     "rl": Family(

@@ -239,20 +239,18 @@ def total_loss(terms: Any, weights: Any) -> Any:
     return (terms * weights).sum(-1)
 
 
-def rewards(initial_terms: ArrayLike, step_terms: ArrayLike, weights: ArrayLike) -> np.ndarray:
+def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
     """Reward of each step: the loss at the initial state minus the loss after the step.
 
     Args:
-        initial_terms: Loss terms of the initial state, shape [..., term].
-        step_terms: Loss terms after each environment step, shape [..., T, term].
-        weights: Weights of the terms, shape [term].
+        initial_terms: Loss terms of the initial state, shape [..., term]; an array or a tensor.
+        step_terms: Loss terms after each environment step, shape [..., T, term], likewise.
+        weights: Weights of the terms, shape [term], likewise.
 
     Returns:
-        Rewards, shape [..., T].
+        Rewards, shape [..., T], like the terms.
     """
-    numbers = np.asarray(weights)
-    before, after = (total_loss(np.asarray(terms), numbers) for terms in (initial_terms, step_terms))
-    return before[..., None] - after
+    return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
 
 
 def observation(x: ArrayLike, v: ArrayLike, poses: Sequence[ArrayLike]) -> np.ndarray:

@@ -10,14 +10,24 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plab.config import ConfigError, build_scene, variant_task
 from plab.losses import make_terms
-from plab.objective import Scores, rewards, scores, scores_from_iou, target_sdf, total_loss
+from plab.objective import (
+    Scores,
+    batch_scores,
+    rewards,
+    score_scale,
+    scores,
+    scores_from_iou,
+    target_sdf,
+    total_loss,
+)
 from plab.sim import Rollout, Simulator
+from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, load_release_target
 
 if TYPE_CHECKING:
@@ -26,7 +36,7 @@ if TYPE_CHECKING:
     from plab.config import Config
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem", "build_scenes", "build_simulator", "make_targets"]
+__all__ = ["Episodes", "Problem", "Trials", "build_scenes", "build_simulator", "make_targets"]
 
 
 @dataclass(frozen=True)
@@ -41,8 +51,7 @@ class Episodes:
         iou: Soft IoU with the target after each step, shape [batch, T].
         final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
         scores: How close each environment came.
-        gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None; a tensor if the
-            actions were one on the device.
+        gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
         failures: Environments that broke off, and when and why; their numbers mean nothing.
     """
 
@@ -54,6 +63,24 @@ class Episodes:
     final_mass: np.ndarray | None
     scores: list[Scores]
     gradient: np.ndarray | None
+    failures: dict[int, str]
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What many sequences of actions gave; arrays, or CUDA tensors if the actions were one.
+
+    Attributes:
+        measures: What each episode is measured by, shape [batch] each: ``loss`` and its terms, ``reward``,
+            ``iou`` and ``score``, as in the columns of results.
+        final_loss: Weighted loss of the last step, shape [batch].
+        gradient: Gradient of ``loss``, shape [batch, T, A], or None.
+        failures: Environments that broke off, and when and why; their numbers mean nothing.
+    """
+
+    measures: dict[str, Any]
+    final_loss: Any
+    gradient: Any
     failures: dict[int, str]
 
 
@@ -84,9 +111,12 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
 
 def _kinds(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal where configurations differ in method, seed and files only."""
-    return [
-        json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)]) for cfg in cfgs
-    ]
+    # A planner's batch has each configuration many times.
+    texts = {
+        id(cfg): json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)])
+        for cfg in {id(cfg): cfg for cfg in cfgs}.values()
+    }
+    return [texts[id(cfg)] for cfg in cfgs]
 
 
 class Problem:
@@ -137,9 +167,47 @@ class Problem:
         self.initial_mass = self.simulator.mass_tensor()
         judged = {kind: self._score(k, self.initial_mass[k]) for kind, k in first.items()}
         self.initial_scores = [judged[kind] for kind in kinds]
+        start, best = zip(
+            *((one.iou_initial, one.iou_target_self) for one in self.initial_scores), strict=True
+        )
+        self._scale, self._held_weights = Constants(score_scale(start, best)), Constants(self.weights)
+
+    def loss_of(self, terms: Any) -> Any:
+        """Weigh and add terms, shape [..., term]; an array or a tensor of shape [...]."""
+        return total_loss(terms, self._held_weights.like(terms))
+
+    def scores_of(self, iou: Any) -> tuple[Any, Any]:
+        """Return ``score`` and ``score_printed`` of states by their soft IoUs, shape [batch] all; arrays or
+        tensors."""
+        return batch_scores(self._scale.like(iou), iou)
+
+    def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> Trials:
+        """Run actions from the initial states, in the current contact model, and sum up what they give; with
+        CUDA tensors nothing passes through the host but that which has broken off.
+
+        Args:
+            actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
+            gradient: Whether to compute the gradient of the trajectory loss.
+
+        Raises:
+            ValueError: If the shape is wrong or an action is not finite.
+            MemoryError: If the gradient does not fit the memory budget.
+        """
+        result = self.simulator.rollout(actions, gradient=gradient, strict=False)
+        terms, iou = result.step_terms, result.step_iou[:, -1]
+        loss, reward = (
+            self.loss_of(terms),
+            rewards(result.initial_terms, terms, self._held_weights.like(terms)),
+        )
+        score, _ = self.scores_of(iou)
+        # One after the other: in which order sum() adds depends on how many episodes there are.
+        total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
+        by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
+        measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
+        return Trials(measures, loss[:, -1], result.gradient, result.failures)
 
     def rollout(
-        self, actions: np.ndarray | torch.Tensor, *, gradient: bool, strict: bool = True, exact: bool = True
+        self, actions: np.ndarray, *, gradient: bool, strict: bool = True, exact: bool = True
     ) -> Episodes:
         """Run actions from the initial states, in the simulator's current contact model.
 
@@ -161,12 +229,12 @@ class Problem:
         return Episodes(
             term_names=self.term_names,
             terms=result.step_terms,
-            loss=total_loss(result.step_terms, self.weights),
+            loss=self.loss_of(result.step_terms),
             reward=rewards(result.initial_terms, result.step_terms, self.weights),
             iou=result.step_iou,
             final_mass=final_mass,
             scores=self._final_scores(result, final_mass),
-            gradient=cast(Any, result.gradient),
+            gradient=result.gradient,
             failures=result.failures,
         )
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from plab.locks import held
-from plab.results import ResultsError, Row, lookup
+from plab.results import ResultsError, Row, lookup, row_count
 from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes
 from plab.results.loading import readable_rows
@@ -218,8 +218,7 @@ def _take(run: Run, row: Row) -> None:
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
     run.rate = run.left = None
     run.message = row.values["message"] if state == "failed" else ""
-    total = lookup(row.config, "method.iterations")
-    run.total = int(total if total == total else lookup(row.config, "method.episodes"))
+    run.total = row_count(row.config["method"]) or int(lookup(row.config, "method.episodes"))
     run.done = run.total if state == "done" else int(row.values["iterations"])
     if state == "running":
         _measure(run)

@@ -16,6 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch, Transition
+from plab.sim.failures import require_none
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -56,10 +57,11 @@ class _Rollout(torch.autograd.Function):
         given = actions.detach()
         if not (given.is_cuda and problem.simulator.device == "cuda"):
             given = given.cpu().double().numpy()
-        result = problem.rollout(given, gradient=wanted, exact=False)
+        result = problem.try_out(given, gradient=wanted)
+        require_none(result.failures)
         if wanted:
             ctx.save_for_backward(torch.as_tensor(result.gradient).to(actions))
-        return actions.new_tensor(result.loss.sum(axis=1))
+        return torch.as_tensor(result.measures["loss"]).to(actions)
 
     @staticmethod
     @once_differentiable

@@ -68,6 +68,7 @@ def synthetic_run(
     columns = (*COLUMNS, *loss_columns(config), *family(method["family"]).columns)
     table = pd.DataFrame({name: rng.uniform(0.0, 1.0, rows) for name in columns})
     table["iteration"], table["episodes"], table["steps"] = np.arange(rows), episodes, episodes * horizon
+    table["steps_forward"], table["steps_gradient"] = 0, (episodes + 1) * horizon
     table["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)
     table["reward"] = 40.0 * table["score"]
     table["loss"] = 100.0 - table["reward"]

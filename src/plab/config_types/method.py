@@ -6,7 +6,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from plab.config_errors import ConfigError
-from plab.config_types.ranges import at_least, folder_name, fraction, one_of, positive, share, vector, widths
+from plab.config_types.ranges import (
+    at_least,
+    folder_name,
+    fraction,
+    one_of,
+    positive,
+    share,
+    unit,
+    vector,
+    widths,
+)
 from plab.families import family
 from plab.losses.registry import check_terms
 
@@ -101,8 +111,7 @@ class TrajectoryConfig(MethodConfig):
         if self.max_gradient_norm is not None:
             positive(f"{path}.max_gradient_norm", self.max_gradient_norm)
         at_least(f"{path}.iterations", self.iterations, 1)
-        if not 0 <= self.action_init <= 1:
-            raise ConfigError(f"{path}.action_init must be in [0, 1], not {self.action_init:g}")
+        unit(f"{path}.action_init", self.action_init)
 
 
 @dataclass
@@ -274,8 +283,7 @@ class PpoConfig(RlConfig):
             most = self.steps_per_update // 2
             raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
         at_least(f"{path}.epochs", self.epochs, 1)
-        if not 0 <= self.gae_lambda <= 1:
-            raise ConfigError(f"{path}.gae_lambda must be in [0, 1], not {self.gae_lambda:g}")
+        unit(f"{path}.gae_lambda", self.gae_lambda)
         for name in ("clip_range", "max_gradient_norm", "adam_eps"):
             positive(f"{path}.{name}", getattr(self, name))
         if self.value_clip_range is not None:

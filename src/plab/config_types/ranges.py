@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from plab.config_errors import ConfigError, pick
 
-__all__ = ["at_least", "folder_name", "fraction", "one_of", "positive", "share", "vector", "widths"]
+__all__ = ["at_least", "folder_name", "fraction", "one_of", "positive", "share", "unit", "vector", "widths"]
 
 
 def folder_name(path: str, value: str) -> None:
@@ -45,6 +45,12 @@ def share(path: str, value: float) -> None:
     """Raise :class:`ConfigError` unless a value is in (0, 1]."""
     if not 0 < value <= 1:
         raise ConfigError(f"{path} must be in (0, 1], not {value:g}")
+
+
+def unit(path: str, value: float) -> None:
+    """Raise :class:`ConfigError` unless a value is in [0, 1]."""
+    if not 0 <= value <= 1:
+        raise ConfigError(f"{path} must be in [0, 1], not {value:g}")
 
 
 def widths(path: str, value: Sequence[int]) -> None:

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
-from plab.objective import OBSERVED_PARTICLES, batch_scores, score_scale, total_loss
+from plab.objective import OBSERVED_PARTICLES
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
@@ -189,10 +189,6 @@ class EpisodeBatch:
         self._renderers: list[Renderer] = []
         self._step: int | None = None
         self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
-        judged = self.problem.initial_scores
-        start, best = [one.iou_initial for one in judged], [one.iou_target_self for one in judged]
-        self._scale = Constants(score_scale(start, best))
-        self._weights = Constants(self.problem.weights)
         self._initial_info = self._info()
         self._initial_loss = Constants(self._initial_info["loss"])
         self._initial_observation = self._observe()
@@ -304,9 +300,9 @@ class EpisodeBatch:
     def _info(self, like: Array = None) -> dict[str, Array]:
         measures = self._simulator.measure(like)
         terms, iou = measures.terms, measures.iou
-        score, printed = batch_scores(self._scale.like(iou), iou)
+        score, printed = self.problem.scores_of(iou)
         return {
-            "loss": total_loss(terms, self._weights.like(terms)),
+            "loss": self.problem.loss_of(terms),
             **{f"loss_{name}": terms[:, k] for k, name in enumerate(self.problem.term_names)},
             "iou": iou,
             "score": score,

@@ -24,6 +24,7 @@ from plab.examples import EXAMPLES, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.agreement import agreement
+from plab.report.budgets import score_at_budget
 from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
 from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
@@ -165,6 +166,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
         agreement(runs),
         timing(runs, benchmark),
         solvability(runs),
+        score_at_budget(runs, load_series(runs)),
         hyperparameters(),
     )
     tables = [table for group in groups for table in group]
@@ -198,6 +200,7 @@ def write_curves(
     from plab.report.curves import (
         aggregates,
         agreement_plot,
+        budget_curves,
         rewards,
         rl_scores,
         score_curves,
@@ -212,6 +215,7 @@ def write_curves(
             drawings += [
                 *rewards(runs, series),
                 *score_curves(runs, series),
+                budget_curves(runs, series),
                 *rl_scores(runs),
                 *agreement_plot(runs),
                 *aggregates(runs),

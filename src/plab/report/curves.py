@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
+from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
 from plab.report.methods import RL, method
@@ -24,7 +25,16 @@ from plab.report.statistics import CONFIDENCE
 from plab.report.table import number
 from plab.report.tables import ordered_tasks, settings_note
 
-__all__ = ["Series", "aggregates", "agreement_plot", "rewards", "rl_scores", "score_curves", "yield_ablation"]
+__all__ = [
+    "Series",
+    "aggregates",
+    "agreement_plot",
+    "budget_curves",
+    "rewards",
+    "rl_scores",
+    "score_curves",
+    "yield_ablation",
+]
 
 Tables = Mapping[str, list[pd.DataFrame]]
 """Rows of runs by method."""
@@ -35,6 +45,8 @@ Series = Sequence[tuple[dict[str, str], pd.DataFrame]]
 _CLAMPED = "Values below zero count as zero, as in the paper."
 _SHADED = "Lines: mean over the runs; shaded: one standard deviation."
 _EPISODES = "episodes"
+_POINTS = 60
+"""Points of a curve against budgets."""
 
 
 def _pick(series: Series, **which: str) -> dict[str, list[pd.DataFrame]]:
@@ -115,6 +127,41 @@ def score_curves(runs: Runs, series: Series) -> list[Drawing]:
     ]
 
 
+def budget_curves(runs: Runs, series: Series) -> Drawing:
+    """Return the score of the best actions so far against simulated environment steps, per task."""
+    tasks, absent = _tasks_with_runs(runs)
+    figure, panels = _panels(len(tasks))
+    for panel, task in zip(panels, tasks, strict=True):
+        panel.set_title(task)
+        for name, strata in sorted(
+            strata_of(series, task).items(), key=lambda one: runs.methods.index(one[0])
+        ):
+            tables = [table for own in strata for table in own]
+            first, last = (max(table["simulated"].iloc[k] for table in tables) for k in (0, -1))
+            budgets = np.unique(np.geomspace(first, last, _POINTS).round())
+            found, look = at_budgets(strata, budgets), method(name)
+            means, low, high = np.array([(one.value, one.low, one.high) for one in found]).T
+            panel.plot(budgets, means, color=look.colour, linestyle=look.dashes, label=look.label)
+            panel.fill_between(
+                budgets, low.clip(0.0), high.clip(max=1.0), color=look.colour, alpha=0.18, lw=0
+            )
+        panel.set_ylim(0.0, 1.05)
+        log_axis(panel, "environment steps")
+    _finish(figure, absent)
+    return Drawing("score_at_budget", figure, [*NOTES, *settings_note(runs)])
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with so many panels, five in a row; a few have room to be larger."""
+    columns = min(count, 5)
+    few = {"width": 4.2 / columns, "height": 2.4} if count < 3 else {}
+    figure, axes = grid(-(-count // columns), columns, **few)
+    panels = list(axes.ravel())
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return figure, panels[:count]
+
+
 def _tasks_with_runs(runs: Runs) -> tuple[list[str], list[str]]:
     """Return the tasks that have runs, and those that have none, hence no panel."""
     tasks, present = ordered_tasks(runs.tasks), set(runs.table["task"])
@@ -131,21 +178,14 @@ def _finish(figure: Figure, absent: Sequence[str]) -> None:
 
 def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str) -> Figure:
     tasks, absent = _tasks_with_runs(runs)
-    columns = min(len(tasks), 5)
-    rows = -(-len(tasks) // columns)
-    # A few panels have room to be larger.
-    few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
-    figure, axes = grid(rows, columns, **few)
-    panels = axes.ravel()
-    for panel, task in zip(panels, tasks, strict=False):
+    figure, panels = _panels(len(tasks))
+    for place, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
         expected = len(runs.variants) * len(runs.seeds)
         panel.set_title(task)
         if _panel(panel, runs, _pick(series, task=task), axis, column, expected):
             log_axis(panel, label)
-    for panel in panels[len(tasks) :]:
-        panel.set_visible(False)
-    for line in axes:
-        line[0].set_ylabel(title)
+        if place % 5 == 0:
+            panel.set_ylabel(title)
     _finish(figure, absent)
     return figure
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.families import known_family
 from plab.report.collect import Runs
-from plab.results import read_iterations
+from plab.results import BUDGETS, read_iterations
 
 __all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
 
@@ -48,8 +49,9 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
 
     Returns:
         For each run what it is (task, variant, method, seed) and its rows, with the columns of
-        docs/results.md and two changes: ``seconds`` is the wall time since the start of the first row,
-        ``substeps`` the simulated substeps, both at the end of the row. ``episodes`` counts the row's own,
+        docs/results.md and some changes: ``seconds`` is the wall time since the start of the first row,
+        ``simulated`` the simulated environment steps, ``substeps`` the simulated substeps, all at the end of
+        the row; ``best_score`` is the score of the best actions so far. ``episodes`` counts the row's own,
         too, so that it starts at 1.
     """
     names = ("task", "variant", "method", "seed")
@@ -68,7 +70,14 @@ def rows_on_axes(config: Mapping[str, Any], iterations: pd.DataFrame) -> pd.Data
     """Return the iterations of a run that has been read as :func:`load_series` does."""
     table, sim = iterations.copy(), config["sim"]
     table["seconds"] = table["seconds"].cumsum()
-    table["substeps"] = (table["steps"] + sim["horizon"]) * sim["substeps"]
+    own = [table[name] for name in BUDGETS if name in table]
+    table["simulated"] = sum(own) if own else table["steps"] + sim["horizon"]
+    table["substeps"] = table["simulated"] * sim["substeps"]
+    known = known_family(config["method"]["family"])
+    if known is not None and known.ranking == "score":
+        table["best_score"] = table["score"].cummax()
+    else:
+        table["best_score"] = table["score"].where(table["loss"] == table["loss"].cummin()).ffill()
     table["episodes"] += 1
     return table
 

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-__all__ = ["CONFIDENCE", "Interval", "Summary", "stratified_difference", "summarise"]
+__all__ = [
+    "CONFIDENCE",
+    "Interval",
+    "Summary",
+    "stratified_difference",
+    "stratified_mean",
+    "summarise",
+]
 
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""
@@ -64,11 +71,21 @@ def stratified_difference(ours: Sequence[Summary], theirs: Sequence[Summary]) ->
     if not pairs:
         return Interval(float("nan"), float("nan"), float("nan"))
     value = float(np.mean([a.mean - b.mean for a, b in pairs]))
-    sides = [side for pair in pairs for side in pair]
+    return _around(value, [side for pair in pairs for side in pair], len(pairs))
+
+
+def stratified_mean(strata: Sequence[Summary]) -> Interval:
+    """Return the mean over the strata of their means, with the same interval as
+    :func:`stratified_difference`; NaN if a stratum has none."""
+    return _around(float(np.mean([one.mean for one in strata])), strata, len(strata))
+
+
+def _around(value: float, sides: Sequence[Summary], count: int) -> Interval:
+    """Put an interval around a mean over ``count`` strata, of which all ``sides`` are parts."""
     if any(side.count < 2 for side in sides):
         return Interval(value, float("nan"), float("nan"))
     # The variance of a mean, from a population's standard deviation.
-    shares = np.array([side.std**2 / (side.count - 1) for side in sides]) / len(pairs) ** 2
+    shares = np.array([side.std**2 / (side.count - 1) for side in sides]) / count**2
     freedom = np.array([side.count - 1 for side in sides])
     if not shares.any():
         return Interval(value, value, value)

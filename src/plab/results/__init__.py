@@ -13,6 +13,7 @@ from plab.results.files import read, read_iterations, write
 from plab.results.loading import Row, load, rows
 from plab.results.running import RunFile
 from plab.results.schema import (
+    BUDGETS,
     SCHEMA_VERSION,
     STATUSES,
     NewerSchemaError,
@@ -22,10 +23,12 @@ from plab.results.schema import (
     config_dict,
     config_hash,
     result_path,
+    row_count,
 )
 from plab.selection import lookup
 
 __all__ = [
+    "BUDGETS",
     "SCHEMA_VERSION",
     "STATUSES",
     "NewerSchemaError",
@@ -44,6 +47,7 @@ __all__ = [
     "read",
     "read_iterations",
     "result_path",
+    "row_count",
     "rows",
     "unpack",
     "write",

@@ -16,6 +16,7 @@ from plab.results.files import explained, read
 from plab.results.loading import run_files
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
+    BUDGETS,
     COLUMNS,
     EVALUATION,
     PARTIAL_SUFFIX,
@@ -24,6 +25,7 @@ from plab.results.schema import (
     RunResult,
     config_hash,
     loss_columns,
+    row_count,
 )
 
 __all__ = ["Problem", "check", "problems"]
@@ -152,7 +154,7 @@ def _iterations(run: RunResult) -> Iterator[str]:
     wanted = common if family is None else (*common, *family.columns)
     # What further columns mean that a family outside plab has, only its record says.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
-    if missing := [name for name in wanted if name not in table]:
+    if missing := [name for name in wanted if name not in table and name not in BUDGETS]:
         yield f"iterations lack {', '.join(missing)}"
         return
     if strange := [name for name in table if table[name].dtype.kind not in "iuf"]:
@@ -162,8 +164,8 @@ def _iterations(run: RunResult) -> Iterator[str]:
         yield f"iterations are not finite: {', '.join(map(str, endless))}"
     if not np.array_equal(table["iteration"], np.arange(len(table))):
         yield "iterations are not numbered 0, 1, 2, ..."
-    for name in ("episodes", "steps"):
-        if (np.diff(table[name]) < 0).any():
+    for name in ("episodes", "steps", *BUDGETS):
+        if name in table and (np.diff(table[name]) < 0).any():
             yield f"{name} decrease"
     for name in ("iou", "score"):
         if not table[name].between(0.0, 1.0).all():
@@ -182,8 +184,20 @@ def _best(run: RunResult) -> Iterator[str]:
         yield "best actions leave [-1, 1]"
     if not 0 <= run.best_iteration < len(table):
         yield f"there is no iteration {run.best_iteration}, which is to be the best"
-    elif "loss" in table and run.best_loss != table["loss"].min():
-        yield f"the best loss is {run.best_loss:g}, the lowest in the iterations {table['loss'].min():g}"
+    elif {"loss", "score"} <= set(table):
+        yield from _best_row(run)
+
+
+def _best_row(run: RunResult) -> Iterator[str]:
+    own, known = run.iterations.iloc[run.best_iteration], known_family(run.config["method"]["family"])
+    ranking = "loss" if known is None else known.ranking
+    if ranking == "score" and own["score"] != run.iterations["score"].max():
+        highest = run.iterations["score"].max()
+        yield f"the score of the best is {own['score']:g}, the highest in the iterations {highest:g}"
+    lowest = own["loss"] if ranking == "score" else run.iterations["loss"].min()
+    if run.best_loss != lowest:
+        of = "of its iteration" if ranking == "score" else "the lowest in the iterations"
+        yield f"the best loss is {run.best_loss:g}, {of} {lowest:g}"
 
 
 def _evaluation(run: RunResult) -> Iterator[str]:
@@ -232,8 +246,9 @@ def _possible(mass: np.ndarray, floor: str) -> bool:
 
 def _complete(run: RunResult) -> Iterator[str]:
     method, table = run.config["method"], run.iterations
-    if "iterations" in method and len(table) != method["iterations"]:
-        yield f"it is finished after {len(table)} of {method['iterations']} iterations"
+    wanted = row_count(method)
+    if wanted is not None and len(table) != wanted:
+        yield f"it is finished after {len(table)} of {wanted} iterations"
     if "episodes" in method and "episodes" in table and len(table):
         done = int(table["episodes"].iloc[-1])
         if done < method["episodes"]:

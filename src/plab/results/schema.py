@@ -17,6 +17,7 @@ from plab.selection import lookup
 
 __all__ = [
     "ARCHIVE_SUFFIX",
+    "BUDGETS",
     "COLUMNS",
     "EVALUATION",
     "PARTIAL_SUFFIX",
@@ -34,6 +35,7 @@ __all__ = [
     "member_name",
     "parse_member",
     "result_path",
+    "row_count",
     "stored_config",
 ]
 
@@ -49,7 +51,11 @@ ARCHIVE_SUFFIX = ".plab.zip"
 
 _MEASURES = ("loss", "reward", "iou", "score")
 
-COLUMNS = ("iteration", "episodes", "steps", *_MEASURES, "seconds")
+BUDGETS = ("steps_forward", "steps_gradient")
+"""Columns of what a run has simulated up to the end of a row, in environment steps: without a gradient, and
+with one. Older files have none."""
+
+COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 """Columns that the iterations of every method have, beside those of :func:`loss_columns`;
 :mod:`plab.families` has those of a family."""
 
@@ -172,6 +178,13 @@ def _without_recipe(task: Mapping[str, Any]) -> dict[str, Any]:
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the columns of the terms of a configuration's loss: of those with a weight."""
     return tuple(f"loss_{name}" for name, weight in config["method"]["loss_weights"].items() if weight)
+
+
+def row_count(method: Mapping[str, Any]) -> int | None:
+    """Return how many rows a run of a method has when it is finished, where its section ``method`` tells."""
+    if "stages" in method:
+        return sum(stage["iterations"] for stage in method["stages"].values())
+    return method.get("iterations")
 
 
 def result_path(cfg: Any) -> Path:

@@ -51,7 +51,9 @@ class ApgRunner(Runner):
         # The actions again, now as functions of the weights; the same numbers but for rounding.
         actions = self._training.policy(torch.from_numpy(done.observations))
         norm = self._training.step(rollout(self.problem, actions[None]).sum())
-        return Step(done.measures | {"gradient_norm": norm}, done.actions, self._training.state())
+        measured, steps = done.measures | {"gradient_norm": norm}, len(done.actions)
+        # An iteration is one episode, simulated twice.
+        return Step(measured, done.actions, self._training.state(), track.iteration, steps_gradient=steps)
 
     @property
     def _method(self) -> ApgConfig:

@@ -64,6 +64,7 @@ class RlRunner(Runner):
     def step(self, track: Track) -> Step:
         """Train until the next evaluation is due, except before the first, and run the policy once."""
         trainer = cast(Trainer, self._trainer)
+        before = trainer.steps
         # The first episode, of the untrained policy, compiles the kernels.
         if track.iteration > 0:
             self._train(trainer, track)
@@ -71,8 +72,9 @@ class RlRunner(Runner):
         done = self.episode(trainer)
         trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
         measured = done.measures | trainer.take_statistics()
+        simulated = trainer.steps - before + len(done.actions)
         # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
-        counts = trainer.episodes, trainer.steps
+        counts = trainer.episodes, trainer.steps, simulated
         return Step(measured, done.actions, trainer.state(), *counts, keep=True)
 
     def episode(self, trainer: Trainer) -> PolicyEpisode:

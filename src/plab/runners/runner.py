@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from plab.families import family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress
-from plab.results import ResultsError
+from plab.results import BUDGETS, ResultsError, row_count
 from plab.reuse import SimulatorCache
 from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import Job, RunError, TogetherError, batch_title
@@ -42,6 +42,9 @@ class Step:
         episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
             iteration.
         steps: Environment steps that they have cost; None: those of the episodes.
+        steps_forward: Environment steps that this iteration has simulated without a gradient; None: those of
+            one episode.
+        steps_gradient: Those that it has simulated with a gradient.
         seconds: The run's share of the wall time; None: all of it.
         keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
     """
@@ -51,6 +54,8 @@ class Step:
     state: Mapping[str, Any]
     episodes: int | None = None
     steps: int | None = None
+    steps_forward: int | None = None
+    steps_gradient: int = 0
     seconds: float | None = None
     keep: bool = False
 
@@ -62,16 +67,24 @@ class Track:
         job: Configuration, file, and how it ended.
         number: Number of the run in its batch, and of its environment in a simulator that they share.
         iteration: Number of the iteration that is next.
-        best_loss: Lowest loss so far, NaN before the first iteration.
-        best_actions: The actions that had it, shape [T, A]; None before the first iteration.
+        best_loss: Loss of the best actions so far, NaN before the first iteration.
+        best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
+            iteration.
     """
 
     def __init__(self, job: Job, number: int) -> None:
         """Take up a run where its file stands."""
         self.job, self.number = job, number
         result = job.run.result
-        self.iteration, self.best_loss = len(result.iterations), result.best_loss
+        rows = result.iterations
+        self.iteration, self.best_loss = len(rows), result.best_loss
         self.best_actions = result.best_actions
+        self._by_score = family(job.cfg.method.family).ranking == "score"
+        known = self._by_score and len(rows) > 0
+        self._best_score = float(rows["score"].iloc[result.best_iteration]) if known else -np.inf
+        # Files that were begun before there were budgets go on without.
+        self._budget = {name: 0 for name in BUDGETS if name in rows or not len(rows)}
+        self._budget |= {name: int(rows[name].iloc[-1]) for name in self._budget if len(rows)}
 
     @property
     def cfg(self) -> Config:
@@ -92,13 +105,22 @@ class Track:
         Raises:
             ResultsError: If the file cannot be written.
         """
-        episodes = self.iteration if step.episodes is None else step.episodes
-        steps = episodes * len(step.actions) if step.steps is None else step.steps
+        horizon, before = len(step.actions), sum(self._budget.values())
+        done = before // horizon if self._budget else self.iteration
+        episodes = done if step.episodes is None else step.episodes
+        steps = episodes * horizon if step.steps is None else step.steps
         row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
+        forward = horizon if step.steps_forward is None else step.steps_forward
+        spent = dict(zip(BUDGETS, (forward, step.steps_gradient), strict=True))
+        self._budget = {name: known + spent[name] for name, known in self._budget.items()}
+        row |= self._budget
         row |= {name: step.measures[name] for name in columns}
         row["seconds"] = cast(float, step.seconds)
         # Written so that the first loss beats the NaN that stands for none.
         better = not row["loss"] >= self.best_loss
+        # Of several with the highest score the one of lowest loss.
+        if self._by_score and row["score"] != self._best_score:
+            better = row["score"] > self._best_score
         best: dict[str, Any] = {
             "best_actions": step.actions,
             "best_iteration": self.iteration,
@@ -108,6 +130,7 @@ class Track:
         self.iteration += 1
         if better:
             self.best_loss, self.best_actions = row["loss"], step.actions
+            self._best_score = row["score"]
         return row
 
 
@@ -156,7 +179,7 @@ class Runner:
 
     def iterations(self, track: Track) -> int:
         """Return how many iterations a run has."""
-        return cast(Any, track.cfg.method).iterations
+        return cast(int, row_count(asdict(track.cfg.method)))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Do one iteration of each of some runs, wherever it stands; by default :meth:`step` of each.

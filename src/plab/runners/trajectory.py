@@ -66,7 +66,17 @@ class TrajectoryRunner(Runner):
             sequence.step(gradient)
             measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
             seconds = share + time.perf_counter() - start
-            yield track, Step(measured, tried[number], sequence.state(), seconds=seconds)
+            yield (
+                track,
+                Step(
+                    measured,
+                    tried[number],
+                    sequence.state(),
+                    steps_forward=0,
+                    steps_gradient=len(gradient),
+                    seconds=seconds,
+                ),
+            )
 
 
 def adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:

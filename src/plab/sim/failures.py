@@ -36,10 +36,10 @@ def broken_states(faults: np.ndarray | torch.Tensor, substeps: int) -> dict[int,
     return failures
 
 
-def broken_terms(values: np.ndarray) -> dict[int, str]:
+def broken_terms(values: np.ndarray | torch.Tensor) -> dict[int, str]:
     """Environments with a measure that is not finite, and after which step; measures of shape [T + 1, batch,
     6]."""
-    broken = ~np.isfinite(values).all(axis=2)
+    broken = ~_all_finite(values)
     first = {int(e): int(np.argmax(broken[:, e])) for e in np.flatnonzero(broken.any(axis=0))}
     when = {e: f"after environment step {t}" if t else "at the start" for e, t in first.items()}
     return {e: f"{text}: the loss is not finite" for e, text in when.items()}
@@ -48,10 +48,14 @@ def broken_terms(values: np.ndarray) -> dict[int, str]:
 def broken_gradients(gradient: np.ndarray | torch.Tensor) -> dict[int, str]:
     """Environments with a gradient that is not finite, and since which step, going backwards; gradient of
     shape [batch, T, action]."""
-    finite = gradient.isfinite().all(2).cpu().numpy() if on_device(gradient) else np.isfinite(gradient).all(2)
-    broken = ~finite
+    broken = ~_all_finite(gradient)
     last = {int(e): int(np.flatnonzero(broken[e])[-1]) for e in np.flatnonzero(broken.any(axis=1))}
     return {e: f"environment step {t + 1}: the gradient is not finite" for e, t in last.items()}
+
+
+def _all_finite(values: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Whether all numbers along the last of three axes are finite, shape of the first two."""
+    return values.isfinite().all(2).cpu().numpy() if on_device(values) else np.isfinite(values).all(2)
 
 
 def require_none(failures: Mapping[int, str]) -> None:

@@ -34,8 +34,8 @@ class Simulator(ForwardSimulator):
         """Run environment steps from the initial state, and differentiate the trajectory loss.
 
         Args:
-            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, the gradient
-                is one too, of its type.
+            actions: Actions, shape [batch, T, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes
+                back are tensors of its type on the same device.
             gradient: Whether to compute the gradient.
             strict: Whether an environment that breaks off is an error, instead of an entry in ``failures``.
 
@@ -60,7 +60,7 @@ class Simulator(ForwardSimulator):
         bars = None
         if gradient:
             bars = self._tape.backward(array, poses, terms, steps, self._steps_before_contact(steps))
-        values = terms.to_numpy().reshape(steps + 1, self.batch, -1)
+        values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), actions)
         failures = broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
             require_none(failures)
@@ -72,7 +72,7 @@ class Simulator(ForwardSimulator):
                 require_none(failures)
         self._place_last(poses, steps)
         judged = self._judged(values)
-        step_terms, step_iou = judged.terms[1:].transpose(1, 0, 2), judged.iou[1:].T
+        step_terms, step_iou = judged.terms[1:].swapaxes(0, 1), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
 
     def record(

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    import torch
 
 __all__ = ["Measures", "Rollout", "State", "rest_state"]
 
@@ -49,7 +46,7 @@ class Measures:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What a rollout of T environment steps gives.
+    """What a rollout of T environment steps gives; arrays, or CUDA tensors if the actions were one.
 
     Attributes:
         initial_terms: Unweighted loss terms of the initial state, in the order of :attr:`Simulator.terms`,
@@ -63,11 +60,11 @@ class Rollout:
             numbers mean nothing, those of the others are what they would be without them.
     """
 
-    initial_terms: np.ndarray
-    step_terms: np.ndarray
-    initial_iou: np.ndarray
-    step_iou: np.ndarray
-    gradient: np.ndarray | torch.Tensor | None
+    initial_terms: Any
+    step_terms: Any
+    initial_iou: Any
+    step_iou: Any
+    gradient: Any
     failures: dict[int, str] = field(default_factory=dict)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.families import family
 from plab.problem import build_scenes
+from plab.results import row_count
 from plab.sim.memory import batch_limit
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     if not (own.batching or own.joins_populations(cfg.method)):
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other, and agents learn in step.
-    alike = method["iterations"] if own.batching else method
+    alike = row_count(method) if own.batching else method
     return [*kind, alike, scene.particle_count, [m.shape for m in scene.manipulators]]
 
 

@@ -88,8 +88,12 @@ class Track:
         """
         if len(self) > EPISODE_STEPS:
             raise _TooLong
-        self.wait(EPISODE_STEPS)
-        return np.clip(np.round(self._actions, DECIMALS), -1.0, 1.0)
+        return self.first(EPISODE_STEPS)
+
+    def first(self, steps: int) -> np.ndarray:
+        """Return the actions of so many steps, shape [steps, A]; what comes later is cut off."""
+        self.wait(steps)
+        return np.clip(np.round(self._actions[:steps], DECIMALS), -1.0, 1.0)
 
 
 @dataclass

@@ -120,8 +120,9 @@ class PopulationRunner(Runner):
             seconds = share + time.perf_counter() - start
             measured = done.measures | trained[place]
             finished = population.steps >= self._total
-            counts = population.episodes, population.steps
-            yield track, Step(measured, done.actions, states[place], *counts, seconds, keep=finished)
+            simulated = population.steps - before + len(done.actions)
+            counts = population.episodes, population.steps, simulated
+            yield track, Step(measured, done.actions, states[place], *counts, seconds=seconds, keep=finished)
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""

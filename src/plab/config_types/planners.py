@@ -1,0 +1,205 @@
+"""Types of the section ``method`` of the planners, which search for a sequence of actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from plab.config_errors import ConfigError
+from plab.config_types.method import MethodConfig
+from plab.config_types.ranges import at_least, fraction, one_of, positive, unit, vector
+from plab.families import family
+
+__all__ = [
+    "CemConfig",
+    "CmaesConfig",
+    "MppiConfig",
+    "MultistartConfig",
+    "PlannerConfig",
+    "SamplerConfig",
+    "StagesConfig",
+]
+
+OBJECTIVES = ("loss", "final", "score")
+CURVES = ("constant", "linear")
+
+
+@dataclass
+class PlannerConfig(MethodConfig):
+    """What the planners have in common.
+
+    Attributes:
+        algorithm: How it searches, one of the family's rules.
+        iterations: Rows of the result; what one costs is up to the planner.
+        population: Candidates, each a sequence of actions.
+        objective: What candidates are ranked by: ``loss``, that of the whole episode; ``final``, that of its
+            last step; or ``score``, and the loss where the score is 0.
+        action_init: Random candidates are uniform in +- this.
+        contact_starts: Share of the candidates to start from that drive manipulators to the body and push or
+            carry it towards the target; the others are random.
+    """
+
+    algorithm: str
+    iterations: int
+    population: int
+    objective: str
+    action_init: float
+    contact_starts: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
+        at_least(f"{path}.iterations", self.iterations, 1)
+        at_least(f"{path}.population", self.population, 4)
+        one_of(f"{path}.objective", self.objective, OBJECTIVES)
+        for name in ("action_init", "contact_starts"):
+            unit(f"{path}.{name}", getattr(self, name))
+
+
+@dataclass
+class SamplerConfig(PlannerConfig):
+    """What planners have in common that draw candidates and learn from what they cost, without a gradient.
+
+    Attributes:
+        knots: Actions are a curve through so many points in time, at most one per environment step.
+        curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
+            the next.
+        spread: Standard deviation of the first draws around the best start, of each point.
+    """
+
+    knots: int
+    curve: str
+    spread: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        at_least(f"{path}.knots", self.knots, 1)
+        one_of(f"{path}.curve", self.curve, CURVES)
+        positive(f"{path}.spread", self.spread)
+
+
+@dataclass
+class CemConfig(SamplerConfig):
+    """Cross-entropy method.
+
+    Attributes:
+        elites: Candidates that mean and spread are taken from.
+        smoothing: Share of the old mean and spread that is kept.
+        least_spread: The spread falls no lower.
+    """
+
+    elites: int
+    smoothing: float
+    least_spread: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        at_least(f"{path}.elites", self.elites, 2)
+        if self.elites > self.population:
+            raise ConfigError(
+                f"{path}.elites must be at most population = {self.population}, not {self.elites}"
+            )
+        fraction(f"{path}.smoothing", self.smoothing)
+        at_least(f"{path}.least_spread", self.least_spread, 0, finite=True)
+
+
+@dataclass
+class MppiConfig(SamplerConfig):
+    """Model-predictive path integral: the mean of all candidates, weighted by how good they are.
+
+    Attributes:
+        temperature: Candidates that are worse than the best by this many standard deviations of the costs
+            weigh 1 / e of it.
+        decay: The spread is multiplied by this after each iteration.
+    """
+
+    temperature: float
+    decay: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        positive(f"{path}.temperature", self.temperature)
+        unit(f"{path}.decay", self.decay)
+
+
+@dataclass
+class CmaesConfig(SamplerConfig):
+    """Covariance matrix adaptation."""
+
+
+@dataclass
+class MultistartConfig(PlannerConfig):
+    """Gradient descent from many starts.
+
+    Attributes:
+        lrs: Learning rates, which candidates have in turn.
+        betas: Decay rates of Adam's two moment estimates.
+        eps: Added to Adam's denominator.
+        updates: Updates of each candidate per iteration.
+        softness_end: The softness goes from ``softness`` to this over the iterations, by the same factor in
+            each; None: it stays.
+        replace_every: Iterations after which the worse half is replaced.
+        fresh: Share of the replaced candidates that start anew; the others start beside a better one, no
+            farther off than ``action_init``.
+    """
+
+    lrs: list[float]
+    betas: list[float]
+    eps: float
+    updates: int
+    softness_end: float | None
+    replace_every: int
+    fresh: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if not self.lrs:
+            raise ConfigError(f"{path}.lrs is empty: give one learning rate at least")
+        for lr in self.lrs:
+            positive(f"{path}.lrs", lr)
+        vector(f"{path}.betas", self.betas, 2)
+        for beta in self.betas:
+            fraction(f"{path}.betas", beta)
+        positive(f"{path}.eps", self.eps)
+        at_least(f"{path}.updates", self.updates, 1)
+        at_least(f"{path}.replace_every", self.replace_every, 1)
+        unit(f"{path}.fresh", self.fresh)
+        if self.softness_end is not None:
+            positive(f"{path}.softness_end", self.softness_end)
+            if self.contact == "hard":
+                raise ConfigError(f"{path}.softness_end has no effect with contact=hard: leave it out")
+
+
+@dataclass
+class StagesConfig(MethodConfig):
+    """Planners one after the other, each from what the one before has found.
+
+    Attributes:
+        algorithm: ``stages``.
+        stages: Planners by names of your choice, in order; each has the keys of a method of its own.
+    """
+
+    algorithm: str
+    stages: dict[str, Any]
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if not self.stages:
+            raise ConfigError(f"{path}.stages is empty: give one planner at least")
+        for name, stage in self.stages.items():
+            if not isinstance(stage, PlannerConfig):
+                raise ConfigError(
+                    f"{path}.stages.{name} is no planner: start from one, as conf/method/solve.yaml"
+                )
+            for part in ("loss_weights", "loss_terms"):
+                if getattr(stage, part) != getattr(self, part):
+                    raise ConfigError(
+                        f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
+                    )
+            stage.check(f"{path}.stages.{name}")

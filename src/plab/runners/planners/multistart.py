@@ -1,0 +1,115 @@
+"""``multistart``: gradient descent (Adam) from many starts, the worse half replaced as it goes.
+
+To reproduce a result:
+
+    python -m plab.run task=Move variant=1 method=multistart seed=0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from plab.config_types import MultistartConfig
+from plab.runners.planners.planner import Asking, Planner, Request, Start
+
+__all__ = ["Multistart"]
+
+
+class Multistart(Planner):
+    """Each candidate has moments and, in turn, a learning rate of its own."""
+
+    method: MultistartConfig
+
+    def __init__(self, method: MultistartConfig, start: Start) -> None:
+        """Make places for the candidates."""
+        super().__init__(method, start)
+        zeros = torch.zeros((method.population, *start.shape), dtype=torch.float64, device=start.device)
+        self._places = [place.clone().requires_grad_() for place in zeros]
+        by_rate = [(lr, self._places[k :: len(method.lrs)]) for k, lr in enumerate(method.lrs)]
+        groups = [{"params": places, "lr": lr} for lr, places in by_rate if places]
+        first, second = method.betas
+        self._adam = torch.optim.Adam(groups, betas=(first, second), eps=method.eps)
+
+    def begin(self, random: torch.Generator, found: Tensor) -> None:
+        """Take over what has been found, but for the share that starts anew."""
+        count = self.method.population
+        kept = found[: count - round(self.method.fresh * count)]
+        self._put(torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]), range(count))
+
+    def iterate(self, random: torch.Generator) -> Asking:
+        """Judge the candidates in the hard model, improve all, and replace the worse half if it is time."""
+        method, softness = self.method, self._softness()
+        actions = self._actions()
+        answer = shown = yield Request(actions, gradient=softness is None)
+        order = shown.cost(method.objective).argsort(stable=True)
+        for update in range(method.updates):
+            if update > 0 or softness is not None:
+                answer = yield Request(self._actions(), softness, gradient=True)
+            self._descend(answer.gradient)
+        self.memory["order"] = order
+        if (self.iteration + 1) % method.replace_every == 0 and self.iteration + 1 < method.iterations:
+            self._replace(order, random)
+        return self.show(actions, shown)
+
+    def candidates(self) -> Tensor:
+        """Return the candidates, the best of the last judgement first."""
+        return self._actions()[self.memory["order"]]
+
+    def _softness(self) -> float | None:
+        """Decay rate of the soft contact in this iteration; None in the hard model."""
+        method = self.method
+        if method.contact == "hard":
+            return None
+        end = method.softness if method.softness_end is None else method.softness_end
+        return method.softness * (end / method.softness) ** (self.iteration / max(method.iterations - 1, 1))
+
+    def _actions(self) -> Tensor:
+        return torch.stack([place.detach() for place in self._places])
+
+    def _put(self, actions: Tensor, numbers: Any) -> None:
+        """Put candidates, shape [N, T, A], into places, where they start without moments."""
+        for place, own in zip(numbers, actions, strict=True):
+            self._places[place].data.copy_(own.clamp(-1.0, 1.0))
+            self._adam.state.pop(self._places[place], None)
+
+    def _descend(self, gradient: Tensor | None) -> None:
+        """Make a step of Adam by gradients of shape [P, T, A]."""
+        assert gradient is not None
+        for place, own in zip(self._places, gradient, strict=True):
+            place.grad = own
+        self._adam.step()
+        for place in self._places:
+            place.data.clamp_(-1.0, 1.0)
+
+    def _replace(self, order: Tensor, random: torch.Generator) -> None:
+        """Put new candidates into the places of the worse half: some afresh, some beside a better one."""
+        better, worse = order.tensor_split([(len(order) + 1) // 2])
+        fresh = self.start.draw(self.method, round(self.method.fresh * len(worse)), random)
+        beside = len(worse) - len(fresh)
+        unit = torch.rand(
+            (beside, *self.start.shape), generator=random, dtype=torch.float64, device=order.device
+        )
+        moved = self._actions()[better[:beside]] + (2.0 * unit - 1.0) * self.method.action_init
+        self._put(torch.cat([moved, fresh]), worse.tolist())
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next iterations depend on, Adam's moments included."""
+        held = {str(k): self._adam.state[p] for k, p in enumerate(self._places) if p in self._adam.state}
+        moments = {k: {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in held.items()}
+        return super().state() | {"actions": self._actions().cpu().numpy(), "moments": moments}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        super().restore(state)
+        self._put(torch.as_tensor(state["actions"], device=self.start.device), range(len(self._places)))
+        for k, own in state.get("moments", {}).items():
+            place = self._places[int(k)]
+            # The number of steps stays on the CPU, as Adam has it.
+            self._adam.state[place] = {
+                name: torch.as_tensor(v, device="cpu" if name == "step" else self.start.device)
+                for name, v in own.items()
+            }

@@ -1,0 +1,304 @@
+"""What the planners share: trying many candidates in one simulator, starts, resuming, rows.
+
+A planner asks for candidates to be tried, by ``yield``, and is sent what they gave; the runner tries those of
+all runs of a batch together. Candidates, losses, scores and gradients are tensors on the simulator's device.
+A row of the results is the best candidate of an iteration, always in the hard contact model.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from plab.config_types import MethodConfig, PlannerConfig, StagesConfig
+from plab.families import family
+from plab.problem import Episodes, build_scenes
+from plab.runners.common import shared_problem, torch_settings
+from plab.runners.planners.starts import ContactStarts
+from plab.runners.runner import Runner, Step, Track
+from plab.scene import Scene
+from plab.sim.memory import batch_limit
+
+__all__ = ["Answer", "Asking", "Planner", "PlannerRunner", "Request", "Shown", "Start", "make_planner"]
+
+
+@dataclass(frozen=True)
+class Request:
+    """Candidates to be tried.
+
+    Attributes:
+        actions: Actions in [-1, 1], shape [P, T, A].
+        softness: Decay rate of the soft contact [1 / domain unit]; None: the hard one.
+        gradient: Whether their gradient is asked for.
+    """
+
+    actions: Tensor
+    softness: float | None = None
+    gradient: bool = False
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What candidates gave.
+
+    Attributes:
+        measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
+        final_loss: Loss of the last step, shape [P].
+        gradient: Gradient of ``loss``, shape [P, T, A], 0 for what broke off; None if it was not asked for.
+        broken: Whether a candidate broke off, shape [P]; its numbers mean nothing.
+    """
+
+    measures: dict[str, Tensor]
+    final_loss: Tensor
+    gradient: Tensor | None
+    broken: Tensor
+
+    def cost(self, objective: str) -> Tensor:
+        """What candidates are ranked by, shape [P]: the lower the better, infinite for what broke off."""
+        loss, score = self.measures["loss"], self.measures["score"]
+        # Where the score is 0 the loss still tells one from another, between 0 and 1.
+        by_score = torch.where(score > 0, -score, loss / (1.0 + loss))
+        cost = {"loss": loss, "final": self.final_loss, "score": by_score}[objective]
+        return torch.where(self.broken, torch.inf, cost)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What an iteration is told by: actions in [-1, 1], shape [T, A], and what they are measured by."""
+
+    actions: Tensor
+    measures: dict[str, float]
+
+
+Asking: TypeAlias = Generator[Request, Answer, Shown]
+
+
+class Start:
+    """Where a run's candidates start from.
+
+    Attributes:
+        shape: Steps T and length A of the action vector.
+        device: Where tensors are.
+    """
+
+    def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
+        """Take note of scene and target, a mass tensor of shape [n, n, n]."""
+        self.shape, self.device = (scene.horizon, scene.action_dim), device
+        self._contact = ContactStarts(scene, target)
+
+    def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
+        """Draw candidates, shape [count, T, A]: first those that go to the body, then uniform ones."""
+        size = (count, *self.shape)
+        unit = torch.rand(size, generator=random, dtype=torch.float64, device=self.device)
+        drawn = (2.0 * unit - 1.0) * method.action_init
+        if contacts := round(method.contact_starts * count):
+            seed = int(torch.randint(2**31, (1,), generator=random, device=self.device))
+            drawn[:contacts] = torch.as_tensor(self._contact.draw(contacts, seed)).to(drawn)
+        return drawn
+
+
+class Planner(ABC):
+    """A run's search. A subclass says how it begins and what an iteration is.
+
+    Attributes:
+        method: Its numbers.
+        start: Where candidates start from.
+        memory: Tensors that the next iteration depends on.
+        iteration: Number of the iteration that is next.
+    """
+
+    def __init__(self, method: PlannerConfig, start: Start) -> None:
+        """Take note of what to do; nothing is drawn yet."""
+        self.method, self.start = method, start
+        self.memory: dict[str, Tensor] = {}
+        self.iteration = 0
+
+    @abstractmethod
+    def begin(self, random: torch.Generator, found: Tensor) -> None:
+        """Make the first candidates.
+
+        Args:
+            random: Source of random numbers.
+            found: What the stage before has found, the best first, shape [N, T, A]; N is 0 if there is none.
+        """
+
+    @abstractmethod
+    def iterate(self, random: torch.Generator) -> Asking:
+        """Do an iteration: ask for candidates to be tried, and return what it is told by."""
+
+    @abstractmethod
+    def candidates(self) -> Tensor:
+        """Return the last candidates, the best first, shape [P, T, A]."""
+
+    def found(self) -> Tensor:
+        """Return the best actions so far, and after them the last candidates, shape [1 + P, T, A]."""
+        return torch.cat([self.memory["champion"][None], self.candidates()])
+
+    def plan(self, random: torch.Generator, found: Tensor | None = None) -> Asking:
+        """Do the next iteration, the first one perhaps from what a stage before has found."""
+        if self.iteration == 0:
+            nothing = torch.empty((0, *self.start.shape), dtype=torch.float64, device=self.start.device)
+            self.begin(random, nothing if found is None else found)
+        shown = yield from self.iterate(random)
+        self.iteration += 1
+        return shown
+
+    def show(self, actions: Tensor, answer: Answer) -> Shown:
+        """Return the best of some candidates, by what they gave in the hard contact model."""
+        cost = answer.cost("score")
+        best = int(cost.argmin())
+        if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
+            self.memory |= {"champion": actions[best].clone(), "cost": cost[best].clone()}
+        return Shown(actions[best], {name: float(values[best]) for name, values in answer.measures.items()})
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next iterations depend on, as arrays and numbers."""
+        arrays = {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.memory.items()}
+        return {"iteration": self.iteration, "memory": arrays}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        self.iteration = int(state["iteration"])
+        arrays = state.get("memory", {})
+        self.memory = {
+            name: torch.as_tensor(array, device=self.start.device) for name, array in arrays.items()
+        }
+
+
+def make_planner(method: MethodConfig, start: Start) -> Any:
+    """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
+    return family(method.family).rule(getattr(method, "algorithm"), type)(method, start)  # noqa: B009
+
+
+class PlannerRunner(Runner):
+    """Tries the candidates of all runs of a batch together.
+
+    The simulator has as many environments per run as the smallest population, or fewer if the memory has no
+    room for more; what is more than that is tried one part after the other. A run ends whose candidates all
+    break off.
+    """
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch one thread of the CPU: its tensors are small."""
+        return torch_settings(1)
+
+    def build(self) -> None:
+        """Make the problem: environment e is for a candidate of run e modulo the number of runs."""
+        cfgs = [track.cfg for track in self.tracks]
+        scene, sim = build_scenes(cfgs[:1])[0], cfgs[0].sim
+        fewest = min(_smallest_population(cfg.method) for cfg in cfgs)
+        room = max(1, batch_limit(scene, sim.precision, sim.device, sim.memory_mb) // len(cfgs))
+        parts = -(-fewest // room)
+        self._width = -(-fewest // parts)
+        self.problem = shared_problem(self.cache, cfgs * self._width)
+        self._device = torch.device(sim.device)
+        self._planners: dict[int, Any] = {}
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make the run's planner, as the file knows it if it does."""
+        number = track.number
+        start = Start(self.problem.scenes[number], self.problem.target_mass[number], self._device)
+        self._planners[number] = make_planner(track.cfg.method, start)
+        if state is not None:
+            self._planners[number].restore(state)
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Let the planners of all runs do one iteration each."""
+        begin = time.perf_counter()
+        spent = {track: {False: 0, True: 0} for track in tracks}
+        asking = {track: self._planners[track.number].plan(self._random(track)) for track in tracks}
+        pending = {track: next(walk) for track, walk in asking.items()}
+        shown: dict[Track, Shown] = {}
+        while pending:
+            first = next(iter(pending.values()))
+            together = {track: request for track, request in pending.items() if _alike(request, first)}
+            for track, answer in self._try(together).items():
+                request = pending.pop(track)
+                spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
+                try:
+                    if track.job.open:
+                        pending[track] = asking[track].send(answer)
+                except StopIteration as stop:
+                    shown[track] = stop.value
+        share = (time.perf_counter() - begin) / len(tracks)
+        for track, best in shown.items():
+            state = self._planners[track.number].state()
+            step = Step(best.measures, best.actions.cpu().numpy().copy(), state, seconds=share)
+            yield track, replace(step, steps_forward=spent[track][False], steps_gradient=spent[track][True])
+
+    def judge(self, actions: np.ndarray) -> Episodes:
+        """Run the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
+        return super().judge(np.concatenate([actions] * self._width))
+
+    def _random(self, track: Track) -> torch.Generator:
+        """Return the random numbers of a run's next iteration, which a resumed run draws again."""
+        seed = np.random.SeedSequence([track.cfg.seed, track.iteration]).generate_state(1, np.uint64)[0]
+        return torch.Generator(self._device).manual_seed(int(seed) >> 1)
+
+    def _try(self, requests: Mapping[Track, Request]) -> dict[Track, Answer]:
+        """Try candidates of some runs, as many of each run; break off runs of which none came through."""
+        first = next(iter(requests.values()))
+        softness = np.zeros(len(self.tracks))
+        for track, request in requests.items():
+            softness[track.number] = request.softness or 0.0
+        models = np.where(softness > 0, "soft", "hard")
+        self.problem.simulator.set_contact(
+            list(models) * self._width, np.tile(softness, self._width).tolist()
+        )
+        count, reasons = len(first.actions), dict[int, str]()
+        parts = [self._try_part(requests, k, first, reasons) for k in range(0, count, self._width)]
+        whole = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        answers = {}
+        for track in requests:
+            own = {name: values[:, track.number] for name, values in whole.items()}
+            broken, final, gradient = own.pop("broken"), own.pop("final"), own.pop("gradient", None)
+            if gradient is not None:
+                gradient = gradient.masked_fill(broken[:, None, None], 0.0)
+            answers[track] = Answer(own, final, gradient, broken)
+            if bool(broken.all()):
+                track.fail(f"none of {count} candidates came through; {reasons[track.number]}")
+        return answers
+
+    def _try_part(
+        self, requests: Mapping[Track, Request], begin: int, first: Request, reasons: dict[int, str]
+    ) -> dict[str, Tensor]:
+        """Try as many candidates of each run as there are environments for, from candidate ``begin`` on.
+
+        Returns:
+            What they gave by name, shape [candidate, run, ...]; in ``reasons``, by run, why one broke off.
+        """
+        width, runs = self._width, len(self.tracks)
+        tried = torch.zeros((width, runs, *first.actions.shape[1:]), dtype=torch.float64, device=self._device)
+        for track, request in requests.items():
+            mine = request.actions[begin : begin + width]
+            tried[: len(mine), track.number] = mine
+        trials = self.problem.try_out(tried.flatten(0, 1), gradient=first.gradient)
+        broken = torch.zeros(width * runs, dtype=torch.bool, device=self._device)
+        broken[list(trials.failures)] = True
+        reasons |= {e % runs: text for e, text in trials.failures.items()}
+        given = trials.measures | {"final": trials.final_loss, "broken": broken}
+        if first.gradient:
+            given["gradient"] = trials.gradient
+        tensors = {name: torch.as_tensor(values) for name, values in given.items()}
+        size = min(width, len(first.actions) - begin)
+        return {name: v.reshape(width, runs, *v.shape[1:])[:size] for name, v in tensors.items()}
+
+
+def _alike(a: Request, b: Request) -> bool:
+    """Whether two runs' candidates can be tried together."""
+    return a.gradient == b.gradient and a.actions.shape == b.actions.shape
+
+
+def _smallest_population(method: Any) -> int:
+    """Return how many candidates are tried at once at least: more environments would stand still then."""
+    if isinstance(method, StagesConfig):
+        return min(map(_smallest_population, method.stages.values()))
+    return method.population

@@ -1,0 +1,50 @@
+"""``hybrid`` and ``solve``: planners one after the other, each from what the one before has found.
+
+Which, in what order and with what numbers is in their YAML; a stage has the keys of a method of its own. To
+reproduce a result:
+
+    python -m plab.run task=Move variant=1 method=hybrid seed=0
+    python -m plab.run task=Move variant=1 method=solve seed=0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from plab.config_types import StagesConfig
+from plab.runners.planners.planner import Asking, Planner, Start, make_planner
+
+__all__ = ["Stages"]
+
+
+class Stages:
+    """Does what a planner does, by the stage that it is in."""
+
+    def __init__(self, method: StagesConfig, start: Start) -> None:
+        """Stand before the first stage."""
+        self._methods, self._start = list(method.stages.values()), start
+        self._enter(0)
+
+    def plan(self, random: torch.Generator) -> Asking:
+        """Do the next iteration, if need be of the next stage."""
+        found = None
+        if self._planner.iteration == self._planner.method.iterations:
+            found = self._planner.found()
+            self._enter(self._stage + 1)
+        return (yield from self._planner.plan(random, found))
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next iterations depend on."""
+        return {"stage": self._stage, "planner": self._planner.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        self._enter(int(state["stage"]))
+        self._planner.restore(state["planner"])
+
+    def _enter(self, stage: int) -> None:
+        self._stage = stage
+        self._planner: Planner = make_planner(self._methods[stage], self._start)

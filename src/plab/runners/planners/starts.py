@@ -1,0 +1,150 @@
+"""Starts that bring manipulators to the body: contact points, found from where the mass has to go.
+
+Some points of the body are assigned to as many of the target so that the ways are shortest in all (optimal
+transport). A start either pushes, each manipulator behind one of the points and along its way, or carries:
+each manipulator goes to the body nearest to it, presses, and takes the body's mean way. Of the target nothing
+is known but its mass tensor. Ways are straight: what stands in between is met earlier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from plab.scene import MANIPULATOR_SHAPES, ROLL_RADIUS, Manipulator, Scene, sample_particles
+from plab.targets.scripted import Track
+
+__all__ = ["ContactStarts", "support"]
+
+POINTS = 256
+"""Points of the body, and of the target."""
+
+TUBE = 0.04
+"""Half width of what a manipulator is taken to meet on its way [domain units]."""
+
+PRESS = (0.0, 0.03)
+"""Range of how far manipulators press into a body before they carry it [domain units]."""
+
+OVERSHOOT = (0.5, 1.5)
+"""Range of how far they push, in ways of the point that they push."""
+
+_SUPPORT: dict[str, Callable[[Sequence[float], np.ndarray], float]] = {
+    "Sphere": lambda size, d: size[0],
+    "Capsule": lambda size, d: 0.5 * size[0] * abs(d[1]) + size[1],
+    "RollingPin": lambda size, d: 0.5 * size[0] * abs(d[1]) + size[1],
+    "Torus": lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1],
+    "Box": lambda size, d: float(np.abs(d) @ np.asarray(size)),
+}
+"""How far a shape reaches from its position, by its sizes and a direction in its own frame."""
+
+
+def support(tool: Manipulator, direction: np.ndarray) -> float:
+    """Return how far a manipulator, as it stands at the start, reaches from its position in a direction.
+
+    Args:
+        tool: The manipulator; chopsticks, which hold between them what they are to carry, reach no farther.
+        direction: Unit vector [3].
+    """
+    reach = _SUPPORT.get(tool.shape)
+    return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
+
+
+class ContactStarts:
+    """Draws starts for a scene and its target."""
+
+    def __init__(self, scene: Scene, target: np.ndarray) -> None:
+        """Take note of the scene, and of the target's mass tensor, shape [n, n, n]."""
+        self._scene, self._target = scene, target
+        self._tools = [m for m in scene.manipulators if m.action_dim]
+
+    def draw(self, count: int, seed: int) -> np.ndarray:
+        """Draw starts, pushing and carrying in turn.
+
+        Args:
+            count: How many.
+            seed: Seed of the draws.
+
+        Returns:
+            Actions in [-1, 1], shape [count, T, A].
+        """
+        rng = np.random.default_rng(seed)
+        return np.stack([(self._carry if k % 2 else self._push)(rng) for k in range(count)])
+
+    @cached_property
+    def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points of the bodies, shape [point, 3], their ways, likewise, and the numbers of their bodies."""
+        rng, scene = np.random.default_rng(0), self._scene
+        body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
+        chosen = rng.choice(len(body), min(POINTS, len(body)), replace=False)
+        points = sample_particles(scene)[chosen]
+        mass = np.maximum(self._target, 0.0).ravel()
+        nodes = rng.choice(mass.size, len(points), p=mass / mass.sum())
+        goals = np.stack(np.unravel_index(nodes, self._target.shape), axis=1) * scene.dx
+        _, assigned = linear_sum_assignment(cdist(points, goals, "sqeuclidean"))
+        return points, goals[assigned] - points, body[chosen]
+
+    def _push(self, rng: np.random.Generator) -> np.ndarray:
+        points, ways, _ = self._transport
+        lengths = np.linalg.norm(ways, axis=1)
+        tracks = []
+        for tool in self._tools:
+            k = rng.choice(len(points), p=lengths**2 / (lengths**2).sum())
+            direction = ways[k] / lengths[k]
+            track = Track(tool)
+            track.go(_action(tool, self._to_touch(tool, points[k], direction)))
+            left = max(1, int((self._scene.horizon - len(track)) * rng.uniform(0.5, 1.0)))
+            track.go(_action(tool, rng.uniform(*OVERSHOOT) * ways[k]), left)
+            tracks.append(track)
+        return self._actions(tracks)
+
+    def _carry(self, rng: np.random.Generator) -> np.ndarray:
+        points, ways, body = self._transport
+        centres = np.stack([points[body == b].mean(0) for b in np.unique(body)])
+        means = np.stack([ways[body == b].mean(0) for b in np.unique(body)])
+        press, tracks, owners = rng.uniform(*PRESS), [], []
+        for tool in self._tools:
+            offsets = centres - np.asarray(tool.position)
+            owner = int(np.linalg.norm(offsets, axis=1).argmin())
+            track = Track(tool)
+            if not MANIPULATOR_SHAPES[tool.shape].grips:
+                direction = offsets[owner] / np.linalg.norm(offsets[owner])
+                way = self._to_touch(tool, centres[owner], direction) + press * direction
+                track.go(_action(tool, way))
+            tracks.append(track)
+            owners.append(owner)
+        together = max(map(len, tracks))
+        for track, tool, owner in zip(tracks, self._tools, owners, strict=True):
+            track.wait(together)
+            left = max(1, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
+            track.go(_action(tool, means[owner]), left)
+        return self._actions(tracks)
+
+    def _to_touch(self, tool: Manipulator, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the way to where a manipulator meets the body on its way to a point in a direction."""
+        points, _, _ = self._transport
+        along = (points - point) @ direction
+        aside = np.linalg.norm(points - point - along[:, None] * direction, axis=1)
+        met = point + along[aside < TUBE].min(initial=0.0) * direction
+        place = np.clip(met - support(tool, direction) * direction, tool.lower_bound, tool.upper_bound)
+        return place - np.asarray(tool.position)
+
+    def _actions(self, tracks: Sequence[Track]) -> np.ndarray:
+        return np.concatenate([track.first(self._scene.horizon) for track in tracks], axis=1)
+
+
+def _rotation(tool: Manipulator) -> Rotation:
+    return Rotation.from_quat(tool.rotation, scalar_first=True)
+
+
+def _action(tool: Manipulator, way: np.ndarray) -> np.ndarray:
+    """Return what takes a manipulator a way [3] [domain units] as far as it can without turning, one entry
+    per action component."""
+    if MANIPULATOR_SHAPES[tool.shape].motion == "roll":
+        axis = _rotation(tool).apply([0.0, 1.0, 0.0])
+        return np.array([(axis[0] * way[2] - axis[2] * way[0]) / ROLL_RADIUS, 0.0, way[1]])
+    return np.concatenate([way, np.zeros(tool.action_dim - 3)])
