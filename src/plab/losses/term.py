@@ -53,13 +53,11 @@ class NodeTerm(Term):
 
     @ti.func
     def measure(self, e, node, mass):
-        """What a node adds to the value of an empty one.
+        """What a node of environment ``e`` adds to the value of an empty one.
 
-        Args:
-            e: Environment.
-            node: Index of the node along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry
-                in fields of n^3 numbers per environment.
-            mass: Its mass, positive; with the release's floor it may be negative.
+        ``node`` is its index along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry in
+        fields of n^3 numbers per environment. ``mass`` is its mass, positive; with the release's floor it may
+        be negative.
         """
         return 0.0 * mass
 
@@ -74,13 +72,8 @@ class ParticleTerm(Term):
 
     @ti.func
     def measure(self, e, x, v):
-        """What a particle adds.
-
-        Args:
-            e: Environment.
-            x: Position [domain units], 3-vector.
-            v: Velocity, 3-vector.
-        """
+        """What a particle of environment ``e`` adds, at position ``x`` [domain units] with velocity ``v``,
+        3-vectors."""
         return 0.0 * x[0]
 
     @ti.func
