@@ -110,8 +110,8 @@ def simulate(
         every_step: Whether to return the state after every environment step, or the last one alone.
         mass: Whether to return mass tensors.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3]; as they are if None.
-        **initial: What the initial state is to have: any of the fields ``x``, ``v``, ``C``, ``F`` and ``poses``
-            of :class:`plab.sim.State`. The simulator keeps it, as it does the material.
+        **initial: What the initial state is to have: any of the fields of :class:`plab.sim.State`. The
+            simulator keeps it, as it does the material.
 
     Returns:
         The states, like ``actions`` in type and device.
