@@ -248,6 +248,14 @@ def test_the_score_is_of_the_best_iteration_or_of_the_last(tmp_path: Path) -> No
         assert (row["score"], row["score_best"]) == (want[name], want["best"])
 
 
+def test_planners_keep_the_score_of_their_best(tmp_path: Path) -> None:
+    run = synthetic.run(tmp_path, method="cem")
+    run.config["protocol"]["score"] = "last"
+    assert run.score == run.evaluation["score"] != run.iterations["score"].iloc[-1]
+    (row,) = load(synthetic.save(run)).to_dict("records")
+    assert row["score"] == row["score_best"] == run.score
+
+
 def test_results_without_the_score_are_their_protocols() -> None:
     for name, score in (("plab", "best"), ("release", "last")):
         assert stored_config(json.dumps({"protocol": {"name": name}}))["protocol"]["score"] == score

@@ -23,6 +23,7 @@ from plab.results.schema import (
     PARTIAL_SUFFIX,
     SUFFIX,
     ResultsError,
+    counts_last,
     final_path,
     stored_config,
 )
@@ -266,6 +267,6 @@ def _row(file: h5py.File, path: Path) -> Row:
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
-    if evaluation and config["protocol"]["score"] == "last":
+    if evaluation and counts_last(config):
         values["score"] = float(table["score"][-1])
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.families import FAMILIES
 from plab.selection import lookup
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "RunResult",
     "config_dict",
     "config_hash",
+    "counts_last",
     "final_path",
     "loss_columns",
     "member_name",
@@ -127,9 +129,10 @@ class RunResult:
         """Score of a finished run in [0, 1], as its protocol counts it.
 
         With ``protocol.score=best`` that of the final evaluation; with ``last`` that of the last iteration,
-        in the contact model of the iterations, as the PlasticineLab release logs it.
+        in the contact model of the iterations, as the PlasticineLab release logs it. Methods that choose by
+        the score themselves, such as planners, and those outside plab always have that of the final one.
         """
-        if self.config["protocol"]["score"] == "last":
+        if counts_last(self.config):
             return float(self.iterations["score"].iloc[-1])
         return self.evaluation["score"]
 
@@ -173,6 +176,12 @@ def _without_recipe(task: Mapping[str, Any]) -> dict[str, Any]:
     variants = {name: _without_recipe(own) for name, own in task.get("variants", {}).items()}
     kept = {key: value for key, value in task.items() if key != "target"}
     return kept | ({"variants": variants} if variants else {})
+
+
+def counts_last(config: Mapping[str, Any]) -> bool:
+    """Return whether a run's score is that of its last iteration: see :attr:`RunResult.score`."""
+    own = FAMILIES.get(config["method"]["family"])
+    return config["protocol"]["score"] == "last" and own is not None and own.ranking == "loss"
 
 
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
