@@ -150,6 +150,22 @@ def test_a_runner_that_is_none_is_said(folder: Path) -> None:
     assert ended.message == "the runner of method.family 'zz_wrong:FAMILY' is no plab.runners.Runner"
 
 
+@pytest.mark.physics
+@pytest.mark.parametrize("hook", ["build", "step", "iterate"])
+def test_a_runner_that_lacks_hooks_is_refused(hook: str, folder: Path) -> None:
+    (folder / f"zz_lacks_{hook}.py").write_text(
+        "from plab.families import *\nfrom plab.runners import Runner\n"
+        f"class Lacking(Runner):\n    def {hook}(self, *given): ...\n"
+        "FAMILY = Family('', 'plab.config_types:ApgConfig', Lacking)\n"
+    )
+    cfg = load_config(["method=apg", f"results_dir={folder}"])
+    cfg.method.family = f"zz_lacks_{hook}:FAMILY"
+    search_in(folder)
+    (ended,) = run_batch([cfg])
+    assert ended.status == "refused"
+    assert ended.message.endswith("is not finished: it needs build, and step or iterate")
+
+
 def test_family_and_keys_have_to_fit() -> None:
     with pytest.raises(ConfigError, match=r"method has the keys of TrajectoryConfig: .* those of ApgConfig"):
         load_config(["method=adam", "method.family=apg"])

@@ -156,4 +156,8 @@ def _runner(job: Job, *, in_sweep: bool) -> type[Runner]:
     kind = own.runner_type(population=population)
     if not issubclass(kind, Runner):
         raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
+    if kind.build is Runner.build or (kind.step is Runner.step and kind.iterate is Runner.iterate):
+        raise ConfigError(
+            f"the runner of method.family '{name}' is not finished: it needs build, and step or iterate"
+        )
     return kind
