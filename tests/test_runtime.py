@@ -1,11 +1,13 @@
 """How plab starts Taichi, and what it changes in it."""
 
 import inspect
+import os
+import time
 
 import pytest
 import taichi as ti
 
-from plab.sim.runtime import available_threads, start_runtime
+from plab.sim.runtime import available_threads, free_abandoned_cache, start_runtime
 
 
 def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
@@ -14,6 +16,17 @@ def test_threads_are_those_that_a_launcher_grants(monkeypatch) -> None:
     for text, count in (("1", 1), (str(cpus + 1), cpus), ("0", cpus), ("many", cpus)):
         monkeypatch.setenv("OMP_NUM_THREADS", text)
         assert available_threads() == count
+
+
+@pytest.mark.parametrize(("age", "left"), [(1.0, True), (60.0, False)])
+def test_a_killed_process_leaves_no_lock_on_compiled_kernels(tmp_path, monkeypatch, age, left) -> None:
+    lock = tmp_path / "ticache.lock"
+    lock.touch()
+    os.utime(lock, (time.time() - age,) * 2)
+    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path))
+    free_abandoned_cache()
+    assert lock.exists() == left
+    free_abandoned_cache()
 
 
 @pytest.mark.physics

@@ -7,16 +7,19 @@ import functools
 import io
 import os
 import textwrap
+import time
 import types
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 # Taichi prints a banner on standard output unless told so before it is imported.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import taichi as ti
+from taichi.lang import impl
 
 __all__ = ["DEVICES", "PRECISIONS", "DeviceError", "Runtime", "SimulationError", "start_runtime"]
 
@@ -25,6 +28,9 @@ PRECISIONS = ("float32", "float64")
 
 CACHE_BYTES = 1 << 30
 """Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
+
+ABANDONED_SECONDS = 10.0
+"""Age from which the lock of Taichi's cache is a killed process's: it is held while files are written."""
 
 
 class DeviceError(RuntimeError):
@@ -115,6 +121,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     _users.clear()
     # Taichi announces the device on standard output, which belongs to the caller.
     with contextlib.redirect_stdout(io.StringIO()):
+        free_abandoned_cache()
         _start_taichi(device, precision, wanted)
     remember_sources()
     remember_source_positions()
@@ -133,6 +140,18 @@ def _refuse_fork() -> None:
     _process = os.getpid()
 
 
+def free_abandoned_cache() -> None:
+    """Remove the lock that a process killed while it wrote compiled kernels has left in Taichi's cache.
+
+    Taichi waits for it a fifth of a second, and would then compile every kernel anew in every later process.
+    """
+    folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    lock = Path(folder) / "ticache.lock"
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > ABANDONED_SECONDS:
+            lock.unlink()
+
+
 def _start_taichi(device: str, precision: str, threads: int) -> None:
     ti.init(
         arch=ti.cuda if device == "cuda" else ti.cpu,
@@ -146,7 +165,8 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         offline_cache=True,
         # The suite's kernels need more than Taichi's own 100 MB, and would be removed and compiled in turns.
         offline_cache_max_size_of_files=CACHE_BYTES,
-        log_level=ti.WARN,
+        # Its warnings are of a cache that another process is writing; these kernels are then not kept.
+        log_level=ti.ERROR,
     )
 
 
