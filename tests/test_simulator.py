@@ -79,6 +79,16 @@ def sim(device: str) -> Simulator:
     return simulator(SCENES, device)
 
 
+def test_no_vector_of_a_tile_or_a_node_straddles_two_cache_lines() -> None:
+    engine = simulator(SCENES[:1], "cpu")._engine
+    for name in ("work", "spread", "places", "stage", "affine", "momentum", "velocity"):
+        field = getattr(engine, name)
+        node, offset = field.parent().ptr, 0
+        while node is not None:
+            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
+        assert offset % (4 * field.n) == 0, name
+
+
 def test_gradient_descends(sim: Simulator) -> None:
     u = actions()
     sim.set_contact("soft")

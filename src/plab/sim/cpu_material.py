@@ -39,8 +39,8 @@ class MaterialTiles(ParticlePhases):
 
     def _allocate(self) -> None:
         self.stage = ti.Vector.field(self.lanes, self.real, shape=self.batch * self.chunks * STAGE)
-        self.once = ti.field(ti.i32, shape=())
         super()._allocate()
+        self.once = ti.field(ti.i32, shape=())
         self.once[None] = 1
 
     @ti.func

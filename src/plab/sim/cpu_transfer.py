@@ -46,6 +46,7 @@ class TransferTiles(ParticlePhases):
         self.work = ti.Vector.field(4, self.real, shape=grids * WORK)
         self.spread = ti.Vector.field(self.lanes, self.real, shape=grids * SPREAD)
         self.places = ti.Vector.field(self.lanes, ti.i32, shape=grids * PLACES)
+        super()._allocate()
         # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
         self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
         self.block_chunks = ti.field(ti.i32, shape=self.batch * self.blocks)
@@ -55,7 +56,6 @@ class TransferTiles(ParticlePhases):
         self.mark_code = ti.field(ti.i32, shape=grids * self.blocks)
         self.mark_list = ti.field(ti.i32, shape=grids * self.blocks)
         self.mark_count = ti.field(ti.i32, shape=grids)
-        super()._allocate()
 
     @ti.func
     def bounded(self, index):
