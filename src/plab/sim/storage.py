@@ -191,8 +191,8 @@ class Storage:
         real, b = self.real, self.batch
         m = max(1, self.manipulators)
         self.lane_type = ti.types.vector(self.lanes, real)
-        # Vectors first: fields lie one behind the other, and behind single numbers a vector straddles two cache
-        # lines, which costs the CPU 7 % of a step.
+        # Vectors first: fields lie one behind the other, and behind single numbers a vector straddles two
+        # cache lines, which costs the CPU 7 % of a step.
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         self.momentum = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
