@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -27,6 +26,7 @@ from plab.runners.planners.starts import ContactStarts, support
 from plab.scene import Manipulator
 from plab.sim import Simulator
 from plab.sweep.plan import plan
+from same_runs import assert_same_numbers
 
 STEPS = 4
 
@@ -74,14 +74,6 @@ def make_config(folder: Path, method: str, *overrides: str) -> Config:
 def run(cfg: Config) -> RunResult:
     run_config(cfg, CACHE)
     return read(result_path(cfg))
-
-
-def assert_same_numbers(a: RunResult, b: RunResult) -> None:
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (a, b)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(a.best_actions, b.best_actions)
-    assert (a.best_iteration, a.best_loss) == (b.best_iteration, b.best_loss)
-    assert a.evaluation == b.evaluation
 
 
 @pytest.fixture(scope="module")

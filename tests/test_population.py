@@ -41,6 +41,8 @@ from plab.runners.population.replay import Replay, Sizes
 from plab.runners.rl_models import CLIP, model_kind
 from plab.sweep.plan import plan
 from plab.tally import Outcome
+from same_runs import finished_as, stopped_at
+from test_rl import COARSE as SMALL_RUN
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
 
@@ -303,21 +305,7 @@ def test_replay_holds_the_latest_transitions_and_goes_on_from_its_file(
 
 # --------------------------------------------------------------------------------------------- whole runs
 
-COARSE = (
-    "task=Move",
-    "sim.grid_size=32",
-    "sim.particles_scale=0.03",
-    "sim.horizon=4",
-    "sim.substeps=5",
-    # Targets that the ball reaches into, so that IoU and score are not 0.
-    "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
-    "method.episodes=16",
-    "method.num_envs=2",
-    "method.evaluate_every=6",
-    "method.hidden=[8]",
-    "checkpoint_seconds=0",
-    "progress=false",
-)
+COARSE = (*SMALL_RUN, "checkpoint_seconds=0")
 
 METHODS = {
     "sac": ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16"),
@@ -336,13 +324,8 @@ def configs(folder: Path, method: str, *overrides: str) -> list[Config]:
 
 
 def assert_same_numbers(cfg: Config, want: RunResult) -> RunResult:
-    """Assert that a run's file agrees bit for bit with another one in all but times; return it."""
-    got = read(result_path(cfg))
-    assert got.status == "finished" and got.config_hash == want.config_hash
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (got, want)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(got.best_actions, want.best_actions)
-    assert got.evaluation == want.evaluation
+    """Assert that a run's file and policy agree with another one's in all but times; return it."""
+    got = finished_as(cfg, want)
     policies = [np.load(policy_path(result.path))["policy"] for result in (got, want)]
     assert np.array_equal(*policies)
     return got
@@ -465,17 +448,8 @@ def test_a_population_that_breaks_off_goes_on_to_the_same_numbers(
 def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone, method, monkeypatch) -> None:
     alone = lone(method)
     cfgs = configs(tmp_path, method)
-    intact, calls = RunFile.record, iter(range(100))
-
-    def record(self, *arguments, **changes):
-        if next(calls) == 4:
-            raise KeyboardInterrupt
-        intact(self, *arguments, **changes)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RunFile, "record", record)
-        with pytest.raises(KeyboardInterrupt):
-            carry(cfgs)
+    with stopped_at(4):
+        carry(cfgs)
     left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in cfgs]
     assert [len(one.iterations) for one in left] == [2, 1, 1]
     # The single run goes on as it was begun.

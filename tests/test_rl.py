@@ -30,6 +30,7 @@ from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
 from plab.sim import SimulationError
+from same_runs import assert_same_numbers
 
 pytestmark = pytest.mark.physics
 
@@ -77,17 +78,6 @@ def run(cfg: Config) -> RunResult:
     result = read(result_path(cfg))
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
-
-
-def assert_same_numbers(a: RunResult, b: RunResult) -> None:
-    """Assert that two runs agree bit for bit in everything but times and provenance."""
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (a, b)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(a.best_actions, b.best_actions)
-    assert (a.best_iteration, a.best_loss) == (b.best_iteration, b.best_loss)
-    assert a.evaluation == b.evaluation
-    for name in ("initial", "final", "target"):
-        assert np.array_equal(a.masses[name], b.masses[name]), name
 
 
 def assert_nothing_else_is_left(result: RunResult) -> None:

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
@@ -21,9 +20,10 @@ from rich.console import Console
 
 from plab import progress
 from plab.config import Config, load_config
-from plab.results import RunResult, read, result_path
+from plab.results import read, result_path
 from plab.run import main
 from plab.runners import run_batch
+from same_runs import assert_same_numbers
 
 pytestmark = pytest.mark.physics
 
@@ -160,12 +160,6 @@ def kill_a_job(sweep: subprocess.Popen, word: str, folder: Path, rng: np.random.
     for pid in computing[:1]:
         os.kill(pid, signal.SIGKILL)
     return bool(computing)
-
-
-def assert_same_numbers(got: RunResult, want: RunResult) -> None:
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (got, want)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(got.best_actions, want.best_actions) and got.evaluation == want.evaluation
 
 
 @pytest.mark.slow

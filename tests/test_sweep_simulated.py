@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from plab.config import Config, load_config
@@ -15,6 +14,7 @@ from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import run_batch, run_config
 from plab.sim import Simulator
+from same_runs import finished_as, stopped_at
 
 pytestmark = pytest.mark.physics
 
@@ -50,25 +50,11 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> list[RunResult]:
     return [read(result_path(cfg)) for cfg in cfgs]
 
 
-def assert_same_numbers(cfg: Config, want: RunResult) -> RunResult:
-    """Assert that a run's file agrees bit for bit with what the run gives alone; return it."""
-    got = read(result_path(cfg))
-    assert got.status == "finished" and got.config_hash == want.config_hash
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (got, want)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(got.best_actions, want.best_actions)
-    assert (got.best_iteration, got.best_loss) == (want.best_iteration, want.best_loss)
-    assert got.evaluation == want.evaluation
-    for name in ("initial", "final", "target"):
-        assert np.array_equal(got.masses[name], want.masses[name]), name
-    return got
-
-
 def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, alone, capsys) -> None:
     cfgs = configs(tmp_path)
     ended = run_batch(cfgs)
     for cfg, want, one in zip(cfgs, alone, ended, strict=True):
-        got = assert_same_numbers(cfg, want)
+        got = finished_as(cfg, want)
         assert (one.status, one.score, one.path) == ("finished", got.evaluation["score"], str(got.path))
         assert got.provenance["batch"] == 4 and want.provenance["batch"] == 1
         assert set(got.wall_time) == set(want.wall_time) == {"build", "compile", "optimise", "evaluate"}
@@ -107,14 +93,14 @@ def test_a_run_that_breaks_off_does_not_disturb_the_others(tmp_path: Path, alone
         ended = run_batch(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "finished", "finished"]
     for k in (0, 2, 3):
-        assert_same_numbers(cfgs[k], alone[k])
+        finished_as(cfgs[k], alone[k])
     left = read(result_path(cfgs[1]).with_suffix(".partial.h5"))
     why = "iteration 2: environment step 2, substep 1: the state is not finite"
     assert (left.status, left.message, ended[1].message) == ("failed", why, why)
     assert left.iterations["loss"].tolist() == alone[1].iterations["loss"].tolist()[:2]
     # Again: it goes on alone where it broke off.
     assert [one.status for one in run_batch(cfgs)] == ["before", "finished", "before", "before"]
-    assert_same_numbers(cfgs[1], alone[1])
+    finished_as(cfgs[1], alone[1])
 
 
 def test_a_state_that_is_not_finite_breaks_off_its_run_only(tmp_path: Path, alone, monkeypatch) -> None:
@@ -140,27 +126,18 @@ def test_a_state_that_is_not_finite_breaks_off_its_run_only(tmp_path: Path, alon
     assert [one.status for one in ended] == ["finished"] * 3 + ["failed"]
     assert ended[3].message.startswith("iteration 1: environment step 1, substep 1: the state is not finite")
     for k in range(3):
-        assert_same_numbers(cfgs[k], alone[k])
+        finished_as(cfgs[k], alone[k])
 
 
 def test_runs_that_stand_at_different_iterations_go_on_together(tmp_path: Path, alone, monkeypatch) -> None:
     cfgs = configs(tmp_path)
-    intact, calls = RunFile.record, iter(range(100))
-
-    def record(self, *arguments, **changes):
-        if next(calls) == 6:
-            raise KeyboardInterrupt
-        intact(self, *arguments, **changes)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RunFile, "record", record)
-        with pytest.raises(KeyboardInterrupt):
-            run_batch(cfgs)
+    with stopped_at(6):
+        run_batch(cfgs)
     left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in cfgs]
     assert [(one.status, len(one.iterations)) for one in left] == [("stopped", 2)] * 2 + [("stopped", 1)] * 2
     assert [one.status for one in run_batch(cfgs)] == ["finished"] * 4
     for cfg, want in zip(cfgs, alone, strict=True):
-        assert assert_same_numbers(cfg, want).provenance["resumed"] == 1
+        assert finished_as(cfg, want).provenance["resumed"] == 1
 
 
 def test_a_file_that_cannot_be_written_ends_its_run_only(tmp_path: Path, alone, monkeypatch) -> None:
@@ -178,6 +155,6 @@ def test_a_file_that_cannot_be_written_ends_its_run_only(tmp_path: Path, alone, 
     assert [one.status for one in ended] == ["finished", "finished", "refused", "finished"]
     assert ended[2].message == f"cannot write {bad}: No space left on device"
     for k in (0, 1, 3):
-        assert_same_numbers(cfgs[k], alone[k])
+        finished_as(cfgs[k], alone[k])
     run_config(cfgs[2])
-    assert_same_numbers(cfgs[2], alone[2])
+    finished_as(cfgs[2], alone[2])

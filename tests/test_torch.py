@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
@@ -18,6 +17,7 @@ from plab.results import BUDGETS, RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
 from plab.torch import TensorEnv, rollout
+from same_runs import assert_same_numbers, stopped_at
 
 pytestmark = pytest.mark.physics
 
@@ -179,19 +179,9 @@ def test_apg_lowers_the_loss(finished: RunResult) -> None:
 
 def test_apg_resumes_to_the_same_numbers(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, "method.lr=0.01")
-    intact, calls = apg.rollout, iter(range(100))
-
-    def broken(*arguments):
-        if next(calls) == 2:
-            raise KeyboardInterrupt
-        return intact(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(apg, "rollout", broken)
-        with pytest.raises(KeyboardInterrupt):
-            run_config(cfg)
+    with stopped_at(2, apg, "rollout"):
+        run_config(cfg)
     assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
     again = run(cfg)
-    rows = [result.iterations.drop(columns=["seconds"]) for result in (again, finished)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert again.evaluation == finished.evaluation and again.provenance["resumed"] == 1
+    assert_same_numbers(again, finished)
+    assert again.provenance["resumed"] == 1

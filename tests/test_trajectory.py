@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from plab.config import Config, load_config
@@ -22,6 +21,7 @@ from plab.runners import RunError, run_config, trajectory
 from plab.runners.common import measures, shared_problem
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
+from same_runs import assert_same_numbers
 
 pytestmark = pytest.mark.physics
 
@@ -43,9 +43,6 @@ COARSE = (
 """300 particles, 15 substeps. The left sphere, of almost a cell's radius, sits on a node in the rope: the
 nodes around it are within reach of the soft contact model, but not of the hard one."""
 
-TIMES = ["seconds"]
-"""Columns that differ from run to run."""
-
 
 def make_config(folder: Path, *overrides: str) -> Config:
     return load_config([*COARSE, f"results_dir={folder}", *overrides])
@@ -56,17 +53,6 @@ def run(cfg: Config) -> RunResult:
     result = read(result_path(cfg))
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
-
-
-def assert_same_numbers(a: RunResult, b: RunResult) -> None:
-    """Assert that two runs agree bit for bit in everything but times and provenance."""
-    rows = [result.iterations.drop(columns=TIMES) for result in (a, b)]
-    pd.testing.assert_frame_equal(*rows, check_exact=True)
-    assert np.array_equal(a.best_actions, b.best_actions)
-    assert (a.best_iteration, a.best_loss) == (b.best_iteration, b.best_loss)
-    assert a.evaluation == b.evaluation
-    for name in ("initial", "final", "target"):
-        assert np.array_equal(a.masses[name], b.masses[name]), name
 
 
 @pytest.fixture(scope="module")

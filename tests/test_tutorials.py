@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from plab.config import load_config
-from plab.results import RunFile, RunResult, load, read
+from plab.results import RunResult, load, read
 from plab.runners import run_config
+from same_runs import stopped_at
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -130,7 +131,7 @@ def test_a_method_of_ones_own(tmp_path):
 
 
 @pytest.mark.physics
-def test_an_interrupted_search_goes_on(tmp_path, monkeypatch):
+def test_an_interrupted_search_goes_on(tmp_path):
     def result(folder: str) -> RunResult:
         run_config(
             load_config([*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"], SEARCH[1])
@@ -138,17 +139,9 @@ def test_an_interrupted_search_goes_on(tmp_path, monkeypatch):
         (path,) = (tmp_path / folder).rglob("*.h5")
         return read(path)
 
-    whole, intact, calls = result("whole"), RunFile.record, iter(range(100))
-
-    def record(self, *arguments, **changes):
-        if next(calls) == 2:
-            raise KeyboardInterrupt
-        intact(self, *arguments, **changes)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RunFile, "record", record)
-        with pytest.raises(KeyboardInterrupt):
-            result("parts")
+    whole = result("whole")
+    with stopped_at(2):
+        result("parts")
     parts = result("parts")
     assert parts.provenance["resumed"] == 1
     assert parts.iterations["loss"].tolist() == whole.iterations["loss"].tolist()

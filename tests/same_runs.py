@@ -1,0 +1,57 @@
+"""What tests of resuming and batching ask for: runs that end with the same numbers, runs cut short."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from plab.config import Config
+from plab.results import RunResult, read, result_path
+from plab.results.running import RunFile
+
+TIMES = ["seconds"]
+"""Columns in which two runs of the same numbers differ."""
+
+
+def assert_same_numbers(got: RunResult, want: RunResult) -> None:
+    """Assert that two runs agree bit for bit in everything but times and provenance."""
+    assert got.status == want.status
+    rows = [result.iterations.drop(columns=TIMES) for result in (got, want)]
+    pd.testing.assert_frame_equal(*rows, check_exact=True)
+    assert np.array_equal(got.best_actions, want.best_actions)
+    assert (got.best_iteration, got.best_loss) == (want.best_iteration, want.best_loss)
+    assert got.evaluation == want.evaluation
+    assert got.masses.keys() == want.masses.keys()
+    for name, mass in got.masses.items():
+        assert np.array_equal(mass, want.masses[name]), name
+
+
+def finished_as(cfg: Config, want: RunResult) -> RunResult:
+    """Assert that a configuration's file is finished and the same as another run of it; return it."""
+    got = read(result_path(cfg))
+    assert got.status == "finished" and got.config_hash == want.config_hash
+    assert_same_numbers(got, want)
+    return got
+
+
+@contextmanager
+def stopped_at(call: int, where: type | Any = RunFile, name: str = "record") -> Iterator[None]:
+    """Raise KeyboardInterrupt in the block at a call of a function, counted from 0, and catch it outside."""
+    intact: Callable = getattr(where, name)
+    calls = count()
+
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        if next(calls) == call:
+            raise KeyboardInterrupt
+        return intact(*arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(where, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            yield
