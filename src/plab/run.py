@@ -22,25 +22,26 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.arguments import told
 from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import help_text
+from plab.command import EXIT_INTERRUPTED, EXIT_USER_ERROR, command_line, complain
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
+from plab.errors import PlabError
 from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
 from plab.targets import TargetError
+from plab.words import quote_folders, shortened
 
 __all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
-EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 
 _CONFIG_ERRORS = (ConfigError, SceneError, TargetError)
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -52,33 +53,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         Ctrl-C.
     """
     tally = Tally()
+    argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
+    if arguments.help:
+        print(help_text(arguments.config_dir))
+        return 0
     try:
-        argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
-        if arguments.help:
-            print(help_text(arguments.config_dir))
-            return 0
         with _hydra_raises(argv):
             hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(
                 _job(tally)
             )()
     except Refusal as refusal:
-        return _complain(str(refusal), refusal.code)
+        return complain(str(refusal), refusal.code)
     except COMPOSE_ERRORS as error:
-        return _complain(explain(error), EXIT_USER_ERROR)
-    except ConfigError as error:
-        return _complain(str(error), EXIT_USER_ERROR)
-    except (OSError, ValueError) as error:
-        # Before the first job these are Hydra's: flags that exclude each other, a sweep's folder that cannot
-        # be made.
-        if tally.started:
-            raise
-        return _complain(told(error) if isinstance(error, OSError) else str(error), EXIT_USER_ERROR)
+        raise ConfigError(explain(error)) from error
+    except (PlabError, OSError, MemoryError):
+        raise
     except KeyboardInterrupt:
         tally.report()
-        return _complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
-    except SystemExit as stop:
-        # Hydra leaves this way after --version and the like.
-        return stop.code if isinstance(stop.code, int) else 0
+        return complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
+    except Exception as error:
+        # Before the first job these are Hydra's: flags that exclude each other, settings that it cannot use.
+        settings = [word for word in arguments.overrides if word.lstrip("+~").startswith("hydra")]
+        if tally.started or not (settings or isinstance(error, ValueError)):
+            raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        cannot = f"Hydra cannot use {' and '.join(map(shortened, settings))}: " if settings else ""
+        raise ConfigError(cannot + reason) from error
     return max(tally.code, tally.report())
 
 
@@ -97,7 +97,7 @@ def _job(tally: Tally) -> TaskFunction:
                 # It has to get out of the job's process.
                 raise
             # Not raised: Hydra would add lines of its own.
-            tally.code = _complain(str(refusal), refusal.code)
+            tally.code = complain(str(refusal), refusal.code)
             return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
@@ -134,7 +134,6 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     Raises:
         ConfigError: If a flag does not exist, an override makes no sense or the folder of ``--config-dir``
             does not do.
-        hydra.errors.HydraException: If an override cannot be parsed.
     """
     parser = get_args_parser()
     flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
@@ -149,10 +148,14 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
         raise ConfigError(
             "--package has no effect without --cfg: write --cfg job --package sim, or leave it out"
         )
-    check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)
     for override in arguments.overrides:
         rest.remove(override)
+    arguments.overrides = quote_folders(arguments.overrides)
+    try:
+        check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
+    except COMPOSE_ERRORS as error:
+        raise ConfigError(explain(error)) from error
     return [*arguments.overrides, *rest], arguments
 
 
@@ -171,11 +174,6 @@ def _hydra_raises(argv: list[str]) -> Iterator[None]:
             del os.environ["HYDRA_FULL_ERROR"]
         else:
             os.environ["HYDRA_FULL_ERROR"] = before[1]
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"plab: {' '.join(message.split())}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -7,7 +7,10 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 
-__all__ = ["Outcome", "Refusal", "Tally"]
+__all__ = ["MOST_RUNS", "Outcome", "Refusal", "Tally"]
+
+MOST_RUNS = 100_000
+"""Runs of a sweep, at most: to compose more would take hours."""
 
 _UNFINISHED = {
     "failed": "failed",
