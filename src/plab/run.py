@@ -65,6 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Refusal as refusal:
         return complain(str(refusal), refusal.code)
     except COMPOSE_ERRORS as error:
+        if tally.started and isinstance(error, RecursionError):
+            raise
         raise ConfigError(explain(error)) from error
     except (PlabError, OSError, MemoryError):
         raise

@@ -67,13 +67,25 @@ def parse(words: Sequence[str]) -> list[Override]:
     parser, found = OverridesParser.create(), []
     for word in words:
         try:
-            found += parser.parse_overrides([word])
+            (override,) = parser.parse_overrides([word])
+            if _has_endless_number(override.value()):
+                raise ValueError("a number has too many digits")
+            found.append(override)
         except HydraException:
             raise
         except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
             reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
             raise ConfigError(f"cannot read '{shortened(word)}': {reason}") from None
     return found
+
+
+def _has_endless_number(value: object) -> bool:
+    """Return whether there is a whole number that no float could hold, beyond which OmegaConf fails."""
+    if isinstance(value, dict | list | ChoiceSweep):
+        entries = value.list if isinstance(value, ChoiceSweep) else [*value]
+        entries += list(value.values()) if isinstance(value, dict) else []
+        return any(map(_has_endless_number, entries))
+    return isinstance(value, int) and value.bit_length() > 1000
 
 
 def shortened(word: str) -> str:
