@@ -133,6 +133,15 @@ class BatchLauncher(Launcher):
 
         if self._size is not None and (type(self._size) is not int or self._size < 1):
             raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")
+        if not isinstance(self._on_gpus, bool):
+            raise ConfigError(f"hydra.launcher.on_gpus must be true or false, not {self._on_gpus}")
+        if self._inner is not None and (
+            not isinstance(self._inner, DictConfig) or "_target_" not in self._inner
+        ):
+            raise ConfigError(
+                "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, such as "
+                "hydra/launcher=batch_joblib"
+            )
         entries = compose_jobs(job_overrides, self._compose)
         refused = [entry for entry in entries if isinstance(entry, Refused)]
         if len(refused) == len(entries) and len({entry.reason for entry in refused}) == 1:

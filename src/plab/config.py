@@ -192,7 +192,13 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
         key, text = override.key_or_group, str(override.input_line)
         if not key:
             raise ConfigError(f"cannot read '{text}': write key=value")
-        if override.is_hydra_override() or key.startswith("hydra/"):
+        if override.is_hydra_override():
+            if (
+                key.startswith("hydra/")
+                and not isinstance(override.value(), str)
+                and not override.is_delete()
+            ):
+                raise ConfigError(f"'{text}': name one, such as hydra/launcher=batch_joblib")
             continue
         if override.is_delete():
             raise ConfigError(f"'{text}': keys cannot be removed, only set")
@@ -279,6 +285,10 @@ def build_scene(cfg: Config) -> Scene:
         plab.scene.SceneError: If the scene cannot be simulated.
     """
     task, protocol, sim = variant_task(cfg), cfg.protocol, cfg.sim
+    most = max((body.particles for body in task.bodies.values()), default=1)
+    if most * sim.particles_scale < 0.5:
+        least = f"use {0.5 / most:.2g} or more"
+        raise ConfigError(f"sim.particles_scale={sim.particles_scale:g} leaves no particle: {least}")
     scene = Scene(
         name=task.name,
         bodies=tuple(body.build(sim.particles_scale) for body in task.bodies.values()),

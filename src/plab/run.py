@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -81,6 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         reason = " ".join(str(error).split()) or type(error).__name__
         cannot = f"Hydra cannot use {' and '.join(map(shortened, settings))}: " if settings else ""
         raise ConfigError(cannot + reason) from error
+    if tally.error is not None:
+        raise tally.error
     return max(tally.code, tally.report())
 
 
@@ -101,6 +104,11 @@ def _job(tally: Tally) -> TaskFunction:
             # Not raised: Hydra would add lines of its own.
             tally.code = complain(str(refusal), refusal.code)
             return math.nan
+        except Exception as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            tally.error = error
+            return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
     job.tally = tally  # type: ignore[attr-defined]
@@ -111,6 +119,7 @@ def _run(composed: DictConfig, cache: SimulatorCache) -> float:
     """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
     # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
+        _require_sweep(HydraConfig.get())
         cfg = finish(composed, HydraConfig.get().overrides.task)
         check_sources(cfg)
         check_device(cfg)
@@ -125,6 +134,17 @@ def _run(composed: DictConfig, cache: SimulatorCache) -> float:
         raise Refusal(str(error), EXIT_BROKE_OFF) from error
     except USER_ERRORS as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
+
+
+def _require_sweep(settings: Any) -> None:
+    """Refuse settings of sweeps, of which a single run takes no notice."""
+    of_sweeps = [
+        word for word in settings.overrides.hydra if re.match(r"[+~]*hydra[./](launcher|sweep)", word)
+    ]
+    if settings.mode == RunMode.RUN and of_sweeps:
+        raise ConfigError(
+            f"'{shortened(of_sweeps[0])}' has no effect on a single run: add -m, or leave it out"
+        )
 
 
 def _parse(argv: list[str]) -> tuple[list[str], Namespace]:

@@ -31,6 +31,9 @@ __all__ = [
 CHOICES = ("plab", "release")
 """Whose way something is done: plab's own, or that of the PlasticineLab release."""
 
+STIFFEST = 1e-12
+"""Time step [s] below which no scene can be simulated in anybody's life."""
+
 SHORTEST = 1e-6
 """Shortest time step, as a share of the longest that is stable: what moves less is lost in rounding."""
 
@@ -285,7 +288,7 @@ class Scene:
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
         _require(
-            self.stable_dt > 0,
+            self.stable_dt > STIFFEST,
             f"youngs_modulus {self.youngs_modulus:g} and poisson_ratio {self.poisson_ratio:g} are too stiff "
             "for any time step: lower them",
         )

@@ -141,10 +141,10 @@ class Config:
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        at_least("seed", self.seed, 0)
-        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if self.seed >= 2**32:
             raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
+        at_least("seed", self.seed, 0)
+        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")
         if self.targets.source is not None and self.seed_scene is not None:

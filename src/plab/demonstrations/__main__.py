@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from plab.arguments import positive, rates, refuse_task, seed, to_write
+from plab.checks import check_sources
 from plab.command import command_line
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config_types import TrajectoryConfig
@@ -82,6 +83,8 @@ def _run(args: argparse.Namespace) -> int:
         [load_config([f"task={task}", f"variant={variant}", *args.overrides]) for variant in SUITE_VARIANTS]
         for task in args.task
     ]
+    for cfgs in tasks:
+        check_sources(cfgs[0])
     if args.search:
         _require_searchable([cfgs[0] for cfgs in tasks])
     for cfgs in tasks:

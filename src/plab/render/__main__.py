@@ -11,6 +11,7 @@ from typing import NoReturn
 from omegaconf import OmegaConf
 
 from plab.arguments import folder, positive, sources_and_words, to_write
+from plab.checks import check_sources
 from plab.command import command_line
 from plab.config import choices, load_config
 from plab.render.graphics import RenderError, require_graphics
@@ -123,6 +124,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.output = arguments.output or arguments.result.with_suffix(".png")
     elif arguments.overrides:
         cfg = arguments.config = load_config(arguments.overrides, arguments.config_dir)
+        check_sources(cfg)
         arguments.output = arguments.output or Path(f"{cfg.task.name}-v{cfg.variant}.png")
     else:
         raise RenderError("say what to draw: a result file, or a task such as task=Torus; --help explains")

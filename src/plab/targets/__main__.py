@@ -22,6 +22,7 @@ import pandas as pd
 
 from plab.arguments import refuse_task, to_write
 from plab.cache import cache_dir
+from plab.checks import check_sources
 from plab.command import command_line
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
@@ -65,6 +66,8 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         average.
     """
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
+    for cfg in cfgs:
+        check_sources(cfg)
     sim = cfgs[0].sim
     scenes = [build_scene(cfg) for cfg in cfgs]
     start = time.perf_counter()
