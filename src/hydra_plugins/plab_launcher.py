@@ -66,7 +66,7 @@ class BatchSweeper(BasicSweeper):
         from plab.config import ConfigError
         from plab.words import parse, require_few
 
-        assert self.hydra_context is not None and self.launcher is not None
+        assert self.config is not None and self.hydra_context is not None and self.launcher is not None
         loader = self.hydra_context.config_loader
         # As in Hydra's own: what is given last counts.
         given = {one.get_key_element(): one for one in parse([*self._parse_config(), *arguments])}
@@ -75,6 +75,8 @@ class BatchSweeper(BasicSweeper):
             if isinstance(one.value(), Glob) and not list(one.sweep_string_iterator()):
                 raise ConfigError(f"'{one.input_line}' matches nothing: there is nothing to run")
         require_few(list(given.values()))
+        if not self.config.hydra.sweep.dir.strip():
+            raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
         if isinstance(self.launcher, BatchLauncher):
             self.launcher.note = self._note
         else:
@@ -139,7 +141,7 @@ class BatchLauncher(Launcher):
             not isinstance(self._inner, DictConfig) or "_target_" not in self._inner
         ):
             raise ConfigError(
-                "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, such as "
+                "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, as by "
                 "hydra/launcher=batch_joblib"
             )
         entries = compose_jobs(job_overrides, self._compose)

@@ -44,7 +44,7 @@ from plab.random_variant import draw_variant
 from plab.scene import Scene, vector3
 from plab.suite import conf_folder
 from plab.variants import RANDOM, merge_variant, undone_key, variant_changes
-from plab.words import parse, quote_folders, require_few, shortened, word_list
+from plab.words import parse, quote_folders, require_few, shortened, unusable, word_list
 from plab.yaml_files import require_plain
 
 __all__ = [
@@ -157,6 +157,12 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
             composed = compose("config", overrides=[*overrides, *_searchpath(config_dir)])
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
+    except ConfigError:
+        raise
+    except Exception as error:
+        if (reason := unusable(error, overrides)) is None:
+            raise
+        raise ConfigError(reason) from error
     finally:
         GlobalHydra.instance().hydra = surrounding
     return finish(composed, overrides)

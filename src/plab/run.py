@@ -33,7 +33,7 @@ from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
 from plab.targets import TargetError
-from plab.words import quote_folders, shortened
+from plab.words import quote_folders, shortened, unusable
 
 __all__ = ["main"]
 
@@ -76,12 +76,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
     except Exception as error:
         # Before the first job these are Hydra's: flags that exclude each other, settings that it cannot use.
-        settings = [word for word in arguments.overrides if word.lstrip("+~").startswith("hydra")]
-        if tally.started or not (settings or isinstance(error, ValueError)):
+        if tally.started:
             raise
-        reason = " ".join(str(error).split()) or type(error).__name__
-        cannot = f"Hydra cannot use {' and '.join(map(shortened, settings))}: " if settings else ""
-        raise ConfigError(cannot + reason) from error
+        reason = unusable(error, arguments.overrides)
+        if reason is None and not isinstance(error, ValueError):
+            raise
+        raise ConfigError(reason or str(error)) from error
     if tally.error is not None:
         raise tally.error
     return max(tally.code, tally.report())

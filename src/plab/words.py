@@ -30,6 +30,7 @@ __all__ = [
     "require_effect",
     "require_few",
     "shortened",
+    "unusable",
     "value_count",
     "word_list",
 ]
@@ -175,6 +176,20 @@ def _quote_folder(word: str) -> str:
     if value is None or isinstance(value, QuotedString | Sweep | Glob):
         return word
     return f"{key}={quoted(text)}"
+
+
+def unusable(error: Exception, words: Sequence[str]) -> str | None:
+    """Return what Hydra says to settings of its own that it cannot use, None where no override is one.
+
+    Args:
+        error: What it raised.
+        words: All overrides.
+    """
+    if not (settings := [shortened(word) for word in words if word.lstrip("+~").startswith("hydra")]):
+        return None
+    return (
+        f"Hydra cannot use {' and '.join(settings)}: {' '.join(str(error).split()) or type(error).__name__}"
+    )
 
 
 def quoted(text: str) -> str:
