@@ -66,7 +66,7 @@ class BatchSweeper(BasicSweeper):
         from plab.config import ConfigError
         from plab.words import parse, require_few
 
-        assert self.config is not None and self.hydra_context is not None and self.launcher is not None
+        assert self.hydra_context is not None and self.launcher is not None
         loader = self.hydra_context.config_loader
         # As in Hydra's own: what is given last counts.
         given = {one.get_key_element(): one for one in parse([*self._parse_config(), *arguments])}
@@ -75,8 +75,6 @@ class BatchSweeper(BasicSweeper):
             if isinstance(one.value(), Glob) and not list(one.sweep_string_iterator()):
                 raise ConfigError(f"'{one.input_line}' matches nothing: there is nothing to run")
         require_few(list(given.values()))
-        if not self.config.hydra.sweep.dir.strip():
-            raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
         if isinstance(self.launcher, BatchLauncher):
             self.launcher.note = self._note
         else:
@@ -91,7 +89,11 @@ class BatchSweeper(BasicSweeper):
 
     def _note(self) -> None:
         """Write what the sweep is, as Hydra's own does."""
+        from plab.config import ConfigError
+
         assert self.config is not None
+        if not self.config.hydra.sweep.dir.strip():
+            raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
         folder = Path(self.config.hydra.sweep.dir)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
