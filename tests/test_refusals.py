@@ -143,14 +143,7 @@ def test_a_pipe_that_closes(tmp_path, argv):
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        done = subprocess.run(
-            [sys.executable, "-m", *argv],
-            cwd=tmp_path,
-            stdout=writing,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+        done = printing_to(writing, tmp_path, argv)
     finally:
         os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")
@@ -160,14 +153,7 @@ def test_a_pipe_that_closes(tmp_path, argv):
 def test_an_output_that_is_full(tmp_path):
     (tmp_path / "results").mkdir()
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "plab.status", "--json"],
-            cwd=tmp_path,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+        done = printing_to(full, tmp_path, ["plab.status", "--json"])
     assert (done.returncode, done.stderr) == (2, "plab: No space left on device\n")
 
 

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar, cast
 
 from plab.arguments import told
 from plab.errors import PlabError
@@ -35,7 +36,7 @@ EXIT_BROKEN_PIPE = 141
 TRACEBACK = "PLAB_TRACEBACK"
 """Variable of the environment that lets a bug through with its traceback."""
 
-Main = Callable[[Sequence[str] | None], int]
+Main = TypeVar("Main", bound=Callable[..., int])
 
 
 def command_line(main: Main) -> Main:
@@ -74,7 +75,7 @@ def command_line(main: Main) -> Main:
                 raise
             return complain(_bug(error), EXIT_BUG)
 
-    return answered
+    return cast(Main, answered)
 
 
 def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
@@ -94,7 +95,7 @@ def traceback_wanted() -> bool:
     return bool(os.environ.get(TRACEBACK))
 
 
-def _exit_code(main: Main, argv: Sequence[str] | None) -> int:
+def _exit_code(main: Callable[..., int], argv: Sequence[str] | None) -> int:
     try:
         return main(argv)
     except SystemExit as stop:

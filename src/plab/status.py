@@ -412,7 +412,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sources, words = sources_and_words(options.arguments)
     if len(sources) > 1:
         raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
-    found = survey(*(sources or ["results"]), select(words, NAMES))
+    found = survey(sources[0] if sources else "results", select(words, NAMES))
     if options.json:
         print(json.dumps(_json(found), indent=1))
     elif options.csv:
