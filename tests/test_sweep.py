@@ -296,6 +296,36 @@ def test_batch_size_must_be_positive(capsys) -> None:
     assert "hydra.launcher.batch_size must be at least 1 or null, not 0" in capsys.readouterr().err
 
 
+class Queue:
+    """A launcher of other processes, from which nobody hears again; it stands for Hydra's list of them, too."""
+
+    @classmethod
+    def instance(cls) -> Queue:
+        return cls()
+
+    def instantiate_launcher(self, **settings: object) -> Queue:
+        return self
+
+    def launch(self, jobs: object, initial_job_idx: int) -> object:
+        raise RuntimeError("nobody is there")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("{_target_:queue}", "6 runs go to Queue in 1 jobs; hydra.launcher.batch_size=1 makes a job of each"),
+        ("{_target_:queue,n_jobs:2}", "6 runs go to Queue in 2 jobs"),
+        ("{_target_:queue,n_jobs:99}", "6 runs go to Queue in 6 jobs"),
+    ],
+)
+def test_other_launchers_get_a_job_per_process_or_say_that_it_is_one(
+    toy, monkeypatch, capsys, settings, said
+):
+    monkeypatch.setattr("hydra_plugins.plab_launcher.Plugins", Queue)
+    assert sweep("seed=range(6)", f"hydra.launcher.inner={settings}") == 1
+    assert capsys.readouterr().out.splitlines()[0] == said
+
+
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_full_size_batches_fit_the_memory(device: str) -> None:
     """What :class:`plab.sim.Simulator` will find, computed here without one."""

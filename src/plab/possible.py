@@ -6,10 +6,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
-from plab.config_errors import ConfigError
 from plab.selection import Selection, lookup, same
 from plab.suite import group_names, suite_tasks
-from plab.variants import RANDOM
 
 __all__ = ["require_possible"]
 
@@ -51,6 +49,9 @@ def require_possible(chosen: Selection, found: Iterable[_Run]) -> None:
 
 def _attempts(key: str, text: str, choices: Mapping[str, Sequence[str]]) -> list[list[str]]:
     """Return overrides of which some have to compose; none where only the user's own files could say."""
+    # Imported here: who chooses nothing should not have to wait for Hydra.
+    from plab.variants import RANDOM
+
     tasks, methods = choices.get("task", suite_tasks()), choices.get("method", group_names("method"))
     word = _word(key, text)
     if key == "variant" or key.startswith("task."):
@@ -63,7 +64,6 @@ def _attempts(key: str, text: str, choices: Mapping[str, Sequence[str]]) -> list
 
 
 def _word(key: str, text: str) -> str:
-    # Imported here: who chooses nothing should not have to wait for Hydra.
     from hydra.errors import HydraException
 
     from plab.words import parse, quoted
@@ -81,7 +81,7 @@ def _require_composed(attempts: Sequence[list[str]]) -> None:
     Raises:
         ConfigError: If none can: what is wrong with the one that came closest.
     """
-    from plab.config import load_config
+    from plab.config import ConfigError, load_config
 
     errors = []
     for words in attempts:

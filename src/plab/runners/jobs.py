@@ -66,6 +66,9 @@ class Job:
         if isinstance(error, ResultsError):
             # The file itself is what failed: nothing more can be written to it.
             return
+        if isinstance(error, USER_ERRORS) and not len(self.run.result.iterations):
+            # Nothing has been computed that a file could keep.
+            return
         try:
             foreseen = isinstance(error, (RunError, *USER_ERRORS))
             self.run.close("failed", str(error) if foreseen else describe(error))
