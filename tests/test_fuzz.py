@@ -11,7 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
-from hydra_plugins.plab_launcher import BatchSweeper
 from plab.checks import check_sources
 from plab.config import GROUPS, Config, choices, load_config
 from plab.errors import PlabError
@@ -19,6 +18,7 @@ from plab.report.collect import collect
 from plab.run import main
 from plab.selection import select
 from plab.status import NAMES, survey
+from refusals import plugin
 
 FEW, MANY = 200, 2000
 """Cases that are tried each time, and in the slow tests."""
@@ -240,7 +240,7 @@ def test_any_command_line_of_a_sweep(
     count: int, seen: list[Config], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Nothing is to be written to folders that chance names.
-    monkeypatch.setattr(BatchSweeper, "_note", lambda self: None)
+    monkeypatch.setattr(plugin().BatchSweeper, "_note", lambda self: None)
 
     @trying(count // 4)
     @given(commands)

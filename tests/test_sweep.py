@@ -20,6 +20,7 @@ from plab.run import main
 from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
+from refusals import plugin
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -297,7 +298,7 @@ def test_batch_size_must_be_positive(capsys) -> None:
 
 
 class Queue:
-    """A launcher of other processes, from which nobody hears again; it stands for Hydra's list of them, too."""
+    """A launcher of other processes, of which nobody hears again; it stands for Hydra's list of them, too."""
 
     @classmethod
     def instance(cls) -> Queue:
@@ -321,7 +322,7 @@ class Queue:
 def test_other_launchers_get_a_job_per_process_or_say_that_it_is_one(
     toy, monkeypatch, capsys, settings, said
 ):
-    monkeypatch.setattr("hydra_plugins.plab_launcher.Plugins", Queue)
+    monkeypatch.setattr(plugin(), "Plugins", Queue)
     assert sweep("seed=range(6)", f"hydra.launcher.inner={settings}") == 1
     assert capsys.readouterr().out.splitlines()[0] == said
 
