@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -16,6 +17,9 @@ from plab.tally import Outcome
 from refusals import ending, refusal, snapshot
 from scheduling import pytest_xdist_make_scheduler  # noqa: F401
 from suite import DEVICE
+
+# A bug is to be seen as what it is, also by the processes that tests start: the last net counts as a failure.
+os.environ["PLAB_TRACEBACK"] = "1"
 
 
 @pytest.fixture(scope="session")

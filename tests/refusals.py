@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import ModuleType
 
-__all__ = ["ending", "refusal", "snapshot"]
+from hydra.core.plugins import Plugins
+
+__all__ = ["ending", "plugin", "refusal", "snapshot"]
+
+
+def plugin() -> ModuleType:
+    """plab's plugin as Hydra has it, which executes its file anew when it looks for plugins."""
+    Plugins.instance()
+    return sys.modules["hydra_plugins.plab_launcher"]
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:

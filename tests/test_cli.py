@@ -206,14 +206,39 @@ def test_ctrl_c(monkeypatch, capsys):
     assert capsys.readouterr().err == "plab: stopped: run the same command again to resume\n"
 
 
-@pytest.mark.parametrize("error", [RuntimeError, ValueError, OSError, KeyError])
-def test_a_bug_keeps_its_traceback(monkeypatch, error):
+@pytest.mark.parametrize("error", [RuntimeError, ValueError, KeyError, RecursionError])
+def test_a_bug_is_one_line_or_its_traceback(monkeypatch, capsys, error):
     def fail(cfg: Config, cache: SimulatorCache) -> float:
         raise error("a bug")
 
     monkeypatch.setattr("plab.runners.run_config", fail)
     with pytest.raises(error, match="a bug"):
         main([])
+    monkeypatch.delenv("PLAB_TRACEBACK")
+    line = fail.__code__.co_firstlineno + 1
+    assert main([]) == 70
+    assert capsys.readouterr().err == (
+        f"plab: a bug of plab: {error.__name__} in test_cli.py, line {line}: {error('a bug')}; please report "
+        "it to plab's maintainers, with the command and what it prints with PLAB_TRACEBACK=1\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (MemoryError(), "this computer has too little memory for that: close something, or ask for less"),
+        (MemoryError("Unable to allocate 7 GiB"), "Unable to allocate 7 GiB"),
+        (PermissionError(13, "Permission denied", "a.h5"), "cannot write a.h5: Permission denied"),
+    ],
+    ids=repr,
+)
+def test_a_lack_is_no_bug(monkeypatch, capsys, error, line):
+    def fail(cfg: Config, cache: SimulatorCache) -> float:
+        raise error
+
+    monkeypatch.setattr("plab.runners.run_config", fail)
+    assert main([]) == 2
+    assert capsys.readouterr().err == f"plab: {line}\n"
 
 
 def test_the_process_is_left_as_it_was(seen, monkeypatch):

@@ -154,7 +154,8 @@ def test_command_line(folder: Path, tmp_path: Path, capsys) -> None:
     assert main(["unpack", archive, "--output", str(tmp_path / "out")]) == 0
     assert main(["check", str(tmp_path / "out"), archive]) == 0
     for wrong, message in (
-        (["pack", str(folder), "task=Nothing", "--output", archive], "nothing to pack"),
+        (["pack", str(folder), "task=Nothing", "--output", archive], "task 'Nothing' does not exist"),
+        (["pack", str(folder), "seed=77", "--output", archive], "nothing to pack"),
         (["pack", str(folder), "tusk=Rope", "--output", archive], "choose from: task"),
         (["pack", str(folder), "--output", "all.zip"], "ends in .plab.zip"),
         (["pack", str(tmp_path / "none"), "--output", archive], "does not exist"),

@@ -18,7 +18,7 @@ import synthetic
 from plab import run, status
 from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
-from plab.command import answered
+from plab.command import command_line
 from plab.demonstrations import __main__ as demonstrations
 from plab.render import __main__ as render
 from plab.render import graphics
@@ -54,6 +54,21 @@ def name_of(value: object) -> str:
     return " ".join(value) if isinstance(value, list) else str(getattr(value, "__module__", value))
 
 
+IMPOSSIBLE = (
+    "task=Ropee",
+    "task=glob(Z*)",
+    "variant=9",
+    "method=foo",
+    "method.episodes=many",
+    "seed=x",
+    "seed=-1",
+    "seed=range(0)",
+    "seed=range(1e9)",
+    "sim.nope=1",
+    "+seed=1",
+)
+"""Words that no run can be chosen by."""
+
 TOOLS = [
     (results.main, []),
     (results.main, ["mend"]),
@@ -68,6 +83,12 @@ TOOLS = [
     (status.main, [".", "seed=range(3"]),
     (status.main, [".", "--json", "--csv"]),
     (status.main, [".", "--yaml"]),
+    *((status.main, [".", word]) for word in IMPOSSIBLE),
+    (status.main, [""]),
+    (results.main, ["pack", ".", "task=Ropee", "--output", "a.plab.zip"]),
+    (results.main, ["pack", ".", "status=done", "--output", "a.plab.zip"]),
+    (results.main, ["pack", ".", "--output", ""]),
+    (results.main, ["check", ""]),
     (report.main, []),
     (report.main, ["graphs"]),
     (report.main, ["tables", "--results", "example", "seed=range(3"]),
@@ -78,6 +99,9 @@ TOOLS = [
     (report.main, ["notebooks", "--results", "nowhere"]),
     (report.main, ["tables", "--results", "nowhere", "--speed", "nowhere.csv"]),
     (report.main, ["tables", "--out"]),
+    (report.main, ["tables", "--results", ".", "--out", ""]),
+    (report.main, ["tables", "--results", ""]),
+    *((report.main, ["tables", "--results", "example", word]) for word in IMPOSSIBLE),
     (render.main, []),
     (render.main, ["nowhere.h5"]),
     (render.main, ["a.h5", "b.h5"]),
@@ -87,6 +111,11 @@ TOOLS = [
     (render.main, ["task=Rope", "--output", "a.avi"]),
     (render.main, ["task=Rope", "--size", "0x0"]),
     (render.main, ["task=Rope", "--size", "wide"]),
+    (render.main, ["task=Rope", "--size", "100000x100000"]),
+    (render.main, ["task=Rope", "--output", ""]),
+    (render.main, ["task=Rope", "seed=3"]),
+    (render.main, ["task=Rope", "method=sac"]),
+    (render.main, ["task=Rope", "targets.source=nowhere"]),
     (render.main, ["task=Rope", "--every", "0"]),
     (render.main, ["task=Rope", "--every", "x"]),
     (render.main, ["task=Rope", "--config-dir", "nowhere"]),
@@ -101,6 +130,12 @@ TOOLS = [
     (targets.main, ["--task", "Rope", "sim.grid_size=7"]),
     (targets.main, ["--task", "Rope", "--csv", "."]),
     (targets.main, ["--colour"]),
+    (targets.main, ["--task", "Rope", "seed=3"]),
+    (targets.main, ["--task", "Rope", "method.lr=0.1"]),
+    (targets.main, ["--task", "Rope", "--rebuild", "targets.source=files"]),
+    (targets.main, ["--task", "Rope", "targets.source=nowhere"]),
+    (targets.main, ["--task", "Rope", "targets.source="]),
+    (targets.main, ["--task", "Rope", "--csv", ""]),
     (demonstrations.main, ["--task", "Nope"]),
     (demonstrations.main, ["--task", "Move", "variant=2"]),
     (demonstrations.main, ["--task", "Move", "sim.grid_size=x"]),
@@ -110,6 +145,12 @@ TOOLS = [
     (demonstrations.main, ["--search", "--seed", "-1"]),
     *((demonstrations.main, ["--search", f"--lr={given}"]) for given in ("", "x", "0", "-1", "nan", "0.1,")),
     (demonstrations.main, ["--markdown", "."]),
+    (demonstrations.main, ["--task", "Move", "method.lr=3"]),
+    (demonstrations.main, ["--task", "Move", "seed=3"]),
+    (demonstrations.main, ["--task", "Move", "--lr", "0.1"]),
+    (demonstrations.main, ["--task", "Move", "--search", "method.lr=3"]),
+    (demonstrations.main, ["--task", "Move", "--search", "method=sac"]),
+    (demonstrations.main, ["--search", "--task", "Torus"]),
     (speed.main, ["--task", "Nope"]),
     (speed.main, ["seed=[1"]),
     (speed.main, ["--device", "gpu"]),
@@ -154,7 +195,13 @@ SAID = {
     (results.main, "unpack", "nowhere.plab.zip", "--output", "b"): "nowhere.plab.zip does not exist",
     (results.main, "unpack"): "required: archive",
     (report.main,): "required: what",
-    (report.main, "html", "--results", "example", "task=Nope"): "no finished runs to show",
+    (report.main, "html", "--results", "example", "task=Nope"): "task 'Nope' does not exist",
+    (results.main, "pack", ".", "task=Ropee", "--output", "a.plab.zip"): "did you mean Rope",
+    (results.main, "pack", ".", "status=done", "--output", "a.plab.zip"): "choose from: running, finished",
+    (status.main, ".", "sim.nope=1"): "unknown key 'sim.nope'",
+    (report.main, "tables", "--results", "example", "sim.nope=1"): "unknown key 'sim.nope'",
+    (targets.main, "--task", "Rope", "--rebuild", "targets.source=files"): "--rebuild has no effect with",
+    (demonstrations.main, "--task", "Move", "--lr", "0.1"): "--lr has no effect without --search",
     (report.main, "tables", "--results", "nowhere", "--speed", "nowhere.csv"): "nowhere does not exist",
     (render.main,): "say what to draw",
     (render.main, "task=Rope", "--contact-sheet", "a.png"): "leave out 'task=Rope'",
@@ -209,10 +256,11 @@ def test_results_where_none_can_be_written(refused, tmp_path):
     ids=str,
 )
 def test_what_goes_wrong_on_the_way_is_one_line(capsys, error, line):
-    def run():
+    @command_line
+    def run(argv):
         raise error
 
-    assert answered(run) == 2
+    assert run([]) == 2
     assert capsys.readouterr().err == f"plab: {line}\n"
 
 

@@ -20,6 +20,7 @@ from plab.run import main
 from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
+from refusals import plugin
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -294,6 +295,36 @@ def test_batches_are_as_large_as_allowed_and_even() -> None:
 def test_batch_size_must_be_positive(capsys) -> None:
     assert sweep("seed=0,1", "hydra.launcher.batch_size=0") == 2
     assert "hydra.launcher.batch_size must be at least 1 or null, not 0" in capsys.readouterr().err
+
+
+class Queue:
+    """A launcher of other processes, of which nobody hears again; it stands for Hydra's list of them, too."""
+
+    @classmethod
+    def instance(cls) -> Queue:
+        return cls()
+
+    def instantiate_launcher(self, **settings: object) -> Queue:
+        return self
+
+    def launch(self, jobs: object, initial_job_idx: int) -> object:
+        raise RuntimeError("nobody is there")
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("{_target_:queue}", "6 runs go to Queue in 1 jobs; hydra.launcher.batch_size=1 makes a job of each"),
+        ("{_target_:queue,n_jobs:2}", "6 runs go to Queue in 2 jobs"),
+        ("{_target_:queue,n_jobs:99}", "6 runs go to Queue in 6 jobs"),
+    ],
+)
+def test_other_launchers_get_a_job_per_process_or_say_that_it_is_one(
+    toy, monkeypatch, capsys, settings, said
+):
+    monkeypatch.setattr(plugin(), "Plugins", Queue)
+    assert sweep("seed=range(6)", f"hydra.launcher.inner={settings}") == 1
+    assert capsys.readouterr().out.splitlines()[0] == said
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])

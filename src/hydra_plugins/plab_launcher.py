@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.types import Glob
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -26,10 +29,74 @@ __all__ = ["BatchLauncher", "BatchSweeper"]
 
 
 class BatchSweeper(BasicSweeper):
-    """Hydra's own sweeper, but for the check of all jobs, which the launcher does much faster."""
+    """Hydra's own sweeper, which counts the jobs before it makes them, and leaves the check of all of them to
+    the launcher, which is much faster."""
 
-    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
-        """Leave it to :class:`BatchLauncher`."""
+    def __init__(self, max_batch_size: int | None, params: dict[str, Any] | None = None) -> None:
+        """Keep the settings.
+
+        Args:
+            max_batch_size: Jobs that go to the launcher at a time, at most; all if None.
+            params: Values of keys, as on the command line.
+
+        Raises:
+            plab.config.ConfigError: If they are of the wrong type.
+        """
+        from plab.config import ConfigError
+
+        if max_batch_size is not None and (type(max_batch_size) is not int or max_batch_size < 1):
+            raise ConfigError(
+                f"hydra.sweeper.max_batch_size must be at least 1 or null, not {max_batch_size}"
+            )
+        if params is not None and not isinstance(params, dict | DictConfig):
+            raise ConfigError(f"hydra.sweeper.params must be keys with their values, not {params}")
+        super().__init__(max_batch_size, params)
+
+    def _parse_config(self) -> list[str]:
+        from plab.words import quote_folders
+
+        return quote_folders(super()._parse_config())
+
+    def sweep(self, arguments: list[str]) -> Any:
+        """Run the sweep.
+
+        Raises:
+            plab.config.ConfigError: If it has no jobs, or too many.
+        """
+        from plab.config import ConfigError
+        from plab.words import parse, require_few
+
+        assert self.hydra_context is not None and self.launcher is not None
+        loader = self.hydra_context.config_loader
+        # As in Hydra's own: what is given last counts.
+        given = {one.get_key_element(): one for one in parse([*self._parse_config(), *arguments])}
+        for one in given.values():
+            one.config_loader = loader
+            if isinstance(one.value(), Glob) and not list(one.sweep_string_iterator()):
+                raise ConfigError(f"'{one.input_line}' matches nothing: there is nothing to run")
+        require_few(list(given.values()))
+        if isinstance(self.launcher, BatchLauncher):
+            self.launcher.note = self._note
+        else:
+            self._note()
+        done: list[Sequence[JobReturn]] = []
+        for jobs in self.split_arguments(list(given.values()), self.max_batch_size):
+            done.append(self.launcher.launch(jobs, initial_job_idx=sum(map(len, done))))
+            for job in done[-1]:
+                # Raises what has ended a job of another launcher.
+                _ = job.return_value
+        return done
+
+    def _note(self) -> None:
+        """Write what the sweep is, as Hydra's own does."""
+        from plab.config import ConfigError
+
+        assert self.config is not None
+        if not self.config.hydra.sweep.dir.strip():
+            raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
+        folder = Path(self.config.hydra.sweep.dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, folder / "multirun.yaml")
 
 
 class BatchLauncher(Launcher):
@@ -37,6 +104,9 @@ class BatchLauncher(Launcher):
 
     How they ended is noted in the :class:`plab.tally.Tally` that the task function has as ``tally``:
     Hydra gives a launcher no other way to tell the command line.
+
+    Attributes:
+        note: Writes what the sweep is; called once there is something to run.
     """
 
     def __init__(self, batch_size: int | None, inner: DictConfig | None, on_gpus: bool) -> None:
@@ -49,6 +119,7 @@ class BatchLauncher(Launcher):
             on_gpus: Whether a process for each GPU does.
         """
         self._size, self._inner, self._on_gpus = batch_size, inner, on_gpus
+        self.note: Callable[[], None] = lambda: None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Take what Hydra gives to launchers."""
@@ -64,8 +135,17 @@ class BatchLauncher(Launcher):
         from plab.sweep.gpus import carry_on, gpus
         from plab.tally import Outcome, Tally
 
-        if self._size is not None and self._size < 1:
+        if self._size is not None and (type(self._size) is not int or self._size < 1):
             raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")
+        if not isinstance(self._on_gpus, bool):
+            raise ConfigError(f"hydra.launcher.on_gpus must be true or false, not {self._on_gpus}")
+        if self._inner is not None and (
+            not isinstance(self._inner, DictConfig) or "_target_" not in self._inner
+        ):
+            raise ConfigError(
+                "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, as by "
+                "hydra/launcher=batch_joblib"
+            )
         entries = compose_jobs(job_overrides, self._compose)
         refused = [entry for entry in entries if isinstance(entry, Refused)]
         if len(refused) == len(entries) and len({entry.reason for entry in refused}) == 1:
@@ -76,6 +156,7 @@ class BatchLauncher(Launcher):
         carry, processes = carry_here, 1
         if self._inner is not None:
             carry = self._carry_elsewhere({paths[n]: job_overrides[n] for n in cfgs})
+            processes = _processes(self._inner)
         else:
             for cfg in cfgs.values():
                 check_device(cfg)
@@ -83,6 +164,8 @@ class BatchLauncher(Launcher):
         if self._on_gpus:
             names = gpus()
             carry, processes = carry_on(names), len(names)
+        if cfgs:
+            self.note()
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]
@@ -113,7 +196,8 @@ class BatchLauncher(Launcher):
             # A job composes the configuration of its first run and then computes the whole batch.
             jobs = [overrides[str(result_path(batch[0]))] for batch in batches]
             runs, name = sum(len(batch) for batch in batches), type(inner).__name__
-            print(f"{runs} runs go to {name} in {len(batches)} jobs", flush=True)
+            alone = "; hydra.launcher.batch_size=1 makes a job of each" if runs > len(batches) == 1 else ""
+            print(f"{runs} runs go to {name} in {len(batches)} jobs{alone}", flush=True)
             try:
                 with passed_on():
                     returns = inner.launch(jobs, initial_job_idx=0)
@@ -126,6 +210,15 @@ class BatchLauncher(Launcher):
             yield from outcomes
 
         return carry
+
+
+def _processes(inner: DictConfig) -> int:
+    """Return how many processes another launcher starts at a time, as far as its settings tell."""
+    wanted = inner.get("n_jobs", 1)
+    if type(wanted) is not int or wanted == 0:
+        return 1
+    # As joblib counts: -1 is one for each core.
+    return wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
 
 
 def _job_return(value: Any) -> JobReturn:

@@ -7,7 +7,9 @@ from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["positive", "rates", "refuse_task", "seed", "to_write", "told"]
+from plab.errors import ArgumentError
+
+__all__ = ["folder", "positive", "rates", "refuse_task", "seed", "sources_and_words", "to_write", "told"]
 
 
 def positive(text: str) -> int:
@@ -35,18 +37,40 @@ def rates(text: str) -> list[float]:
     return numbers
 
 
+def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Tell folders and archives from words that choose among their runs, as ``task=Rope`` does.
+
+    Returns:
+        The folders, those that are there with an equals sign in their names included, and the words.
+
+    Raises:
+        ArgumentError: If the name of a folder is empty.
+    """
+    if not all(argument.strip() for argument in arguments):
+        raise ArgumentError("the name of a folder is empty: give one, or . for this one")
+    words = [argument for argument in arguments if "=" in argument and not os.path.exists(argument)]
+    return [argument for argument in arguments if argument not in words], words
+
+
+def folder(text: str) -> Path:
+    """Read the name of a folder: an empty one would be the working directory."""
+    if not text.strip():
+        raise ArgumentTypeError("is empty: give the name of a folder, or . for this one")
+    return Path(text)
+
+
 def to_write(text: str) -> Path:
     """Read the name of a file that can be written: hours of work should not end in none.
 
     Folders above it that are not there yet are for whoever writes it to make.
     """
-    path = Path(text)
+    path = folder(text)
     # Of pathlib's `exists` some versions raise where a folder may not be searched.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
-    folder = there.is_dir()
-    if (there == path) == folder:
-        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if folder else 'no'} folder")
-    needed = os.W_OK | os.X_OK if folder else os.W_OK
+    is_folder = there.is_dir()
+    if (there == path) == is_folder:
+        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if is_folder else 'no'} folder")
+    needed = os.W_OK | os.X_OK if is_folder else os.W_OK
     if not os.access(there, needed, effective_ids=os.access in os.supports_effective_ids):
         raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
     return path

@@ -1,38 +1,123 @@
-"""What command lines that simulate answer to mistakes: one line."""
+"""What all command lines have in common: how a mistake, a closed pipe, Ctrl-C and a bug are answered."""
 
 from __future__ import annotations
 
+import functools
+import os
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar, cast
 
 from plab.arguments import told
-from plab.config import ConfigError
-from plab.results import ResultsError
-from plab.scene import SceneError
-from plab.sim import DeviceError, SimulationError
-from plab.targets import TargetError
+from plab.errors import PlabError
 
-__all__ = ["answered"]
+__all__ = [
+    "EXIT_BROKEN_PIPE",
+    "EXIT_BUG",
+    "EXIT_INTERRUPTED",
+    "EXIT_USER_ERROR",
+    "TRACEBACK",
+    "command_line",
+    "complain",
+    "out_of_memory",
+    "traceback_wanted",
+]
 
 EXIT_USER_ERROR = 2
+EXIT_BUG = 70
+"""As sysexits.h has it, so that no refusal is taken for a bug, and no bug for a refusal."""
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+"""What a shell says of a program that a closed pipe has ended."""
 
-_TOLD = (ConfigError, SceneError, TargetError, DeviceError, SimulationError, ResultsError, MemoryError)
+TRACEBACK = "PLAB_TRACEBACK"
+"""Variable of the environment that lets a bug through with its traceback."""
+
+Main = TypeVar("Main", bound=Callable[..., int])
 
 
-def answered(run: Callable[[], int]) -> int:
-    """Run what a command line asks for; say in one line what is wrong with it.
+def command_line(main: Main) -> Main:
+    """Let a command line answer what goes wrong in one line.
 
     Args:
-        run: What is asked for; returns its exit code.
+        main: Takes the arguments after the program's name, those of the process if None; returns the exit
+            code.
 
     Returns:
-        This, or 2 for a mistake of the user's.
+        The same; where it raises, it says in one line what, and returns 2 for what the user can put right,
+        130 after Ctrl-C, 141 if nobody reads its output any more, and 70 for a bug. With ``PLAB_TRACEBACK``
+        set, a bug is raised.
     """
+
+    @functools.wraps(main)
+    def answered(argv: Sequence[str] | None = None) -> int:
+        try:
+            code = _exit_code(main, argv)
+            # Not left to Python's end, which could only complain in lines of its own.
+            sys.stdout.flush()
+            return code
+        except BrokenPipeError:
+            _close_output()
+            return EXIT_BROKEN_PIPE
+        except PlabError as error:
+            return complain(str(error))
+        except OSError as error:
+            return complain(told(error))
+        except MemoryError as error:
+            return complain(out_of_memory(error))
+        except KeyboardInterrupt:
+            return complain("stopped", EXIT_INTERRUPTED)
+        except Exception as error:
+            if traceback_wanted():
+                raise
+            return complain(_bug(error), EXIT_BUG)
+
+    return cast(Main, answered)
+
+
+def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
+    """Print a line on standard error; return the exit code."""
+    with suppress(BrokenPipeError):
+        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def out_of_memory(error: MemoryError) -> str:
+    """Return one line about memory that is lacking; Python's own error says nothing."""
+    return str(error) or "this computer has too little memory for that: close something, or ask for less"
+
+
+def traceback_wanted() -> bool:
+    """Whether bugs are to be shown with their tracebacks."""
+    return bool(os.environ.get(TRACEBACK))
+
+
+def _exit_code(main: Callable[..., int], argv: Sequence[str] | None) -> int:
     try:
-        return run()
-    except _TOLD as error:
-        message = str(error)
-    except OSError as error:
-        message = told(error)
-    print(f"plab: {message}", file=sys.stderr)
-    return EXIT_USER_ERROR
+        return main(argv)
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):
+            # Rich's answer to a closed pipe.
+            raise stop.__context__ from None
+        # How argparse leaves, after --help and mistakes.
+        return int(stop.code or 0)
+
+
+def _close_output() -> None:
+    """Let what is still to be printed go nowhere; without a word, as nobody reads it."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _bug(error: Exception) -> str:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(last.filename).name}, line {last.lineno}"
+    return (
+        f"a bug of plab: {type(error).__name__} in {where}: {error}; please report it to plab's maintainers, "
+        f"with the command and what it prints with {TRACEBACK}=1"
+    )

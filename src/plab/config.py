@@ -15,10 +15,10 @@ from typing import Any, cast
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.capacity import check_size
 from plab.config_errors import COMPOSE_ERRORS, ConfigError, explain, pick
 from plab.config_types import (
     CONTACTS,
@@ -44,6 +44,8 @@ from plab.random_variant import draw_variant
 from plab.scene import Scene, vector3
 from plab.suite import conf_folder
 from plab.variants import RANDOM, merge_variant, undone_key, variant_changes
+from plab.words import parse, quote_folders, require_few, shortened, unusable, word_list
+from plab.yaml_files import require_plain
 
 __all__ = [
     "CONTACTS",
@@ -129,10 +131,7 @@ def _check_config_dir(config_dir: str | Path) -> None:
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
-            try:
-                path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError):
-                raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
+            require_plain(path)
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -148,6 +147,7 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
     Raises:
         ConfigError: If an override or a file does not fit.
     """
+    overrides = quote_folders(word_list(overrides))
     surrounding = GlobalHydra.instance().hydra
     try:
         check_overrides(overrides, config_dir)
@@ -157,6 +157,12 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
             composed = compose("config", overrides=[*overrides, *_searchpath(config_dir)])
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
+    except ConfigError:
+        raise
+    except Exception as error:
+        if (reason := unusable(error, overrides)) is None:
+            raise
+        raise ConfigError(reason) from error
     finally:
         GlobalHydra.instance().hydra = surrounding
     return finish(composed, overrides)
@@ -186,16 +192,27 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
     if config_dir is not None:
         _check_config_dir(config_dir)
         search_in(config_dir)
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    parsed = parse(overrides)
+    require_few(parsed)
+    for override in parsed:
         key, text = override.key_or_group, str(override.input_line)
         if not key:
             raise ConfigError(f"cannot read '{text}': write key=value")
-        if override.is_hydra_override() or key.startswith("hydra/"):
+        if override.is_hydra_override():
+            if (
+                key.startswith("hydra/")
+                and not isinstance(override.value(), str)
+                and not override.is_delete()
+            ):
+                raise ConfigError(f"'{text}': name one, such as hydra/launcher=batch_joblib")
             continue
         if override.is_delete():
             raise ConfigError(f"'{text}': keys cannot be removed, only set")
         if key == EXPERIMENT and not override.is_add():
             raise ConfigError(f"'{text}': write +{text.lstrip('+')}")
+        if key == EXPERIMENT and not isinstance(override.value(), str):
+            names = ", ".join(choices(key, config_dir))
+            raise ConfigError(f"'{text}': name one experiment, itself a sweep; choose from: {names}")
         if key in GROUPS and override.package is None:
             if override.is_add() or override.is_force_add():
                 raise ConfigError(f"'{text}': write {text.lstrip('+')}")
@@ -204,7 +221,7 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
                 raise ConfigError(f"'{text}': name one {key}; choose from: {names}")
 
 
-def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
+def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool = True) -> Config:
     """Turn what Hydra composed into a checked configuration.
 
     The chosen variant is merged over the task. The result keeps no other variant: what a run does not use is
@@ -212,7 +229,9 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
 
     Args:
         composed: The composed configuration, without Hydra's own section.
-        overrides: The command line's overrides; one that the variant would undo is an error.
+        overrides: The command line's overrides; one that has no effect is an error.
+        alone: Whether there is no other run, on which an override about another variant, task or profile
+            could have its effect.
 
     Returns:
         The checked configuration.
@@ -225,6 +244,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = ()) -> Config:
         _reject_unknown(composed, "")
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
+        _require_effect(composed, overrides, alone)
         _choose_profile(composed.method)
         _choose_learning_rate(composed.method)
         _choose_numbers(composed, overrides)
@@ -267,10 +287,14 @@ def build_scene(cfg: Config) -> Scene:
         The validated scene.
 
     Raises:
-        ConfigError: If the variant does not exist.
+        ConfigError: If the variant does not exist, or this computer's memory cannot hold the configuration.
         plab.scene.SceneError: If the scene cannot be simulated.
     """
     task, protocol, sim = variant_task(cfg), cfg.protocol, cfg.sim
+    most = max((body.particles for body in task.bodies.values()), default=1)
+    if most * sim.particles_scale < 0.5:
+        least = f"use {0.5 / most:.2g} or more"
+        raise ConfigError(f"sim.particles_scale={sim.particles_scale:g} leaves no particle: {least}")
     scene = Scene(
         name=task.name,
         bodies=tuple(body.build(sim.particles_scale) for body in task.bodies.values()),
@@ -289,6 +313,7 @@ def build_scene(cfg: Config) -> Scene:
         floor=protocol.floor,
     )
     scene.validate()
+    check_size(cfg, scene)
     return scene
 
 
@@ -315,6 +340,28 @@ def _typed_method(method: DictConfig) -> DictConfig:
         has, needs = cast(type, chosen).__name__, wanted.__name__
         raise ConfigError(f"method has the keys of {has}: with its family or algorithm go those of {needs}")
     return method
+
+
+def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool) -> None:
+    """Refuse overrides of what goes with another variant, profile or task than the chosen ones."""
+    task, method, variant = composed.task, composed.method, composed.variant
+    used: dict[str, tuple[str, str | None]] = {}
+    if alone:
+        rates = method.get("lr_by_task") or {}
+        used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
+        used["method.lr_by_task."] = f"task={task.name}", task.name if task.name in rates else "default"
+    if alone or variant == RANDOM:
+        # Of the variants a random one uses that which gives what is not drawn, if any.
+        chosen = task.random.get("variant") if variant == RANDOM else variant
+        used |= dict.fromkeys(("task.variants.", "task.release.variants."), (f"variant={variant}", chosen))
+    for override in parse(overrides):
+        for section, (choice, name) in used.items():
+            key = override.key_or_group
+            if key.startswith(section) and key.removeprefix(section).partition(".")[0] != name:
+                raise ConfigError(f"'{shortened(str(override.input_line))}' has no effect with {choice}")
+        if composed.targets.source is not None and f"{override.key_or_group}.".startswith("task.target."):
+            line = shortened(str(override.input_line))
+            raise ConfigError(f"'{line}' has no effect with targets.source: leave one of them out")
 
 
 def _choose_profile(method: DictConfig) -> None:
@@ -360,7 +407,7 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[str]) -> None:
         return
     if key := undone_key(variant_changes(task, name), overrides):
         raise ConfigError(f"task.{key} is set by variant {name}: override task.variants.{name}.{key}")
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    for override in parse(overrides):
         if override.key_or_group == "seed_scene" or f"{override.key_or_group}.".startswith("task.random."):
             raise ConfigError(f"'{override.input_line}' has no effect without variant=random")
     composed.seed_scene = None

@@ -18,13 +18,15 @@ from omegaconf.errors import (
 )
 from yaml import MarkedYAMLError, YAMLError
 
+from plab.errors import PlabError
+
 __all__ = ["COMPOSE_ERRORS", "ConfigError", "explain", "pick"]
 
-COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError)
+COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
 """What composing a configuration raises where the configuration is wrong."""
 
 
-class ConfigError(ValueError):
+class ConfigError(PlabError, ValueError):
     """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
 
 
@@ -44,7 +46,7 @@ LAUNCHER_EXTRAS = {
 """Launchers of other packages, to the extra of plab that installs them."""
 
 
-def explain(error: HydraException | OmegaConfBaseException | YAMLError) -> str:
+def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:
     """Return one line that says what is wrong with a configuration.
 
     Args:
@@ -53,6 +55,13 @@ def explain(error: HydraException | OmegaConfBaseException | YAMLError) -> str:
     Returns:
         The line, without a full stop.
     """
+    if isinstance(error, RecursionError):
+        return (
+            "the configuration refers to itself, or is nested too deeply: look at defaults, ${...}, brackets"
+        )
+    if isinstance(error.__cause__, ConfigError):
+        # Of plab's launcher or sweeper, which Hydra makes.
+        return str(error.__cause__)
     launcher = re.search(r"Could not (?:load|find) 'hydra/launcher/(\w+)'", str(error))
     if launcher and launcher[1] in LAUNCHER_EXTRAS:
         return f"this launcher is not installed: pip install 'plab[{LAUNCHER_EXTRAS[launcher[1]]}]'"

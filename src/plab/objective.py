@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plab.errors import ArgumentError
+
 __all__ = [
     "OBSERVED_PARTICLES",
     "TARGET_MASS",
@@ -77,11 +79,11 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.nd
     """
     x = np.asarray(x, dtype=np.float64)
     if x.ndim != 2 or x.shape[1] != 3:
-        raise ValueError(f"positions have shape {list(x.shape)}, not [particle, 3]")
+        raise ArgumentError(f"positions have shape {list(x.shape)}, not [particle, 3]")
     scaled = x * n
     # Written so that nan fails it too. Beyond these limits a particle reaches nodes below -1 or above n - 1.
     if not np.all((scaled >= -0.5) & (scaled < n - 1.5)):
-        raise ValueError(
+        raise ArgumentError(
             f"positions outside the grid: each coordinate must be in [{-0.5 / n:.4g}, {1 - 1.5 / n:.4g})"
         )
     base = np.floor(scaled - 0.5)
@@ -116,7 +118,7 @@ def target_sdf(mass: ArrayLike, threshold: float = TARGET_MASS) -> np.ndarray:
     mass = np.asarray(mass, dtype=np.float64)
     outside = ~(mass > threshold)
     if outside.all():
-        raise ValueError(
+        raise ArgumentError(
             f"the target is empty: no node holds more than {threshold:g}, the most is {mass.max():.3g}"
         )
     return distance_transform_edt(outside) / mass.shape[0]
@@ -138,11 +140,11 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
     """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     if a.shape != b.shape:
-        raise ValueError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
+        raise ArgumentError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
     largest_a, largest_b = a.max(initial=0.0), b.max(initial=0.0)
     # Written so that nan fails it too.
     if not (0.0 < largest_a < np.inf and 0.0 < largest_b < np.inf):
-        raise ValueError(
+        raise ArgumentError(
             f"mass tensors need finite mass somewhere: their maxima are {largest_a:g} and {largest_b:g}"
         )
     a, b = a / largest_a, b / largest_b

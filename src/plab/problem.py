@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.config import ConfigError, build_scene, variant_task
+from plab.config import Config, ConfigError, build_scene, variant_task
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -29,11 +29,11 @@ from plab.objective import (
 from plab.sim import Rollout, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, load_release_target
+from plab.words import shortened
 
 if TYPE_CHECKING:
     import torch
 
-    from plab.config import Config
     from plab.scene import Scene
 
 __all__ = ["Episodes", "Problem", "Trials", "build_scenes", "build_simulator", "make_targets"]
@@ -288,7 +288,13 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """Refuse configurations of which one simulator could only follow the first."""
+    if isinstance(cfgs, Config):
+        raise ConfigError("give a list of configurations, one per environment: [cfg]")
+    if not cfgs:
+        raise ConfigError("there is no configuration: give one per environment, as load_config() makes them")
     for number, cfg in enumerate(cfgs):
+        if not isinstance(cfg, Config):
+            raise ConfigError(f"configurations are what load_config() returns, not {shortened(repr(cfg))}")
         for part in ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets"):
             first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
             if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:

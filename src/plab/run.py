@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -22,25 +23,26 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.arguments import told
 from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import help_text
+from plab.command import EXIT_INTERRUPTED, EXIT_USER_ERROR, command_line, complain
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
+from plab.errors import PlabError
 from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
 from plab.targets import TargetError
+from plab.words import quote_folders, shortened, unusable
 
 __all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
-EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 
 _CONFIG_ERRORS = (ConfigError, SceneError, TargetError)
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -52,33 +54,36 @@ def main(argv: Sequence[str] | None = None) -> int:
         Ctrl-C.
     """
     tally = Tally()
+    argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
+    if arguments.help:
+        print(help_text(arguments.config_dir))
+        return 0
     try:
-        argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
-        if arguments.help:
-            print(help_text(arguments.config_dir))
-            return 0
         with _hydra_raises(argv):
             hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(
                 _job(tally)
             )()
     except Refusal as refusal:
-        return _complain(str(refusal), refusal.code)
+        return complain(str(refusal), refusal.code)
     except COMPOSE_ERRORS as error:
-        return _complain(explain(error), EXIT_USER_ERROR)
-    except ConfigError as error:
-        return _complain(str(error), EXIT_USER_ERROR)
-    except (OSError, ValueError) as error:
-        # Before the first job these are Hydra's: flags that exclude each other, a sweep's folder that cannot
-        # be made.
-        if tally.started:
+        if tally.started and isinstance(error, RecursionError):
             raise
-        return _complain(told(error) if isinstance(error, OSError) else str(error), EXIT_USER_ERROR)
+        raise ConfigError(explain(error)) from error
+    except (PlabError, OSError, MemoryError):
+        raise
     except KeyboardInterrupt:
         tally.report()
-        return _complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
-    except SystemExit as stop:
-        # Hydra leaves this way after --version and the like.
-        return stop.code if isinstance(stop.code, int) else 0
+        return complain("stopped: run the same command again to resume", EXIT_INTERRUPTED)
+    except Exception as error:
+        # Before the first job these are Hydra's: flags that exclude each other, settings that it cannot use.
+        if tally.started:
+            raise
+        reason = unusable(error, arguments.overrides)
+        if reason is None and not isinstance(error, ValueError):
+            raise
+        raise ConfigError(reason or str(error)) from error
+    if tally.error is not None:
+        raise tally.error
     return max(tally.code, tally.report())
 
 
@@ -97,7 +102,12 @@ def _job(tally: Tally) -> TaskFunction:
                 # It has to get out of the job's process.
                 raise
             # Not raised: Hydra would add lines of its own.
-            tally.code = _complain(str(refusal), refusal.code)
+            tally.code = complain(str(refusal), refusal.code)
+            return math.nan
+        except Exception as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            tally.error = error
             return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
@@ -109,6 +119,7 @@ def _run(composed: DictConfig, cache: SimulatorCache) -> float:
     """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
     # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
+        _require_sweep(HydraConfig.get())
         cfg = finish(composed, HydraConfig.get().overrides.task)
         check_sources(cfg)
         check_device(cfg)
@@ -125,6 +136,17 @@ def _run(composed: DictConfig, cache: SimulatorCache) -> float:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
 
 
+def _require_sweep(settings: Any) -> None:
+    """Refuse settings of sweeps, of which a single run takes no notice."""
+    of_sweeps = [
+        word for word in settings.overrides.hydra if re.match(r"[+~]*hydra[./](launcher|sweep)", word)
+    ]
+    if settings.mode == RunMode.RUN and of_sweeps:
+        raise ConfigError(
+            f"'{shortened(of_sweeps[0])}' has no effect on a single run: add -m, or leave it out"
+        )
+
+
 def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     """Check the arguments and put them into the order that Hydra reads: overrides, then flags.
 
@@ -134,7 +156,6 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     Raises:
         ConfigError: If a flag does not exist, an override makes no sense or the folder of ``--config-dir``
             does not do.
-        hydra.errors.HydraException: If an override cannot be parsed.
     """
     parser = get_args_parser()
     flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
@@ -149,10 +170,14 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
         raise ConfigError(
             "--package has no effect without --cfg: write --cfg job --package sim, or leave it out"
         )
-    check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
     rest = list(argv)
     for override in arguments.overrides:
         rest.remove(override)
+    arguments.overrides = quote_folders(arguments.overrides)
+    try:
+        check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
+    except COMPOSE_ERRORS as error:
+        raise ConfigError(explain(error)) from error
     return [*arguments.overrides, *rest], arguments
 
 
@@ -171,11 +196,6 @@ def _hydra_raises(argv: list[str]) -> Iterator[None]:
             del os.environ["HYDRA_FULL_ERROR"]
         else:
             os.environ["HYDRA_FULL_ERROR"] = before[1]
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"plab: {' '.join(message.split())}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plab.errors import PlabError
+
 __all__ = [
     "CHOICES",
     "MANIPULATOR_SHAPES",
@@ -28,6 +30,12 @@ __all__ = [
 
 CHOICES = ("plab", "release")
 """Whose way something is done: plab's own, or that of the PlasticineLab release."""
+
+STIFFEST = 1e-12
+"""Time step [s] below which no scene can be simulated in anybody's life."""
+
+SHORTEST = 1e-6
+"""Shortest time step, as a share of the longest that is stable: what moves less is lost in rounding."""
 
 Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -48,7 +56,7 @@ def vector3(values: Sequence[float]) -> Vec3:
     return x, y, z
 
 
-class SceneError(ValueError):
+class SceneError(PlabError, ValueError):
     """A scene that cannot be simulated; the message says why and which value would do."""
 
 
@@ -279,12 +287,22 @@ class Scene:
         _require(self.yield_stress >= 0, f"yield_stress {self.yield_stress:g} must not be negative")
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
+        _require(
+            self.stable_dt > STIFFEST,
+            f"youngs_modulus {self.youngs_modulus:g} and poisson_ratio {self.poisson_ratio:g} are too stiff "
+            "for any time step: lower them",
+        )
         if self.dt > self.stable_dt:
             steps = math.ceil(self.substeps * self.dt / self.stable_dt)
             raise SceneError(
                 f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of material and grid: "
                 f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
             )
+        _require(
+            self.dt >= SHORTEST * self.stable_dt,
+            f"dt {self.dt:g} is too short for anything to move: use dt >= {SHORTEST * self.stable_dt:.3g}, "
+            f"and at most {self.stable_dt:.3g}",
+        )
         _require(
             self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
         )

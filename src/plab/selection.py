@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "select"]
+from plab.errors import PlabError
+
+if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
+
+__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "same", "select"]
 
 
-class SelectionError(ValueError):
+class SelectionError(PlabError, ValueError):
     """Words that select nothing meaningful; the message is one line that says what would do."""
 
 
@@ -34,7 +39,7 @@ class Selection:
             config: Its configuration.
         """
         return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
-            any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
+            any(same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
         )
 
 
@@ -51,25 +56,50 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     if not words:
         return Selection()
     # Imported here: without words nobody should have to wait for Hydra.
-    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
+
+    from plab.words import parse, shortened
 
     choices: dict[str, list[str]] = {}
     keys: dict[str, list[str]] = {}
     for word in words:
         try:
-            (override,) = OverridesParser.create().parse_overrides([word])
+            (override,) = parse([word])
+            name = override.key_or_group
+            if "." not in name and name not in names:
+                raise SelectionError(
+                    f"'{shortened(word)}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
+                )
+            (keys if "." in name else choices)[name] = _texts(override)
         except HydraException:
-            raise SelectionError(f"cannot read '{word}': write name=value or name=value,value") from None
-        name = override.key_or_group
-        if "." not in name and name not in names:
             raise SelectionError(
-                f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
-            )
-        sweep = override.is_sweep_override()
-        texts = list(override.sweep_string_iterator()) if sweep else [str(override.value())]
-        (keys if "." in name else choices)[name] = texts
+                f"cannot read '{shortened(word)}': write name=value or name=value,value"
+            ) from None
     return Selection(choices, keys)
+
+
+def _texts(override: Override) -> list[str]:
+    """Return the values that a word gives, as texts.
+
+    Raises:
+        SelectionError: If it gives none.
+        plab.config.ConfigError: If it gives too many.
+        hydra.errors.HydraException: If its values cannot be enumerated.
+    """
+    from hydra.core.override_parser.types import Glob, OverrideType
+
+    from plab.suite import group_names
+    from plab.words import require_few
+
+    word, value = override.input_line, override.value()
+    if override.type is not OverrideType.CHANGE or override.package is not None:
+        raise SelectionError(f"'{word}' selects nothing: write name=value or name=value,value")
+    if isinstance(value, Glob):
+        if not (texts := value.filter(group_names(override.key_or_group))):
+            raise SelectionError(f"'{word}' matches nothing")
+        return texts
+    require_few([override])
+    return list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(value)]
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
@@ -96,7 +126,7 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def _same(value: Any, text: str) -> bool:
+def same(value: Any, text: str) -> bool:
     """Return whether a configuration's value is what the text says: numbers by value, all else by letter."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower() == text.lower()

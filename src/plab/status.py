@@ -11,6 +11,7 @@ import argparse
 import csv
 import itertools
 import json
+import math
 import sys
 import time
 from collections import Counter
@@ -18,9 +19,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
+from plab.arguments import sources_and_words
+from plab.command import command_line
 from plab.locks import held
+from plab.possible import require_possible
 from plab.results import ResultsError, Row, lookup, row_count
 from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes
@@ -28,6 +32,7 @@ from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
 from plab.selection import Selection, SelectionError, one_protocol, select
 from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
+from plab.tally import MOST_RUNS
 
 __all__ = ["STATES", "Group", "Run", "Survey", "main", "survey"]
 
@@ -151,9 +156,11 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
 
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
-        SelectionError: If there are runs of several protocols.
+        SelectionError: If there are runs of several protocols, or more are asked for than a sweep has.
+        plab.config.ConfigError: If no run can be of the choice.
     """
     found, unreadable = readable_rows(source)
+    require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
     runs = {key: Run(*key) for key in _expected(fitting, chosen)}
@@ -189,8 +196,10 @@ def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[Key]:
         "method": methods or list(PAPER_METHODS),
         "seed": sorted(present["seed"], key=int) or list(PAPER_SEEDS),
     }
-    task, variant, method, seed = (chosen.choices.get(name, open_choices[name]) for name in NAMES)
-    return itertools.product(task, variant, method, seed)
+    asked = [chosen.choices.get(name, open_choices[name]) for name in NAMES]
+    if (count := math.prod(map(len, asked))) > MOST_RUNS:
+        raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
+    return cast(Iterable[Key], itertools.product(*asked))
 
 
 def _key(row: Row) -> Key:
@@ -390,6 +399,7 @@ def _csv(found: Survey) -> None:
         writer.writerow(values.pop("counts") | values)
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
@@ -399,15 +409,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     form.add_argument("--json", action="store_true", help="print everything, for scripts")
     form.add_argument("--csv", action="store_true", help="print the table, for scripts")
     options = parser.parse_intermixed_args(argv)
-    words = [argument for argument in options.arguments if "=" in argument]
-    sources = [argument for argument in options.arguments if "=" not in argument] or ["results"]
-    try:
-        if len(sources) > 1:
-            raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
-        found = survey(sources[0], select(words, NAMES))
-    except (ResultsError, SelectionError) as error:
-        print(f"plab: {error}", file=sys.stderr)
-        return 2
+    sources, words = sources_and_words(options.arguments)
+    if len(sources) > 1:
+        raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
+    found = survey(sources[0] if sources else "results", select(words, NAMES))
     if options.json:
         print(json.dumps(_json(found), indent=1))
     elif options.csv:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-__all__ = ["PAPER_METHODS", "PAPER_SEEDS", "SUITE_VARIANTS", "conf_folder", "suite_tasks", "task_list"]
+__all__ = [
+    "PAPER_METHODS",
+    "PAPER_SEEDS",
+    "SUITE_VARIANTS",
+    "conf_folder",
+    "group_names",
+    "suite_tasks",
+    "task_list",
+]
 
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
@@ -34,9 +42,14 @@ def conf_folder() -> Path:
     )
 
 
+def group_names(group: str) -> list[str]:
+    """Return the names of plab's own files of a group, such as ``method``; none where there is no such."""
+    return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
+
+
 def suite_tasks() -> list[str]:
     """Return the names of plab's own tasks, those of the files in ``conf/task``."""
-    return sorted(path.stem for path in (conf_folder() / "task").glob("*.yaml"))
+    return group_names("task")
 
 
 def task_list(text: str) -> list[str]:

@@ -7,7 +7,10 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 
-__all__ = ["Outcome", "Refusal", "Tally"]
+__all__ = ["MOST_RUNS", "Outcome", "Refusal", "Tally"]
+
+MOST_RUNS = 100_000
+"""Runs of a sweep, at most: to compose more would take hours."""
 
 _UNFINISHED = {
     "failed": "failed",
@@ -65,11 +68,13 @@ class Tally:
     Attributes:
         started: Whether there has been a configuration to run.
         code: Exit code of a single run.
+        error: What has ended a single run, where nobody foresaw it.
         outcomes: How the runs of a sweep ended.
     """
 
     started: bool = False
     code: int = 0
+    error: Exception | None = None
     outcomes: list[Outcome] = field(default_factory=list)
 
     def report(self) -> int:

@@ -30,7 +30,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive
+from plab.arguments import folder, positive
 from plab.bench.common_scene import (
     ANY_SCENE,
     common_actions,
@@ -41,7 +41,7 @@ from plab.bench.common_scene import (
 )
 from plab.bench.precision import angle
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
@@ -377,6 +377,7 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
             }
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write the table and the diagrams; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.accuracy", description=__doc__.splitlines()[0])
@@ -389,14 +390,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "particles per environment (10000; 1000 with --quick)"
     parser.add_argument("--particles", type=positive, help=what)
     parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
-    parser.add_argument("--output", type=Path, default=Path("accuracy"), help="folder of what is written")
+    parser.add_argument("--output", type=folder, default=Path("accuracy"), help="folder of what is written")
     options = parser.parse_args(argv)
     tasks = options.task or (QUICK_TASKS if options.quick else TASKS)
     if unknown := set(tasks) - set(TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
     plan = QUICK if options.quick else Plan()
     plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
-    return answered(lambda: _run(tasks, plan, options.output))
+    return _run(tasks, plan, options.output)
 
 
 def _run(tasks: Sequence[str], plan: Plan, output: Path) -> int:

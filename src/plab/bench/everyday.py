@@ -25,7 +25,7 @@ import plab
 from plab.arguments import positive, to_write
 from plab.bench.results import SETTLE, write_runs
 from plab.bench.table import progress, report
-from plab.command import answered
+from plab.command import command_line
 
 __all__ = ["COLUMNS", "THINGS", "main", "measure"]
 
@@ -118,6 +118,7 @@ def _children() -> float:
     return used.ru_utime + used.ru_stime
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.everyday", description=__doc__.splitlines()[0])
@@ -132,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.against is not None and not (options.against / "plab" / "__init__.py").is_file():
         parser.error(f"--against: {options.against} holds no package plab; name a source tree's src")
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

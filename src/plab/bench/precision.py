@@ -22,7 +22,7 @@ import pandas as pd
 from plab.arguments import positive, to_write
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, grid_terms, own_components
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
@@ -173,6 +173,7 @@ def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
             }
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write the files asked for; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.precision", description=__doc__.splitlines()[0])
@@ -182,7 +183,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
     options = parser.parse_args(argv)
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -31,7 +31,7 @@ from plab.arguments import positive, to_write
 from plab.bench.common_scene import ANY_SCENE, grid_terms
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
 from plab.sim import Simulator, particle_phases
@@ -196,6 +196,7 @@ def _row(start: Start, kind: str, ours: np.ndarray, theirs: np.ndarray) -> dict[
     return row
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.release", description=__doc__.splitlines()[0])
@@ -204,12 +205,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--choice", nargs="+", choices=CHOICES, default=list(CHOICES), help="only these")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
-
-    def run() -> int:
-        report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
-        return 0
-
-    return answered(run)
+    report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
+    return 0
 
 
 if __name__ == "__main__":

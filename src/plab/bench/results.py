@@ -16,7 +16,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ import pandas as pd
 
 from plab.arguments import positive, to_write
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.config import load_config
 from plab.families import family
 from plab.objective import scores_from_iou
@@ -168,7 +168,8 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
     yield timed("archive again", lambda: load(archive))
 
 
-def main(argv: list[str] | None = None) -> int:
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.results", description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=positive, default=5000, help="number of result files")
@@ -176,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -31,7 +31,7 @@ from stable_baselines3.common.logger import Logger
 
 from plab.arguments import positive, to_write
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.config import Config, PpoConfig, load_config
 from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
@@ -215,7 +215,8 @@ def _config(overrides: list[str], method: str, num_envs: int, batches: int, *, w
     return cfg
 
 
-def main(argv: list[str] | None = None) -> int:
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.rl", description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -228,7 +229,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

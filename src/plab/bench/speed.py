@@ -37,7 +37,7 @@ from plab.bench.workload import (
     restart_peak_rss,
     time_calls,
 )
-from plab.command import answered
+from plab.command import command_line
 from plab.config import Config, load_config
 from plab.suite import suite_tasks, task_list
 
@@ -275,6 +275,7 @@ def _run_paper(options: argparse.Namespace) -> None:
         paper.write_markdown(options.markdown, done)
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, measure, print, and write a CSV file if asked to.
 
@@ -286,7 +287,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         user's.
     """
     options = _options(argv)
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from plab.arguments import positive, to_write
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
-from plab.command import answered
+from plab.command import command_line
 from plab.config import ConfigError
 from plab.losses import make_terms
 from plab.scene import SceneError
@@ -196,6 +196,7 @@ def _speeds(simulator: Simulator, cases: Sequence[Case]) -> np.ndarray:
     return fastest[: len(cases)]
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.bench.stability", description=__doc__.splitlines()[0])
@@ -208,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "file for the gradient's norm per step back in time"
     parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
-    return answered(lambda: _run(options))
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:

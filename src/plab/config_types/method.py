@@ -13,6 +13,7 @@ from plab.config_types.ranges import (
     one_of,
     positive,
     share,
+    threads,
     unit,
     vector,
     widths,
@@ -136,7 +137,7 @@ class ApgConfig(MethodConfig):
         positive(f"{path}.lr", self.lr)
         at_least(f"{path}.iterations", self.iterations, 1)
         widths(f"{path}.hidden", self.hidden)
-        at_least(f"{path}.torch_threads", self.torch_threads, 1)
+        threads(f"{path}.torch_threads", self.torch_threads)
 
 
 @dataclass
@@ -175,8 +176,9 @@ class RlConfig(MethodConfig):
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-        for name in ("episodes", "num_envs", "evaluate_every", "torch_threads"):
+        for name in ("episodes", "num_envs", "evaluate_every"):
             at_least(f"{path}.{name}", getattr(self, name), 1)
+        threads(f"{path}.torch_threads", self.torch_threads)
         one_of(f"{path}.torch_device", self.torch_device, DEVICES)
         positive(f"{path}.lr", self.lr)
         share(f"{path}.gamma", self.gamma)

@@ -14,6 +14,9 @@ from plab.scene import CHOICES
 
 __all__ = ["PRECISIONS", "Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
 
+MOST_MEMORY_MB = 1e9
+"""A petabyte: more is a slip of the unit."""
+
 PRECISIONS = ("float32", "float64")
 
 Method = TypeVar("Method", bound=MethodConfig)
@@ -48,6 +51,10 @@ class SimConfig:
         one_of(f"{path}.precision", self.precision, PRECISIONS)
         one_of(f"{path}.device", self.device, DEVICES)
         positive(f"{path}.memory_mb", self.memory_mb)
+        if self.memory_mb > MOST_MEMORY_MB:
+            raise ConfigError(
+                f"{path}.memory_mb must be at most {MOST_MEMORY_MB:g}, not {self.memory_mb:g}: it is in MB"
+            )
         at_least(f"{path}.grid_size", self.grid_size, 8)
         positive(f"{path}.dt", self.dt)
         at_least(f"{path}.substeps", self.substeps, 1)
@@ -134,10 +141,10 @@ class Config:
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        at_least("seed", self.seed, 0)
-        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if self.seed >= 2**32:
             raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
+        at_least("seed", self.seed, 0)
+        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")
         if self.targets.source is not None and self.seed_scene is not None:

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,14 +23,17 @@ from rich.console import Console
 from rich.table import Table
 
 from plab.arguments import positive, rates, refuse_task, seed, to_write
-from plab.command import answered
+from plab.checks import check_sources
+from plab.command import command_line
 from plab.config import Config, ConfigError, build_scene, load_config
+from plab.config_types import TrajectoryConfig
 from plab.demonstrations import action_names, known_actions, recorded_scores, save_actions
 from plab.demonstrations.search import search
 from plab.objective import Scores
 from plab.problem import Problem
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
 from plab.targets import EPISODE_STEPS
+from plab.words import IDLE, require_effect
 
 HEADING = """\
 # Demonstrations
@@ -40,6 +44,13 @@ to the last motion, "score at rest" is what doing nothing reaches, the IoUs are 
 target, and of the target and itself.
 
 """
+
+
+SEARCH: dict[str, Any] = {"lr": [0.1, 0.03, 0.01], "iterations": 200, "every": 10, "seed": 0}
+"""What ``--search`` does unless told otherwise."""
+
+_NOT_SEARCHED = ("name", "optimizer", "lr", "lr_by_task", "momentum", "max_gradient_norm", "iterations")
+"""Settings of the method that ``--search`` has flags of its own for, or does not use."""
 
 
 @dataclass(frozen=True)
@@ -59,21 +70,27 @@ class Replay:
     idle: Scores
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     args = _parse(argv)
-    return answered(lambda: _run(args))
+    return _run(args)
 
 
 def _run(args: argparse.Namespace) -> int:
     rows = []
-    for task in args.task:
-        cfgs = [
-            load_config([f"task={task}", f"variant={variant}", *args.overrides]) for variant in SUITE_VARIANTS
-        ]
+    tasks = [
+        [load_config([f"task={task}", f"variant={variant}", *args.overrides]) for variant in SUITE_VARIANTS]
+        for task in args.task
+    ]
+    for cfgs in tasks:
+        check_sources(cfgs[0])
+    if args.search:
+        _require_searchable([cfgs[0] for cfgs in tasks])
+    for cfgs in tasks:
         if args.search or args.record:
             _require_own_resolution(cfgs[0])
-        if args.search and "seed" not in cfgs[0].task.target:
+        if args.search and _is_geometric(cfgs[0]):
             _search(cfgs, args)
         replays = replay(cfgs)
         if args.record:
@@ -109,6 +126,25 @@ def _require_own_resolution(cfg: Config) -> None:
         raise ConfigError(
             "demonstrations are recorded at the suite's own resolution: leave out what changes it"
         )
+
+
+def _is_geometric(cfg: Config) -> bool:
+    """Return whether the target is no outcome of a script, whose actions are the demonstration."""
+    return "seed" not in cfg.task.target
+
+
+def _require_searchable(cfgs: Sequence[Config]) -> None:
+    """Refuse a search for what is known, or by a method without Adam's settings."""
+    if not any(map(_is_geometric, cfgs)):
+        names = ", ".join(cfg.task.name for cfg in cfgs)
+        raise ConfigError(
+            f"--search has no effect on {names}: their targets are made by scripts; leave it out"
+        )
+    for cfg in cfgs:
+        if not isinstance(cfg.method, TrajectoryConfig):
+            raise ConfigError(
+                f"--search takes the settings of adam, gd or adam_h: leave out method={cfg.method.name}"
+            )
 
 
 def _search(cfgs: Sequence[Config], args: argparse.Namespace) -> None:
@@ -164,14 +200,20 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
     parser.add_argument("--record", action="store_true", help="record what is replayed")
     parser.add_argument("--search", action="store_true", help="search for better ones (geometric targets)")
-    parser.add_argument(
-        "--lr", type=rates, default=[0.1, 0.03, 0.01], help="learning rates of random starts: 0.1,0.01"
-    )
-    parser.add_argument("--iterations", type=positive, default=200, help="updates of each candidate")
-    parser.add_argument("--every", type=positive, default=10, help="updates between evaluations")
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the first actions")
+    parser.add_argument("--lr", type=rates, help="--search: learning rates of random starts: 0.1,0.01")
+    parser.add_argument("--iterations", type=positive, help="--search: updates of each candidate")
+    parser.add_argument("--every", type=positive, help="--search: updates between evaluations")
+    parser.add_argument("--seed", type=seed, help="--search: seed of the first actions")
     options = parser.parse_intermixed_args(argv)
     refuse_task(parser, options.overrides)
+    given = {name: value for name in SEARCH if (value := getattr(options, name)) is not None}
+    if given and not options.search:
+        parser.error(f"--{next(iter(given))} has no effect without --search: leave it out")
+    vars(options).update(SEARCH | given)
+    idle = tuple(f"method.{key}" for key in _NOT_SEARCHED) if options.search else ("method", "progress")
+    require_effect(
+        options.overrides, (*idle, "seed", *(key for key in IDLE if key != "progress")), "demonstrations"
+    )
     return options
 
 

@@ -13,7 +13,10 @@ import gymnasium
 
 from plab.suite import SUITE_VARIANTS, suite_tasks
 
-__all__ = ["register_suite", "register_task"]
+__all__ = ["ENTRY_POINT", "register_suite", "register_task"]
+
+ENTRY_POINT = "plab.envs.single:PlabEnv"
+"""What Gymnasium makes an environment of plab's with."""
 
 
 def register_suite() -> None:
@@ -35,7 +38,7 @@ def register_task(task: str, variants: Sequence[str] = SUITE_VARIANTS, **kwargs:
         env_id = f"plab/{task}-v{variant}"
         gymnasium.register(
             env_id,
-            entry_point="plab.envs.single:PlabEnv",
+            entry_point=ENTRY_POINT,
             vector_entry_point="plab.envs.vector:PlabVectorEnv",
             kwargs={"task": task, "variant": variant, **kwargs},
         )

@@ -17,11 +17,13 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
+from plab.errors import ArgumentError
 from plab.objective import OBSERVED_PARTICLES
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
+from plab.words import word_list
 
 if TYPE_CHECKING:
     import torch
@@ -38,6 +40,9 @@ __all__ = [
     "refuse_options",
     "spaces",
 ]
+
+MOST_ENVS = 100_000
+"""Sub-environments, at most; what fits into the memory is less, and found out with the scene."""
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
@@ -75,11 +80,13 @@ def compose_configs(
         ValueError: If the numbers do not fit, or overrides are no lists or name a task.
         plab.config.ConfigError: If an override or a file does not fit.
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ArgumentError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
+    if num_envs > MOST_ENVS:
+        raise ArgumentError(f"num_envs={num_envs} is too many for one simulator: use at most {MOST_ENVS}")
     own = [()] * num_envs if overrides_per_env is None else list(overrides_per_env)
     if len(own) != num_envs:
-        raise ValueError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
+        raise ArgumentError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
     for entries in (overrides, *own):
         _check_overrides(entries, task)
     lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
@@ -88,11 +95,11 @@ def compose_configs(
 
 
 def _check_overrides(overrides: Sequence[str], task: str) -> None:
-    if isinstance(overrides, str):
-        raise ValueError(f"overrides are a list of texts, such as ['sim.device=cuda'], not '{overrides}'")
-    for override in overrides:
+    for override in word_list(overrides):
         if override.partition("=")[0] == "task":
-            raise ValueError(f"'{override}' in an environment of task {task}: make that task's environment")
+            raise ArgumentError(
+                f"'{override}' in an environment of task {task}: make that task's environment"
+            )
 
 
 def action_array(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -105,16 +112,19 @@ def action_array(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarra
     Raises:
         ValueError: If it has another shape or its entries are no numbers.
     """
-    array = np.asarray(actions, np.float64)
+    try:
+        array = np.asarray(actions, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"actions have to be numbers: {error}") from None
     if array.shape != shape:
-        raise ValueError(f"actions have shape {list(array.shape)}, not {list(shape or ())}")
+        raise ArgumentError(f"actions have shape {list(array.shape)}, not {list(shape or ())}")
     return array
 
 
 def refuse_options(options: Mapping[str, Any] | None) -> None:
     """Raise ValueError if ``reset`` was given an option: there are none."""
     if options:
-        raise ValueError(f"unknown reset option '{next(iter(options))}': plab's environments have none")
+        raise ArgumentError(f"unknown reset option '{next(iter(options))}': plab's environments have none")
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
@@ -125,7 +135,7 @@ def check_render_mode(render_mode: str | None) -> str | None:
     """
     modes = METADATA["render_modes"]
     if render_mode is not None and render_mode not in modes:
-        raise ValueError(f"render_mode '{render_mode}' is not one of {', '.join(modes)}")
+        raise ArgumentError(f"render_mode '{render_mode}' is not one of {', '.join(modes)}")
     return render_mode
 
 
@@ -178,7 +188,7 @@ class EpisodeBatch:
             RuntimeError: If this process was forked from one that has made environments.
         """
         if contact not in CONTACT_MODELS:
-            raise ValueError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
+            raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
         self._problem: Problem | None = Problem(cfgs)
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon

@@ -11,6 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from plab.envs import ENTRY_POINT
 from plab.envs.core import (
     METADATA,
     EpisodeBatch,
@@ -19,6 +20,7 @@ from plab.envs.core import (
     compose_configs,
     refuse_options,
 )
+from plab.errors import ArgumentError
 
 __all__ = ["PlabVecEnv", "make_sb3"]
 
@@ -43,11 +45,24 @@ def make_sb3(
 
     Raises:
         gymnasium.error.Error: If there is no such id.
-        ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
+        ValueError: If an argument does not fit, or the id is not one of plab's; see also
+            :class:`plab.envs.core.EpisodeBatch`.
     """
-    spec = gymnasium.spec(env_id)
+    spec = _spec(env_id)
     cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
     return PlabVecEnv(EpisodeBatch(cfgs, contact=contact), render_mode=render_mode, spec=spec)
+
+
+def _spec(env_id: str) -> EnvSpec:
+    """Return the specification of one of plab's environments, of the suite or registered since."""
+    if not isinstance(env_id, str):
+        raise ArgumentError(f"an environment is named by a text, such as plab/Rope-v1, not {env_id!r}")
+    spec = gymnasium.spec(env_id)
+    if spec.entry_point != ENTRY_POINT:
+        raise ArgumentError(
+            f"'{env_id}' is no environment of plab's: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
+        )
+    return spec
 
 
 class PlabVecEnv(VecEnv):
@@ -141,7 +156,7 @@ class PlabVecEnv(VecEnv):
             ValueError: If it is to be set for some only.
         """
         if len(set(self._get_indices(indices))) != self.num_envs:
-            raise ValueError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
+            raise ArgumentError(f"'{attr_name}' cannot be set for some sub-environments only: all share it")
         setattr(self, attr_name, value)
 
     def env_method(

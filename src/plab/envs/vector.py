@@ -20,6 +20,7 @@ from plab.envs.core import (
     compose_configs,
     refuse_options,
 )
+from plab.errors import ArgumentError
 
 __all__ = ["PlabVectorEnv"]
 
@@ -99,7 +100,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         rest = dict(options or {})
         if not np.all(rest.pop("reset_mask", True)):
-            raise ValueError(
+            raise ArgumentError(
                 "reset_mask must be True for all sub-environments: they share one simulator and end together"
             )
         refuse_options(rest)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from plab.errors import ArgumentError
 from plab.losses.term import Term
 from plab.scene import MANIPULATOR_SHAPES, Scene
 from plab.sim import Simulator, State
@@ -63,7 +64,7 @@ def check_gradient(
             slopes.setdefault(part, []).append(pair)
     largest = max(abs(slope) for pairs in slopes.values() for pair in pairs for slope in pair)
     if largest == 0.0:
-        raise ValueError(
+        raise ArgumentError(
             f"{type(term).__name__} does not change with the state: there is no gradient to check"
         )
     errors = {}

@@ -10,16 +10,14 @@ from typing import NoReturn
 
 from omegaconf import OmegaConf
 
-from plab.arguments import positive, to_write
-from plab.config import ConfigError, choices, load_config
+from plab.arguments import folder, positive, sources_and_words, to_write
+from plab.checks import check_sources
+from plab.command import command_line
+from plab.config import choices, load_config
 from plab.render.graphics import RenderError, require_graphics
-from plab.scene import SceneError
-from plab.targets import TargetError
+from plab.words import IDLE, require_effect
 
 __all__ = ["main"]
-
-EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 
 _USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
@@ -41,7 +39,11 @@ EXAMPLES
 _FRAME = (480, 360)
 _CELL = (360, 150)
 
+_LARGEST = 4096
+"""Pixels of a frame's side, at most: what every OpenGL can draw, and H.264 can hold."""
 
+
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -49,17 +51,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; those of the process by default.
 
     Returns:
-        Exit code: 0, 2 for a mistake of the user's, 130 after Ctrl-C.
+        Exit code: 0.
     """
-    try:
-        _run(_parse(argv))
-    except (RenderError, ConfigError, SceneError, TargetError) as error:
-        return _complain(str(error), EXIT_USER_ERROR)
-    except KeyboardInterrupt:
-        return _complain("stopped", EXIT_INTERRUPTED)
-    except SystemExit as stop:
-        # argparse leaves this way after --help.
-        return stop.code if isinstance(stop.code, int) else 0
+    _run(_parse(argv))
     return 0
 
 
@@ -67,14 +61,9 @@ def _run(arguments: argparse.Namespace) -> None:
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
     from plab.render.pictures import check_output
-    from plab.results import ResultsError
-    from plab.sim import DeviceError, SimulationError
 
     check_output(arguments.output)
-    try:
-        (_draw_contact_sheet if arguments.contact_sheet else _draw_rollout)(arguments)
-    except (ResultsError, DeviceError, SimulationError) as error:
-        raise RenderError(str(error)) from error
+    (_draw_contact_sheet if arguments.contact_sheet else _draw_rollout)(arguments)
     print(arguments.output)
 
 
@@ -118,8 +107,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     where a rollout is to be drawn; ``output`` where it was not given.
     """
     arguments = _parser().parse_args(argv)
-    arguments.overrides = [word for word in arguments.what if "=" in word]
-    files = [word for word in arguments.what if "=" not in word]
+    files, arguments.overrides = sources_and_words(arguments.what)
+    require_effect(arguments.overrides, ("method", "seed", "sim.memory_mb", *IDLE), "a picture")
     arguments.result = Path(files[0]) if files else None
     if arguments.contact_sheet:
         given = [word for word in arguments.overrides if word.startswith(("task=", "variant="))]
@@ -135,6 +124,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         arguments.output = arguments.output or arguments.result.with_suffix(".png")
     elif arguments.overrides:
         cfg = arguments.config = load_config(arguments.overrides, arguments.config_dir)
+        check_sources(cfg)
         arguments.output = arguments.output or Path(f"{cfg.task.name}-v{cfg.variant}.png")
     else:
         raise RenderError("say what to draw: a result file, or a task such as task=Torus; --help explains")
@@ -149,8 +139,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(usage=_USAGE, allow_abbrev=False)
     add = parser.add_argument
     add("what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run")
-    add("--output", type=Path, metavar="FILE", help="by default a .png named like the result or the task")
-    add("--contact-sheet", type=Path, metavar="FILE", help="a .png")
+    add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
+    add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
     add("--every", type=positive, default=1, metavar="K", help="a film has a frame every K environment steps")
     add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for python -m plab.run")
@@ -165,16 +155,11 @@ def _parser() -> argparse.ArgumentParser:
 def _size(text: str) -> tuple[int, int]:
     """Read a size such as 480x360; H.264 needs even numbers."""
     numbers = [int(number) for number in text.split("x") if number.isdecimal()]
-    if len(numbers) != 2 or min(numbers) < 16 or any(number % 2 for number in numbers):
+    if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _LARGEST for number in numbers):
         raise argparse.ArgumentTypeError(
-            f"'{text}' is not a size such as 480x360, of even numbers from 16 on"
+            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_LARGEST}"
         )
     return numbers[0], numbers[1]
-
-
-def _complain(message: str, code: int) -> int:
-    print(f"plab: {' '.join(message.split())}", file=sys.stderr)
-    return code
 
 
 if __name__ == "__main__":

@@ -8,13 +8,15 @@ import os
 import sys
 from importlib.util import find_spec
 
+from plab.errors import PlabError
+
 __all__ = ["RenderError", "missing_graphics", "require_graphics"]
 
 _EGL_PLATFORM_DEVICE = 0x313F
 _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
 
 
-class RenderError(RuntimeError):
+class RenderError(PlabError, RuntimeError):
     """A picture that cannot be drawn or written; the message is one line that says why and what would do."""
 
 

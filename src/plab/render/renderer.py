@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pyvista as pv
 
+from plab.errors import ArgumentError
 from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
 from plab.render.camera import Camera, scene_camera
 from plab.render.shadows import AmbientLight, Cloud, floor_light
@@ -92,7 +93,7 @@ class Renderer:
         """
         self._place(poses)
         if np.shape(x) != (self._scene.particle_count, 3):
-            raise ValueError(f"x has shape {np.shape(x)}, not {(self._scene.particle_count, 3)}")
+            raise ArgumentError(f"x has shape {np.shape(x)}, not {(self._scene.particle_count, 3)}")
         x = np.asarray(x, np.float64)
         clouds = [Cloud(x, self._particle_area), *(rigid.cloud for rigid in self._manipulators)]
         fields = [surface.field(x[at]) for surface, at in zip(self._surfaces, self._slices, strict=True)]
@@ -118,7 +119,7 @@ class Renderer:
             ValueError: If the renderer has no target, or the shape is wrong.
         """
         if self._target is None:
-            raise ValueError("this renderer has no target: give it target_mass")
+            raise ArgumentError("this renderer has no target: give it target_mass")
         self._place(poses)
         fixed = [rigid for rigid in self._manipulators if not rigid.moves]
         clouds = [self._target.cloud, *(rigid.cloud for rigid in fixed)]
@@ -138,7 +139,7 @@ class Renderer:
         """Put the manipulators at their poses, shape [manipulator, 8]."""
         self._window()
         if np.shape(poses) != (len(self._manipulators), 8):
-            raise ValueError(f"poses have shape {np.shape(poses)}, not {(len(self._manipulators), 8)}")
+            raise ArgumentError(f"poses have shape {np.shape(poses)}, not {(len(self._manipulators), 8)}")
         for rigid, pose in zip(self._manipulators, np.asarray(poses, np.float64), strict=True):
             rigid.place(pose)
 

@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 import plab
-from plab.arguments import told
+from plab.arguments import folder, sources_and_words
+from plab.command import command_line
 from plab.examples import EXAMPLES, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.agreement import agreement
 from plab.report.budgets import score_at_budget
-from plab.report.collect import NAMES, Ablation, MixedRunsError, Runs, collect, collect_ablation
+from plab.report.collect import NAMES, Ablation, Runs, collect, collect_ablation
 from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
@@ -36,7 +37,7 @@ from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
-from plab.selection import SelectionError, select
+from plab.selection import select
 
 if TYPE_CHECKING:
     from plab.report.figures import Drawing
@@ -46,21 +47,15 @@ __all__ = ["main", "write_curves", "write_tables"]
 YIELD_STRESS = "task.yield_stress"
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     options = _parse(arguments)
     command = shlex.join(["python", "-m", "plab.report", *arguments])
     out = options.out or Path("reports") / options.what
-    try:
-        runs = collect(options.results, select(options.words, NAMES))
-        made = _MAKERS[options.what](runs, options, out, command)
-    except (ResultsError, SelectionError, MixedRunsError) as error:
-        print(f"plab: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"plab: {told(error)}", file=sys.stderr)
-        return 2
+    runs = collect(options.results, select(options.words, NAMES))
+    made = _MAKERS[options.what](runs, options, out, command)
     _tell(runs, made, out)
     return 0
 
@@ -132,19 +127,20 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
     what = f"folder of results, archive, or several; {', '.join(EXAMPLES)}: real runs (default: results)"
     parser.add_argument("--results", nargs="+", default=["results"], help=what)
-    parser.add_argument("--out", type=Path, help="folder to write to (default: reports/<what>)")
+    parser.add_argument("--out", type=folder, help="folder to write to (default: reports/<what>)")
     what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
     what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
     parser.add_argument("--accuracy", type=Path, help=what)
     what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
-    parser.add_argument("--bench", type=Path, default=Path("reports/bench"), help=what)
+    parser.add_argument("--bench", type=folder, default=Path("reports/bench"), help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
-    options.words += [item for item in options.results if "=" in item]
-    options.results = [resolve(item) for item in options.results if "=" not in item]
+    sources, words = sources_and_words(options.results)
+    options.words += words
+    options.results = [resolve(item) for item in sources or ["results"]]
     return options
 
 

@@ -14,6 +14,8 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from plab.errors import PlabError
+from plab.possible import require_possible
 from plab.report.methods import ordered
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows
@@ -57,7 +59,7 @@ _HARMLESS = (
 """Keys in which the runs of one mean may differ."""
 
 
-class MixedRunsError(ValueError):
+class MixedRunsError(PlabError, ValueError):
     """Runs that do not belong into one mean; the message is one line that says how to choose."""
 
 
@@ -137,10 +139,12 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     Raises:
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
         plab.selection.SelectionError: If there are runs of several protocols.
+        plab.config.ConfigError: If no run can be of the choice.
         plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
             can be read.
     """
     found, unreadable = readable_rows(source)
+    require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]

@@ -12,11 +12,13 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from plab.arguments import positive
+from plab.arguments import folder, positive
+from plab.command import command_line
+from plab.possible import require_possible
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
-from plab.results.loading import Row
-from plab.results.schema import ResultsError
+from plab.results.loading import Row, readable_rows
+from plab.results.schema import STATUSES
 from plab.selection import Selection, SelectionError, select
 
 __all__ = ["main"]
@@ -24,6 +26,7 @@ __all__ = ["main"]
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -31,11 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, 1 if ``check`` found something wrong, 2 for a mistake of the user's.
     """
     options = _parse(argv)
-    try:
-        return options.run(options)
-    except (ResultsError, SelectionError) as error:
-        print(f"plab: {error}", file=sys.stderr)
-        return 2
+    return options.run(options)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -56,17 +55,19 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def _check_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.description = "Check every file against the schema; exit code 1 if anything is wrong."
-    parser.add_argument("sources", nargs="*", default=["results"], help="folders, files, archives")
+    parser.add_argument(
+        "sources", nargs="*", type=folder, default=["results"], help="folders, files, archives"
+    )
     parser.set_defaults(run=_check)
     return parser
 
 
 def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.description = "Put runs into one small file."
-    parser.add_argument("source", type=Path, help="folder, file or archive")
+    parser.add_argument("source", type=folder, help="folder, file or archive")
     what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
     parser.add_argument("words", nargs="*", help=what)
-    parser.add_argument("--output", type=Path, required=True, help="archive to write, <name>.plab.zip")
+    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
     what = "significant digits that the iterations keep, >= 1 (default: all); 4 halve an archive"
     parser.add_argument("--digits", type=positive, help=what)
@@ -77,8 +78,8 @@ def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
 
 def _unpack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.description = "Make files of the runs of an archive; files that are there stay."
-    parser.add_argument("archive", type=Path, help="archive to read")
-    parser.add_argument("--output", type=Path, default=Path("results"), help="folder to write to")
+    parser.add_argument("archive", type=folder, help="archive to read")
+    parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
     parser.set_defaults(run=_unpack)
     return parser
 
@@ -101,6 +102,10 @@ def _check(options: argparse.Namespace) -> int:
 
 def _pack(options: argparse.Namespace) -> int:
     chosen = select(options.words, SELECTABLE)
+    _require_statuses(chosen.choices.get("status", ()))
+    if options.words:
+        others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
+        require_possible(Selection(others, chosen.keys), readable_rows(options.source)[0])
     done = pack(
         options.source,
         options.output,
@@ -115,6 +120,12 @@ def _pack(options: argparse.Namespace) -> int:
     before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
     print(f"{options.output}: {done.runs} run(s), {size}{before}")
     return 0
+
+
+def _require_statuses(texts: Sequence[str]) -> None:
+    for text in texts:
+        if text not in (*STATUSES, "all"):
+            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
 
 
 def _wanted(chosen: Selection) -> Callable[[Row], bool]:

@@ -108,8 +108,10 @@ def load(
         or that of the last iteration with ``protocol.score=last``.
 
     Raises:
-        ResultsError: If there is nothing at ``source``.
+        ResultsError: If there is nothing at ``source``, or ``keys`` is a text.
     """
+    if isinstance(keys, str):
+        raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
     found, unreadable = rows(source, index=index)
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.errors import PlabError
 from plab.families import FAMILIES
 from plab.selection import lookup
 
@@ -74,7 +75,7 @@ _BEFORE_PROTOCOLS = {
 """What the configurations of runs say that are older than protocols."""
 
 
-class ResultsError(RuntimeError):
+class ResultsError(PlabError, RuntimeError):
     """A result file that cannot be read or written; the message names the file and the reason."""
 
 

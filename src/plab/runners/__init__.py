@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
+from plab.command import TRACEBACK, traceback_wanted
 from plab.config_errors import ConfigError
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile
@@ -89,11 +90,15 @@ def _outcome(job: Job, how: str) -> Outcome:
         return outcome(job.cfg, how, job.run.result.score)
     refused = isinstance(job.error, USER_ERRORS)
     what = str(job.error) if refused or isinstance(job.error, RunError) else describe(job.error)
+    if not (refused or isinstance(job.error, RunError) or traceback_wanted()):
+        what += f"; a bug of plab: {TRACEBACK}=1 shows where"
     return outcome(job.cfg, "refused" if refused else "failed", message=what)
 
 
 def _print_bugs(jobs: Sequence[Job]) -> None:
-    """Print the traceback of each error that nobody foresaw, once if it ended several runs."""
+    """Print the traceback of each error that nobody foresaw, once if it ended several runs, if asked to."""
+    if not traceback_wanted():
+        return
     errors = {id(job.error): job.error for job in jobs if job.error is not None}
     for error in errors.values():
         if not isinstance(error, (RunError, *USER_ERRORS)):
@@ -124,7 +129,8 @@ def _carry_out(jobs: Sequence[Job], kind: type[Runner], note: str, cache: Simula
     halves: list[Sequence[Job]] = []
     try:
         kind(jobs, note, cache).run()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, BrokenPipeError):
+        # Nobody waits for it any more.
         for job in jobs:
             if job.open:
                 # The others are to be closed even if this one's file cannot be written.

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from plab.command import out_of_memory
+from plab.config_errors import ConfigError
 from plab.envs.core import EpisodeBatch
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
@@ -162,8 +164,11 @@ def torch_settings(threads: int) -> Iterator[None]:
 
 @contextmanager
 def simulation_errors(when: str = "") -> Iterator[None]:
-    """Turn what the simulator raises into a RunError; ``when`` goes before its message."""
+    """Turn what the simulator raises into a RunError, what it says of too little memory into a ConfigError;
+    ``when`` goes before the message."""
     try:
         yield
-    except (DeviceError, SimulationError, MemoryError) as error:
+    except (DeviceError, SimulationError) as error:
         raise RunError(f"{when}{error}") from error
+    except MemoryError as error:
+        raise ConfigError(f"{when}{out_of_memory(error)}") from error

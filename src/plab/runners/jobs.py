@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plab.config_errors import ConfigError
+from plab.errors import PlabError
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
 from plab.scene import SceneError
 from plab.tally import Outcome
@@ -32,7 +33,7 @@ USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
 """What a user has to put right: mistakes in the configuration, files that cannot be read or written."""
 
 
-class RunError(RuntimeError):
+class RunError(PlabError, RuntimeError):
     """A run that cannot go on; the message says in which iteration and why."""
 
 
@@ -65,8 +66,12 @@ class Job:
         if isinstance(error, ResultsError):
             # The file itself is what failed: nothing more can be written to it.
             return
+        if isinstance(error, USER_ERRORS) and not len(self.run.result.iterations):
+            # Nothing has been computed that a file could keep.
+            return
         try:
-            self.run.close("failed", str(error) if isinstance(error, RunError) else describe(error))
+            foreseen = isinstance(error, (RunError, *USER_ERRORS))
+            self.run.close("failed", str(error) if foreseen else describe(error))
         except ResultsError as another:
             self.error = another
 

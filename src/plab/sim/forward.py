@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from plab.errors import ArgumentError
 from plab.scene import Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, require_alike, with_material
 from plab.sim.engine import CpuEngine
@@ -21,6 +22,7 @@ from plab.sim.skips import Skips
 from plab.sim.state import Measures, State, rest_state
 from plab.sim.tape import Tape
 from plab.sim.tensors import numbers_of, on_device, output_for, step_actions
+from plab.sizes import require_memory
 
 if TYPE_CHECKING:
     import torch
@@ -68,11 +70,14 @@ class ForwardSimulator:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
             DeviceError: If CUDA was asked for and is not there.
         """
+        if isinstance(scenes, Scene):
+            raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
         if not scenes:
             raise SceneError("a simulator needs at least one scene")
         for scene in scenes:
             scene.validate()
         require_alike(scenes)
+        require_memory(len(scenes), scenes[0], precision, device)
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
@@ -161,9 +166,9 @@ class ForwardSimulator:
         decay = np.broadcast_to(np.asarray(softness, float), self.batch)
         for name, rate in zip(models, decay, strict=True):
             if name not in CONTACT_MODELS:
-                raise ValueError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
+                raise ArgumentError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
             if name == "soft" and not rate > 0:
-                raise ValueError(f"softness {rate:g} must be positive")
+                raise ArgumentError(f"softness {rate:g} must be positive")
         self._version += 1
         self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
 
@@ -180,7 +185,7 @@ class ForwardSimulator:
         for name, weight in weights.items():
             if name not in columns:
                 known = ", ".join(columns) or "none"
-                raise ValueError(f"this simulator was built without a term '{name}'; it has: {known}")
+                raise ArgumentError(f"this simulator was built without a term '{name}'; it has: {known}")
             self._engine.term_weights[columns[name]] = weight
 
     def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
@@ -244,7 +249,7 @@ class ForwardSimulator:
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
         for name, value in (("mass", mass), ("sdf", sdf)):
             if np.shape(value) != expected:
-                raise ValueError(f"target {name} has shape {np.shape(value)}, not {expected}")
+                raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
         held = {"mass": np.asarray(mass, self._numpy_real), "sdf": np.asarray(sdf, self._numpy_real)}
         for name, field in self._engine.references.items():
             field.from_numpy(held[name].reshape(-1))
@@ -367,11 +372,11 @@ class ForwardSimulator:
         expected = (self.batch, self.particle_count)
         for name, tail in (("x", (3,)), ("v", (3,)), ("C", (3, 3)), ("F", (3, 3))):
             if np.shape(getattr(state, name)) != (*expected, *tail):
-                raise ValueError(
+                raise ArgumentError(
                     f"{name} has shape {np.shape(getattr(state, name))}, not {(*expected, *tail)}"
                 )
         if np.shape(state.poses) != self._initial_poses.shape:
-            raise ValueError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
+            raise ArgumentError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
         self._version += 1
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()

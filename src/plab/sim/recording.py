@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import taichi as ti
 
+from plab.errors import ArgumentError
 from plab.sim.particles import Particles
 from plab.sim.tensors import on_device, output_for, write_numbers
 
@@ -64,7 +65,7 @@ class Recording:
         for name, bar in given.items():
             shape = np.shape(getattr(self, name)) if getattr(self, name) is not None else None
             if bar is not None and np.shape(bar) != shape:
-                raise ValueError(f"derivatives by {name} have shape {np.shape(bar)}, not {shape}")
+                raise ArgumentError(f"derivatives by {name} have shape {np.shape(bar)}, not {shape}")
         if not self._current():
             raise RuntimeError(
                 "the way back is gone: record with gradient=True, and pull back before the simulator runs "

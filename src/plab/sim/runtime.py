@@ -21,6 +21,8 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 import taichi as ti
 from taichi.lang import impl
 
+from plab.errors import ArgumentError, PlabError
+
 __all__ = ["DEVICES", "PRECISIONS", "DeviceError", "Runtime", "SimulationError", "start_runtime"]
 
 DEVICES = ("cpu", "cuda")
@@ -33,11 +35,11 @@ ABANDONED_SECONDS = 10.0
 """Age from which the lock of Taichi's cache is a killed process's: it is held while files are written."""
 
 
-class DeviceError(RuntimeError):
+class DeviceError(PlabError, RuntimeError):
     """The requested device is not there; the message says what to do."""
 
 
-class SimulationError(RuntimeError):
+class SimulationError(PlabError, RuntimeError):
     """The state or a gradient stopped being finite; the message says where and when.
 
     Attributes:
@@ -105,9 +107,9 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     global _current
     _refuse_fork()
     if device not in DEVICES:
-        raise ValueError(f"device '{device}' is not one of {', '.join(DEVICES)}")
+        raise ArgumentError(f"device '{device}' is not one of {', '.join(DEVICES)}")
     if precision not in PRECISIONS:
-        raise ValueError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
+        raise ArgumentError(f"precision '{precision}' is not one of {', '.join(PRECISIONS)}")
     wanted = 1 if device == "cuda" else max(1, threads or available_threads())
     # Compiled kernels are found in Taichi's cache only by a simulator whose fields have the same numbers, so
     # that the next one starts from a fresh count when nothing is left of those before.

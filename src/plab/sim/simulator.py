@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from plab.errors import ArgumentError
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
@@ -49,7 +50,7 @@ class Simulator(ForwardSimulator):
         """
         self.reset()
         if gradient and not self.terms:
-            raise ValueError("there is no loss to differentiate: Simulator(scenes, terms=...)")
+            raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
         kept = gradient or not self._skips.history
         plan = self._tape.plan(steps, self.memory_mb) if kept else None

@@ -12,6 +12,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
+from plab.errors import ArgumentError
+
 if TYPE_CHECKING:
     import torch
     from typing_extensions import TypeIs
@@ -132,9 +134,11 @@ def action_array(
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
-    shape = np.shape(actions)
+    shape = tuple(actions.shape) if on_device(actions) else _array(actions).shape
     expected = (batch, shape[1] if len(shape) == 3 else "T", components)
     actions = _of_shape(actions, expected, "(batch, steps, components)")
+    if not actions.shape[1]:
+        raise ArgumentError("actions have no steps: give one at least, shape (batch, steps, components)")
     return _array_of(_numbers(actions.swapaxes(0, 1)), device)
 
 
@@ -146,10 +150,17 @@ def _of_shape(
     Raises:
         ValueError: If they have another shape.
     """
-    actions = actions if on_device(actions) else np.asarray(actions, np.float64)
+    actions = actions if on_device(actions) else _array(actions)
     if tuple(actions.shape) != expected:
-        raise ValueError(f"actions have shape {tuple(actions.shape)}, not {expected} {named}")
+        raise ArgumentError(f"actions have shape {tuple(actions.shape)}, not {expected} {named}")
     return actions
+
+
+def _array(actions: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(actions, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"actions have to be numbers, of one shape: {error}") from None
 
 
 def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor":
@@ -165,7 +176,7 @@ def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor
         flat = np.ascontiguousarray(actions).reshape(-1)
         finite = bool(np.isfinite(flat).all())
     if not finite:
-        raise ValueError("actions contain NaN or infinity")
+        raise ArgumentError("actions contain NaN or infinity")
     return flat
 
 

@@ -92,7 +92,7 @@ class _Composer:
         key = _lines(parsed)
         if key not in self._finished:
             try:
-                self._finished[key] = finish(self._composition(parsed), key)
+                self._finished[key] = finish(self._composition(parsed), key, alone=False)
             except COMPOSE_ERRORS as error:
                 self._finished[key] = explain(error)
             except ConfigError as error:
@@ -121,7 +121,8 @@ class _Composer:
 
     def _check(self, cfg: Config) -> str | None:
         """Return what is wrong with scene and target, if anything is."""
-        parts = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+        sections = cfg.task, cfg.method, cfg.protocol, cfg.sim, cfg.targets
+        parts = [asdict(section) for section in sections]
         key = json.dumps([cfg.variant, *parts])
         if key not in self._checked:
             try:

@@ -22,21 +22,24 @@ import pandas as pd
 
 from plab.arguments import refuse_task, to_write
 from plab.cache import cache_dir
-from plab.command import answered
+from plab.checks import check_sources
+from plab.command import command_line
 from plab.config import build_scene, load_config
 from plab.objective import target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator
 from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
+from plab.words import IDLE, require_effect
 
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian that hides where single particles were drawn [domain units]."""
 
 
+@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     args = _parse(argv)
-    return answered(lambda: _run(args))
+    return _run(args)
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -63,6 +66,8 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         average.
     """
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
+    for cfg in cfgs:
+        check_sources(cfg)
     sim = cfgs[0].sim
     scenes = [build_scene(cfg) for cfg in cfgs]
     start = time.perf_counter()
@@ -116,6 +121,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
     options = parser.parse_intermixed_args(argv)
     refuse_task(parser, options.overrides)
+    require_effect(options.overrides, ("method", "seed", "sim.memory_mb", *IDLE), "targets")
+    from_files = any(word.partition("=")[0] == "targets.source" for word in options.overrides)
+    if options.rebuild and from_files:
+        parser.error("--rebuild has no effect with targets.source: leave one of them out")
     return options
 
 

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from plab.errors import PlabError
 from plab.scene import Scene
 
 __all__ = ["EPISODE_STEPS", "GeometricRecipe", "ScriptedRecipe", "TargetError"]
@@ -14,7 +15,7 @@ EPISODE_STEPS = 50
 """Environment steps of the suite's episodes, hence of its scripted demonstrations."""
 
 
-class TargetError(ValueError):
+class TargetError(PlabError, ValueError):
     """A target that cannot be built; the message says why."""
 
 

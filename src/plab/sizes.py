@@ -1,0 +1,170 @@
+"""How much memory something needs at least, found out before any is taken.
+
+The estimates are below what is really used: they are there to refuse what cannot work, and to name the value
+that could, not to foresee.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from plab.scene import Scene, SceneError
+
+__all__ = ["OBSERVED", "computer_bytes", "gigabytes", "largest", "require_memory", "scene_bytes"]
+
+_REAL_BYTES = {"float32": 4, "float64": 8}
+
+_PARTICLE_NUMBERS = 3 * 24 + 9
+"""Of a particle: its state in three arrays, and its stress."""
+
+_CHUNKS = {"cpu": 8, "cuda": 1}
+"""Grids of an environment for the momentum."""
+
+OBSERVED = 200
+"""Particles of an observation, about."""
+
+
+def scene_bytes(
+    *,
+    particles: float,
+    grid_size: float,
+    substeps: float,
+    horizon: float,
+    tools: int,
+    precision: str,
+    device: str,
+) -> float:
+    """Return how many bytes an environment takes at least while it is simulated without a gradient.
+
+    Args:
+        particles: Number of particles.
+        grid_size: Grid nodes per axis.
+        substeps: Substeps per environment step.
+        horizon: Environment steps of an episode.
+        tools: Number of manipulators.
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+    """
+    real = _REAL_BYTES[precision]
+    # Momentum and velocity, four numbers each; mass tensors of start, target and now, and a distance.
+    grid = float(grid_size) ** 3 * (4 * real * (_CHUNKS[device] + 1) + 4 * 8)
+    # Pose in float64; centre, rotation, their rates and the gap.
+    poses = float(substeps) * tools * (8 * 8 + 25 * real)
+    # Poses, actions and what is measured.
+    history = float(horizon) * (tools * 15 + 8) * 8
+    return float(particles) * _PARTICLE_NUMBERS * real + grid + poses + history
+
+
+def require_memory(scenes: int, scene: Scene, precision: str, device: str) -> None:
+    """Refuse scenes that do not fit into the memory.
+
+    Args:
+        scenes: How many are simulated together.
+        scene: One of them.
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+
+    Raises:
+        SceneError: If they do not fit; says how many would.
+    """
+    one = scene_bytes(
+        particles=scene.particle_count,
+        grid_size=scene.grid_size,
+        substeps=scene.substeps,
+        horizon=scene.horizon,
+        tools=len(scene.manipulators),
+        precision=precision,
+        device=device,
+    )
+    limit = computer_bytes(device)
+    if one > limit:
+        raise SceneError(
+            f"the scene needs at least {gigabytes(one)}, and there are {gigabytes(limit)}: "
+            "use fewer particles, grid nodes, substeps or steps"
+        )
+    if scenes * one > limit:
+        raise SceneError(
+            f"{scenes} environments need at least {gigabytes(scenes * one)}, and there are "
+            f"{gigabytes(limit)}: simulate at most {int(limit // one)} together"
+        )
+
+
+def gigabytes(count: float) -> str:
+    """Return a number of bytes for people."""
+    return f"{count / 1e9:.3g} GB"
+
+
+def largest(
+    needed: Callable[[Mapping[str, float]], float],
+    values: Mapping[str, float],
+    smallest: Mapping[str, float],
+    limit: float,
+) -> tuple[str, float]:
+    """Find the quantity that asks for too much, and what it may be.
+
+    Args:
+        needed: Bytes for some values, the more the larger each of them is.
+        values: The values, which need more than there is.
+        smallest: The least that those may be which may be named; of whole numbers an int.
+        limit: Bytes that there are.
+
+    Returns:
+        Name of the quantity that takes the most, and the largest value that would do with the others as they
+        are, or, if none would, with the others as small as may be; its smallest if not even that would do.
+    """
+    name = min(smallest, key=lambda one: needed({**values, one: smallest[one]}))
+    for others in (values, {**values, **smallest}):
+        low, high = smallest[name], values[name]
+        if needed({**others, name: low}) > limit:
+            continue
+        for _ in range(200):
+            middle = (low + high) // 2 if isinstance(low, int) else math.sqrt(low * high)
+            if needed({**others, name: middle}) > limit:
+                high = middle
+            else:
+                low = middle
+        return name, low if isinstance(low, int) else float(f"{0.999 * low:.3g}")
+    return name, smallest[name]
+
+
+def computer_bytes(device: str) -> float:
+    """Return how much memory there is on a device, for this process; infinite where nobody can tell."""
+    return _gpu_bytes() if device == "cuda" else min(_main_bytes(), _group_bytes())
+
+
+def _main_bytes() -> float:
+    if sys.platform == "win32":
+        kilobytes = ctypes.c_ulonglong(0)
+        found = ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kilobytes))
+        return kilobytes.value * 1024.0 if found else math.inf
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError):
+        return math.inf
+
+
+def _group_bytes() -> float:
+    """Return what a container or a job of a cluster may take."""
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            return float((Path("/sys/fs/cgroup") / file).read_text(encoding="ascii"))
+        except (OSError, ValueError):
+            # There is none, or it says "max".
+            continue
+    return math.inf
+
+
+def _gpu_bytes() -> float:
+    total, device = ctypes.c_size_t(0), ctypes.c_int(0)
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        done = driver.cuInit(0), driver.cuDeviceGet(ctypes.byref(device), 0)
+        done += (driver.cuDeviceTotalMem_v2(ctypes.byref(total), device),)
+    except (AttributeError, OSError):
+        return math.inf
+    return float(total.value) if not any(done) else math.inf
