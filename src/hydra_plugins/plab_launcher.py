@@ -9,9 +9,11 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
@@ -26,10 +28,32 @@ __all__ = ["BatchLauncher", "BatchSweeper"]
 
 
 class BatchSweeper(BasicSweeper):
-    """Hydra's own sweeper, but for the check of all jobs, which the launcher does much faster."""
+    """Makes the jobs of a sweep as Hydra's own sweeper does, and leaves nothing in the folder but results.
 
-    def validate_batch_is_legal(self, batch: Sequence[Sequence[str]]) -> None:
-        """Leave it to :class:`BatchLauncher`."""
+    Hydra's own writes its settings there first, which a sweep that has finished on a disk that is read-only
+    by now cannot, and checks all jobs, which :class:`BatchLauncher` does much faster.
+    """
+
+    def sweep(self, arguments: list[str]) -> list[Sequence[JobReturn]]:
+        """Launch all jobs; see :meth:`hydra.plugins.sweeper.Sweeper.sweep`."""
+        from plab.results.files import make_folder, remove_folders
+
+        assert self.config is not None and self.launcher is not None and self.hydra_context is not None
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        overrides = parser.parse_overrides([*self._parse_config(), *arguments])
+        # A folder that cannot be made is told before anything else.
+        made = make_folder(Path(self.config.hydra.sweep.dir))
+        returns: list[Sequence[JobReturn]] = []
+        try:
+            for batch in self.split_arguments(overrides, self.max_batch_size):
+                first = sum(len(earlier) for earlier in returns)
+                returns.append(self.launcher.launch(batch, initial_job_idx=first))
+                for job in returns[-1]:
+                    # Raises what went wrong in a job of another launcher.
+                    _ = job.return_value
+        finally:
+            remove_folders(made)
+        return returns
 
 
 class BatchLauncher(Launcher):

@@ -65,10 +65,12 @@ def run_sweep(
                 ended[one.path] = one
                 yield one
         by_path = {str(result_path(cfg)): cfg for cfg in todo}
+        todo = []
         for one in away:
             if held(one.path):
                 yield one
-        todo = [by_path[one.path] for one in away if not held(one.path)]
+            else:
+                todo.append(by_path[one.path])
 
 
 def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
