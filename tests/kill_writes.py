@@ -40,39 +40,38 @@ from plab.runners import run_batch, run_config
 PATIENCE = 300.0
 """Time after which a process has come to a stop [s]."""
 
-SCENE = (
-    "task=Move",
-    "sim.grid_size=16",
-    "sim.horizon=3",
-    "sim.substeps=5",
-    "sim.dt=4e-4",
-    "sim.particles_scale=0.03",
-    "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
-    "checkpoint_seconds=0",
-    "progress=false",
-)
+COMMON = ("sim.substeps=5", "sim.particles_scale=0.03", "checkpoint_seconds=0", "progress=false")
 
-RL = ("method.episodes=12", "method.num_envs=2", "method.evaluate_every=4", "method.hidden=[8]")
+DESCENT = ("sim.grid_size=16", "sim.horizon=3", "sim.dt=4e-4", "method.iterations=3")
+SEARCH = ("sim.grid_size=16", "sim.horizon=3", "sim.dt=4e-4", "method.population=4", "method.iterations=3")
+RL = (
+    "task=Move",
+    "sim.grid_size=32",
+    "sim.horizon=4",
+    "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
+    "method.episodes=12",
+    "method.num_envs=2",
+    "method.evaluate_every=4",
+    "method.hidden=[8]",
+)
 # A replay buffer that is written round and round.
-OFF_POLICY = (*RL, "method.batch_size=8", "method.learning_starts=6", "method.buffer_size=12")
-ON_POLICY = (*RL, "method.steps_per_update=6", "method.minibatches=2", "method.epochs=2")
-SEARCH = ("method.population=3", "method.iterations=3")
+OFF_POLICY = (*RL, "method.batch_size=8", "method.learning_starts=8", "method.buffer_size=16")
+ON_POLICY = (*RL, "method.steps_per_update=10", "method.minibatches=2", "method.epochs=2")
 
 CASES: dict[str, tuple[tuple[str, ...], int]] = {
-    "adam": (("method=adam", "method.iterations=3"), 2),
+    "adam": (("method=adam", *DESCENT), 2),
     "cem": (("method=cem", *SEARCH, "method.elites=2"), 1),
-    "multistart": (("method=multistart", *SEARCH, "method.updates=1", "method.replace_every=2"), 1),
     "sac": (("method=sac", *OFF_POLICY), 1),
     "ppo": (("method=ppo", *ON_POLICY), 1),
-    "td3 population": (("method=td3", *OFF_POLICY), 2),
-    "ppo population": (("method=ppo", *ON_POLICY), 2),
+    "td3-population": (("method=td3", *OFF_POLICY), 2),
+    "ppo-population": (("method=ppo", *ON_POLICY), 2),
 }
 """Method and number of runs; reinforcement learning with several is a population."""
 
 
 def configs(case: str, folder: Path) -> list[Config]:
     words, runs = CASES[case]
-    return [load_config([*SCENE, *words, f"seed={seed}", f"results_dir={folder}"]) for seed in range(runs)]
+    return [load_config([*COMMON, *words, f"seed={seed}", f"results_dir={folder}"]) for seed in range(runs)]
 
 
 def carry_out(cfgs: list[Config]) -> None:

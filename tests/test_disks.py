@@ -113,7 +113,7 @@ def test_a_final_file_that_does_not_reach_the_disk_is_not_there(toy: Configs, mo
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", fail)
-        assert main(list(SWEEP)) == 2
+        assert main([*SWEEP, "hydra.launcher.batch_size=1"]) == 2
     out, err = capsys.readouterr()
     assert summary(out) == "3 runs: 0 finished, 0 finished before, 3 refused"
     cfgs = toy()
@@ -149,6 +149,8 @@ def mounted(tmp_path: Path) -> Iterator[Callable[..., Path]]:
         return disk
 
     yield mount
+    # Whoever works there keeps it from going.
+    os.chdir(tmp_path)
     while disk.is_mount():
         subprocess.run(["umount", str(disk)], check=True)
 
@@ -237,7 +239,7 @@ def test_a_finished_sweep_in_a_closed_folder_ends_well(
             for folder in folders:
                 folder.chmod(0o755)
     assert snapshot(tmp_path) == before
-    # Who may write clears up.
+    # Who may write clears up, when the run is asked for.
     assert main(list(SWEEP)) == 0
     assert_complete(cfgs)
 
