@@ -1,6 +1,6 @@
 """Many runs, or episodes, in one process: python tests/long_life.py runs|resets COUNT; prints what is held.
 
-A line of JSON is printed after a tenth of them and another at the end: resident memory, threads, open files,
+A line of JSON is printed after each tenth of them: resident memory, threads, open files,
 lock files, and memory in use on the device where that is ``PLAB_TEST_DEVICE=cuda``.
 """
 
@@ -44,16 +44,16 @@ def held() -> dict[str, float]:
 
 
 class Watch:
-    """Prints what is held after a tenth of the count, and at the end."""
+    """Prints what is held after each tenth of the count."""
 
     def __init__(self, count: int) -> None:
-        self._due, self._done, self._begin = (count // 10, count), 0, time.monotonic()
+        self._every, self._done, self._begin = count // 10, 0, time.monotonic()
         self._out = sys.stdout
 
     def __call__(self) -> None:
         """Count one."""
         self._done += 1
-        if self._done in self._due:
+        if self._done % self._every == 0:
             seconds = time.monotonic() - self._begin
             line = json.dumps({"done": self._done, "seconds": round(seconds, 1)} | held())
             print(line, file=self._out, flush=True)

@@ -33,7 +33,7 @@ def live(folder: Path, what: str, count: int, growth: float) -> None:
     )
     assert done.returncode == 0, done.stderr[-2000:]
     print(done.stdout)
-    early, late = (json.loads(line) for line in done.stdout.splitlines())
+    early, *_, late = (json.loads(line) for line in done.stdout.splitlines() if line.startswith("{"))
     assert (early["done"], late["done"]) == (count // 10, count)
     assert late["rss"] <= growth * early["rss"]
     assert late.get("device", 0.0) <= growth * early.get("device", 0.0)
