@@ -39,7 +39,7 @@ def test_there_is_one_holder(path: Path) -> None:
     assert again is not None
     lock.release()
     assert held(path)
-    again.release(remove=True)
+    again.release()
     assert not held(path) and not lock_path(path).exists()
 
 

@@ -56,7 +56,7 @@ def assert_complete(cfgs: list[Config]) -> None:
     """Assert that there is each result, right, and no other file."""
     assert all(toy_runner.is_right(read(result_path(cfg)), cfg) for cfg in cfgs)
     files = {path for path in Path("results").rglob("*") if path.is_file()}
-    assert files == {result_path(cfg) for cfg in cfgs} | {Path("results/log"), Path("results/multirun.yaml")}
+    assert files == {result_path(cfg) for cfg in cfgs} | {Path("results/log")}
 
 
 # ---------------------------------------------------------------- what is run

@@ -29,8 +29,11 @@ __all__ = ["BatchLauncher", "BatchSweeper"]
 
 
 class BatchSweeper(BasicSweeper):
-    """Hydra's own sweeper, which counts the jobs before it makes them, and leaves the check of all of them to
-    the launcher, which is much faster."""
+    """Counts the jobs of a sweep before it makes them, and leaves nothing in the folder but results.
+
+    Hydra's own writes its settings there first, which a sweep that has finished on a disk that is read-only
+    by now cannot, and checks all jobs, which :class:`BatchLauncher` does much faster.
+    """
 
     def __init__(self, max_batch_size: int | None, params: dict[str, Any] | None = None) -> None:
         """Keep the settings.
@@ -64,6 +67,7 @@ class BatchSweeper(BasicSweeper):
             plab.config.ConfigError: If it has no jobs, or too many.
         """
         from plab.config import ConfigError
+        from plab.results.files import make_folder, remove_folders
         from plab.words import parse, require_few
 
         assert self.hydra_context is not None and self.launcher is not None
@@ -75,28 +79,21 @@ class BatchSweeper(BasicSweeper):
             if isinstance(one.value(), Glob) and not list(one.sweep_string_iterator()):
                 raise ConfigError(f"'{one.input_line}' matches nothing: there is nothing to run")
         require_few(list(given.values()))
-        if isinstance(self.launcher, BatchLauncher):
-            self.launcher.note = self._note
-        else:
-            self._note()
-        done: list[Sequence[JobReturn]] = []
-        for jobs in self.split_arguments(list(given.values()), self.max_batch_size):
-            done.append(self.launcher.launch(jobs, initial_job_idx=sum(map(len, done))))
-            for job in done[-1]:
-                # Raises what has ended a job of another launcher.
-                _ = job.return_value
-        return done
-
-    def _note(self) -> None:
-        """Write what the sweep is, as Hydra's own does."""
-        from plab.config import ConfigError
-
         assert self.config is not None
         if not self.config.hydra.sweep.dir.strip():
             raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
-        folder = Path(self.config.hydra.sweep.dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(self.config, folder / "multirun.yaml")
+        # A folder that cannot be made is told before anything else.
+        made = make_folder(Path(self.config.hydra.sweep.dir))
+        done: list[Sequence[JobReturn]] = []
+        try:
+            for jobs in self.split_arguments(list(given.values()), self.max_batch_size):
+                done.append(self.launcher.launch(jobs, initial_job_idx=sum(map(len, done))))
+                for job in done[-1]:
+                    # Raises what has ended a job of another launcher.
+                    _ = job.return_value
+        finally:
+            remove_folders(made)
+        return done
 
 
 class BatchLauncher(Launcher):
@@ -104,9 +101,6 @@ class BatchLauncher(Launcher):
 
     How they ended is noted in the :class:`plab.tally.Tally` that the task function has as ``tally``:
     Hydra gives a launcher no other way to tell the command line.
-
-    Attributes:
-        note: Writes what the sweep is; called once there is something to run.
     """
 
     def __init__(self, batch_size: int | None, inner: DictConfig | None, on_gpus: bool) -> None:
@@ -119,7 +113,6 @@ class BatchLauncher(Launcher):
             on_gpus: Whether a process for each GPU does.
         """
         self._size, self._inner, self._on_gpus = batch_size, inner, on_gpus
-        self.note: Callable[[], None] = lambda: None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Take what Hydra gives to launchers."""
@@ -164,8 +157,6 @@ class BatchLauncher(Launcher):
         if self._on_gpus:
             names = gpus()
             carry, processes = carry_on(names), len(names)
-        if cfgs:
-            self.note()
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import subprocess
@@ -81,8 +82,12 @@ def _processor() -> str:
     return next(names, platform.processor())
 
 
+@functools.cache
 def _git() -> tuple[str, bool]:
-    """Return the commit of plab's own repository ("" outside one), and whether tracked files differ."""
+    """Return the commit of plab's own repository ("" outside one), and whether tracked files differ.
+
+    Of the first run of a process, and so of the code that runs in it.
+    """
     here = Path(__file__)
 
     def git(*arguments: str) -> str:

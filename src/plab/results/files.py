@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import itertools
 import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,16 +30,22 @@ from plab.results.schema import (
 from plab.selection import lookup
 
 __all__ = [
+    "cause",
     "encode",
     "explained",
+    "make_folder",
     "opened",
     "opened_image",
     "read",
     "read_iterations",
+    "remove_folders",
     "replace_file",
     "split_archive",
     "write",
 ]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What a full disk answers, and one of which a user has had his share."""
 
 _images = itertools.count()
 
@@ -82,8 +90,41 @@ def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
                 os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise ResultsError(f"cannot write {path}: {cause(error, len(content))}") from error
+
+
+def cause(error: OSError, size: int) -> str:
+    """Return why something could not be written, and, where a disk is full, what room it needs.
+
+    Args:
+        error: What the system answered.
+        size: What was to be written [bytes].
+    """
+    why = error.strerror or str(error)
+    if error.errno not in _FULL:
+        return why
+    room = f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{max(size / 1e6, 0.1):.1f} MB"
+    return f"{why}: it needs {room}"
+
+
+def make_folder(folder: Path) -> list[Path]:
+    """Make a folder and those that it is in; return those that were not there, the innermost first.
+
+    Raises:
+        OSError: If that cannot be done.
+    """
+    new = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return new
+
+
+def remove_folders(folders: Iterable[Path]) -> None:
+    """Remove folders, the innermost first, up to one that holds something."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def read(path: str | Path) -> RunResult:

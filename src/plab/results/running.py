@@ -7,21 +7,23 @@ import itertools
 import logging
 import math
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from plab.locks import Lock, acquire, lock_path
+from plab.locks import NO_LOCKS, Lock, acquire, lock_path
 from plab.provenance import provenance, version_changes
-from plab.results.files import opened, read, write
+from plab.results.files import cause, make_folder, opened, read, remove_folders, write
 from plab.results.schema import (
     PARTIAL_SUFFIX,
+    REPLAY_SUFFIX,
     NewerSchemaError,
     ResultsError,
     RunBusyError,
@@ -68,13 +70,29 @@ class RunFile:
         )
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
+        # What is there before the run begins: folders made for it, files, iterations.
+        self._made: list[Path] = []
+        self._found: set[Path] = set()
+        self._known = 0
         _refuse_newer(self.path, self.partial_path)
         if not config["force"] and self._is_finished():
             if lock_path(self.path).exists() or self.partial_path.exists():
                 self._clear_up()
             return
-        _probe(self.path.parent)
-        self._lock_and_look(config["force"])
+        try:
+            self._made = make_folder(self.path.parent)
+            _probe(self.path.parent)
+            self._lock_and_look(config["force"])
+        except OSError as error:
+            self._let_go()
+            if error.errno in NO_LOCKS:
+                why = f"{error.strerror}: choose a results_dir with locks"
+                raise ResultsError(f"cannot lock {self.path.parent}: {why}") from error
+            why = cause(error, _PROBE_BYTES)
+            raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
+        except BaseException:
+            self._let_go()
+            raise
 
     def _lock_and_look(self, force: bool) -> None:
         """Take the run's lock, then see what there is: whoever had it before may have changed everything."""
@@ -82,23 +100,60 @@ class RunFile:
         if self._lock is None:
             raise RunBusyError(f"{self.path} is being computed by another process")
         self._remove_temporary()
-        if not force and not self._is_finished():
+        if force:
+            # It would be gone on with, but its replay buffer is about to be another one's.
+            self.partial_path.unlink(missing_ok=True)
+        elif not self._is_finished():
             self._take_up_earlier()
         if self.finished:
             self.release()
+            return
+        self._found = set(self._files())
+        self._known = len(self._state[0].iterations)
 
     def _clear_up(self) -> None:
         """Remove what a process left that was killed just after it had finished the run."""
-        lock = acquire(self.path)
-        # Otherwise somebody computes it again, by force.
-        if lock is not None:
-            self._remove_temporary()
-            self.partial_path.unlink(missing_ok=True)
-            lock.release(remove=True)
+        # Where nothing can be removed it stays: the result is there.
+        with suppress(OSError):
+            lock = acquire(self.path)
+            # Otherwise somebody computes it again, by force.
+            if lock is not None:
+                try:
+                    self._remove_temporary()
+                    # The replay buffer of a repetition that was killed; a run's own is gone before it ends.
+                    self.path.with_suffix(REPLAY_SUFFIX).unlink(missing_ok=True)
+                    self.partial_path.unlink(missing_ok=True)
+                finally:
+                    lock.release()
+
+    def _files(self) -> list[Path]:
+        """Return what there is of the run beside its lock, whoever has made it."""
+        stem, lock = f"{self.path.stem}.", lock_path(self.path)
+        return [path for path in self.path.parent.iterdir() if path.name.startswith(stem) and path != lock]
 
     def _remove_temporary(self) -> None:
-        for leftover in self.path.parent.glob(f"{self.path.stem}.*.tmp"):
-            leftover.unlink(missing_ok=True)
+        for path in self._files():
+            if path.suffix == ".tmp":
+                path.unlink(missing_ok=True)
+
+    def withdraw(self) -> None:
+        """Let go of a run that is refused: what it has made is gone, unless it can go on from there.
+
+        What an earlier process has left stays as it was.
+        """
+        if self._lock is not None and not self.partial_path.exists():
+            for path in set(self._files()) - self._found:
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    with suppress(OSError):
+                        path.unlink(missing_ok=True)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self.release()
+        # Those of task and method may have been made by another run that was refused, too.
+        remove_folders(self._made or self.path.parents[:2])
 
     @property
     def result(self) -> RunResult:
@@ -118,10 +173,15 @@ class RunFile:
         """Whether the run is complete, by this process or an earlier one."""
         return self._state[0].status == "finished"
 
+    @property
+    def advanced(self) -> bool:
+        """Whether this process has computed an iteration of the run."""
+        return len(self.result.iterations) > self._known
+
     def release(self) -> None:
         """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
         if self._lock is not None:
-            self._lock.release(remove=self.finished)
+            self._lock.release()
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -184,7 +244,9 @@ class RunFile:
         )
         write(result, self.path, compress=True)
         self._state = result, ()
-        self.partial_path.unlink(missing_ok=True)
+        # The result is there: where nothing can be removed any more, whoever comes next does it.
+        with suppress(OSError):
+            self.partial_path.unlink(missing_ok=True)
         self.release()
 
     def _is_finished(self) -> bool:
@@ -248,11 +310,7 @@ def _refuse_newer(*paths: Path) -> None:
 
 
 def _probe(folder: Path) -> None:
-    """Check that a folder can be made and has room, by writing to it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # A file without a name, of which a process that is killed leaves nothing.
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(bytes(_PROBE_BYTES))
-    except OSError as error:
-        raise ResultsError(f"cannot write results to {folder}: {error.strerror or error}") from error
+    """Raise OSError if a folder cannot be written or has no room."""
+    # A file without a name, of which a process that is killed leaves nothing.
+    with tempfile.TemporaryFile(dir=folder) as probe:
+        probe.write(bytes(_PROBE_BYTES))

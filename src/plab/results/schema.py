@@ -23,6 +23,7 @@ __all__ = [
     "COLUMNS",
     "EVALUATION",
     "PARTIAL_SUFFIX",
+    "REPLAY_SUFFIX",
     "SCHEMA_VERSION",
     "STATUSES",
     "SUFFIX",
@@ -49,8 +50,9 @@ STATUSES = ("running", "finished", "failed", "stopped")
 
 SUFFIX = ".h5"
 PARTIAL_SUFFIX = ".partial.h5"
+REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip"
-"""Ends of the names of result files, of those of runs under way, and of archives."""
+"""Ends of the names of result files, of those of runs under way, of their replay buffers, and of archives."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 

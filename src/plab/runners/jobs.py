@@ -61,10 +61,14 @@ class Job:
         return self.error is None and not self.run.finished
 
     def fail(self, error: Exception) -> None:
-        """Note why the run breaks off, also in its file, which keeps what it computed."""
+        """Note why the run breaks off, also in its file, which keeps what it computed.
+
+        A run that is refused before it computes anything leaves no file.
+        """
         self.error = error
-        if isinstance(error, ResultsError):
-            # The file itself is what failed: nothing more can be written to it.
+        if isinstance(error, ResultsError) or (isinstance(error, USER_ERRORS) and not self.run.advanced):
+            # Of a ResultsError the file itself is what failed: nothing more can be written to it.
+            self.run.withdraw()
             return
         if isinstance(error, USER_ERRORS) and not len(self.run.result.iterations):
             # Nothing has been computed that a file could keep.

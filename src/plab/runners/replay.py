@@ -183,8 +183,17 @@ class EpisodeReplay(ReplayBuffer):
         )
 
     def flush(self) -> None:
-        """Wait until the disk has everything that was added."""
-        self._file.flush()
+        """Wait until the disk has everything that was added.
+
+        Raises:
+            ResultsError: If it does not take it.
+        """
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise ResultsError(
+                f"cannot write the replay buffer {self._file.filename}: {error.strerror or error}"
+            ) from error
 
 
 def _require_file(path: Path, size: int, *, create: bool) -> None:

@@ -22,6 +22,7 @@ from plab.checks import check_packages
 from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results import RunFile
+from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
 from plab.runners.policy import model_policy, save_policy
 from plab.runners.rl_models import total_steps
@@ -52,7 +53,7 @@ class RlRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the model, or take that of the last checkpoint, unless its training is over."""
-        self._replay_path = track.job.run.path.with_suffix(".replay")
+        self._replay_path = track.job.run.path.with_suffix(REPLAY_SUFFIX)
         if state is None or int(state["steps"]) < total_steps(self._method, track.cfg.sim.horizon):
             self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
             self._trainer.set_logger(_logger(self._method, track.job.run))

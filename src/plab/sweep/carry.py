@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from plab import runners
 from plab.locks import held, lock_path
 from plab.results import ResultsError, RunFile, read, result_path
+from plab.results.schema import PARTIAL_SUFFIX
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
@@ -65,10 +66,12 @@ def run_sweep(
                 ended[one.path] = one
                 yield one
         by_path = {str(result_path(cfg)): cfg for cfg in todo}
+        todo = []
         for one in away:
             if held(one.path):
                 yield one
-        todo = [by_path[one.path] for one in away if not held(one.path)]
+            else:
+                todo.append(by_path[one.path])
 
 
 def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
@@ -99,7 +102,7 @@ def look_up(cfg: Config) -> Outcome:
     if held(path):
         return outcome(cfg, "elsewhere", message=f"{path} is being computed by another process")
     try:
-        left = read(path.with_suffix(".partial.h5"))
+        left = read(path.with_suffix(PARTIAL_SUFFIX))
     except ResultsError:
         return outcome(cfg, "lost", message="no result, and no process computes it now")
     if left.status == "failed":
@@ -112,7 +115,10 @@ def _finished_before(cfg: Config) -> Outcome | None:
     path = result_path(cfg)
     try:
         # Where there is something left of a process that was killed, RunFile clears it up.
-        result = RunFile(cfg).result if path.exists() and lock_path(path).exists() else read(path)
+        left = path.exists() and any(
+            one.exists() for one in (lock_path(path), path.with_suffix(PARTIAL_SUFFIX))
+        )
+        result = RunFile(cfg).result if left else read(path)
     except ResultsError:
         return None
     if result.status != "finished":

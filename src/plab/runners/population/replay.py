@@ -13,6 +13,7 @@ from torch import Tensor
 
 from plab.config_types import OffPolicyConfig
 from plab.results import ResultsError
+from plab.results.files import cause
 
 __all__ = ["Replay", "Samples", "Sizes", "require_file"]
 
@@ -150,7 +151,8 @@ class Replay:
                     for part in self._parts(agent, episode):
                         file.write(part.cpu().numpy().data)
         except OSError as error:
-            raise ResultsError(f"cannot write the replay buffer {path}: {error.strerror or error}") from error
+            size = 4 * (last - since) * self._sizes.entries
+            raise ResultsError(f"cannot write the replay buffer {path}: {cause(error, size)}") from error
         self._written[agent] = last
 
     def read(self, paths: Sequence[Path], added: int) -> None:

@@ -20,6 +20,7 @@ from plab.config_types import OffPolicyConfig
 from plab.envs.core import spaces
 from plab.problem import build_scenes
 from plab.results import ResultsError
+from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.common import environment_key, torch_settings
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
@@ -203,4 +204,4 @@ class PopulationRunner(Runner):
 
 
 def _replay_path(track: Track) -> Path:
-    return track.job.run.path.with_suffix(".replay")
+    return track.job.run.path.with_suffix(REPLAY_SUFFIX)
