@@ -145,7 +145,7 @@ def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None
         ConfigError: If there is such an override, or one cannot be read.
     """
     try:
-        overrides = parse(words)
+        overrides = parse(quote_folders(words))
     except HydraException as error:
         raise ConfigError(explain(error)) from None
     for override in overrides:

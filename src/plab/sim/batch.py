@@ -14,8 +14,14 @@ __all__ = ["initial_poses", "require_alike", "with_material"]
 
 
 def require_alike(scenes: Sequence[Scene]) -> None:
-    """Raise SceneError if scenes do not fit together in one simulator."""
+    """Raise SceneError if scenes cannot be simulated, or do not fit together in one simulator."""
+    if isinstance(scenes, Scene):
+        raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
+    if not scenes:
+        raise SceneError("a simulator needs at least one scene")
     first = scenes[0]
+    for scene in scenes:
+        scene.validate()
     for number, scene in enumerate(scenes[1:], start=1):
         for name in ("particle_count", "grid_size", "dt", "substeps", "numbers", "floor"):
             if getattr(scene, name) != getattr(first, name):

@@ -70,12 +70,6 @@ class ForwardSimulator:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
             DeviceError: If CUDA was asked for and is not there.
         """
-        if isinstance(scenes, Scene):
-            raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
-        if not scenes:
-            raise SceneError("a simulator needs at least one scene")
-        for scene in scenes:
-            scene.validate()
         require_alike(scenes)
         require_memory(len(scenes), scenes[0], precision, device)
         self.scenes = tuple(scenes)
