@@ -314,7 +314,10 @@ def test_a_recording_holds_the_start_and_every_step(recording):
     assert recording.poses.shape == (4, 3, 8)
     moved = recording.poses[:, 0, 0] - recording.poses[0, 0, 0]
     assert moved == pytest.approx(0.5 * 0.01 * np.arange(4))
-    assert 0 <= recording.score <= 1
+    assert recording.scores.shape == (4,) and recording.scores[0] == 0
+    assert (
+        np.all((recording.scores >= 0) & (recording.scores <= 1)) and recording.score == recording.scores[3]
+    )
 
 
 @drawing
@@ -377,7 +380,7 @@ def refused(capsys) -> Callable[..., str]:
 
 
 REFUSED = [
-    ([], "say what to draw"),
+    ([], "say what to show"),
     (["task=Ropee"], "did you mean Rope?"),
     (["task=Rope", "variant=77"], "variant 77 of task Rope does not exist"),
     (["nothing.h5"], "nothing.h5 does not exist"),

@@ -1,0 +1,135 @@
+"""Which rollout is meant, and how mistakes are answered: the same on every command line that shows one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import numpy as np
+
+from plab.arguments import positive, to_write
+from plab.config import ConfigError, load_config
+from plab.render.graphics import RenderError
+from plab.scene import SceneError
+from plab.targets import TargetError
+
+if TYPE_CHECKING:
+    from plab.config_types import Config
+
+__all__ = ["carried_out", "make_parser", "require_writable", "rollout", "settle"]
+
+EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+def make_parser(usage: str, every: str) -> argparse.ArgumentParser:
+    """Return a parser with the arguments that choose a rollout; mistakes in them are RenderErrors.
+
+    Args:
+        usage: What ``--help`` says first.
+        every: What has a frame every K environment steps.
+    """
+    parser = argparse.ArgumentParser(usage=usage, allow_abbrev=False)
+    parser.add_argument(
+        "what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run"
+    )
+    parser.add_argument(
+        "--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps"
+    )
+    parser.add_argument(
+        "--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for python -m plab.run"
+    )
+
+    def refuse(message: str) -> NoReturn:
+        raise RenderError(message)
+
+    parser.error = refuse  # type: ignore[method-assign]
+    return parser
+
+
+def settle(arguments: argparse.Namespace) -> Path:
+    """Find out which rollout is meant, as far as can be done without simulating.
+
+    Adds ``result``, the result file or None, and ``config``, the configuration where there is none.
+
+    Returns:
+        Name of what is to be written, without its suffix, where nothing else is said: that of the result
+        (beside it, but not inside an archive) or that of the task.
+
+    Raises:
+        RenderError: If nothing is chosen, or two things are.
+        plab.config.ConfigError: If the configuration is wrong.
+    """
+    overrides = [word for word in arguments.what if "=" in word]
+    files = [word for word in arguments.what if "=" not in word]
+    if len(files) > 1 or (files and overrides):
+        raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
+    if files:
+        # Imported here: it loads pandas, for which no mistake above should have to wait.
+        from plab.results.files import split_archive
+
+        arguments.result = Path(files[0])
+        name = arguments.result.with_suffix("")
+        return Path(name.name) if split_archive(arguments.result) else name
+    if not overrides:
+        raise RenderError("say what to show: a result file, or a task such as task=Torus; --help explains")
+    arguments.result = None
+    cfg = arguments.config = load_config(overrides, arguments.config_dir)
+    return Path(f"{cfg.task.name}-v{cfg.variant}")
+
+
+def require_writable(path: Path) -> None:
+    """Raise :class:`RenderError` if a file cannot be written, before anything is computed."""
+    try:
+        to_write(str(path))
+    except argparse.ArgumentTypeError as error:
+        raise RenderError(str(error)) from None
+
+
+def rollout(arguments: argparse.Namespace) -> tuple[Config, np.ndarray]:
+    """Return configuration and actions, shape [T, A], of the rollout that :func:`settle` found."""
+    from plab.render import recording
+
+    if arguments.result:
+        return recording.result(arguments.result)
+    return arguments.config, recording.demonstration(arguments.config)
+
+
+def carried_out(run: Callable[[], None]) -> int:
+    """Do what a command line asks for; say in one line what is wrong with it.
+
+    Args:
+        run: What is asked for.
+
+    Returns:
+        Exit code: 0, 2 for a mistake of the user's, 130 after Ctrl-C.
+    """
+    try:
+        try:
+            run()
+        except (RenderError, ConfigError, SceneError, TargetError):
+            raise
+        except RuntimeError as error:
+            # Imported here: they load the simulator, for which no mistake above should have to wait.
+            from plab.results import ResultsError
+            from plab.sim import DeviceError, SimulationError
+
+            if not isinstance(error, ResultsError | DeviceError | SimulationError):
+                raise
+            raise RenderError(str(error)) from error
+    except (RenderError, ConfigError, SceneError, TargetError) as error:
+        return _complain(str(error), EXIT_USER_ERROR)
+    except KeyboardInterrupt:
+        return _complain("stopped", EXIT_INTERRUPTED)
+    except SystemExit as stop:
+        # argparse leaves this way after --help.
+        return stop.code if isinstance(stop.code, int) else 0
+    return 0
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+    return code
