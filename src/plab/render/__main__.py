@@ -120,8 +120,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             arguments.output, arguments.draw, arguments.all_tasks = path, draw, True
             break
     else:
-        name = settle(arguments)
-        arguments.output = arguments.output or name.with_suffix(".png")
+        usual = settle(arguments, ".png")
+        arguments.output = arguments.output or usual
         arguments.draw, arguments.all_tasks = _draw_rollout, False
     require_writable(arguments.output)
     return arguments

@@ -50,14 +50,18 @@ def make_parser(usage: str, every: str) -> argparse.ArgumentParser:
     return parser
 
 
-def settle(arguments: argparse.Namespace) -> Path:
+def settle(arguments: argparse.Namespace, ending: str) -> Path:
     """Find out which rollout is meant, as far as can be done without simulating.
 
     Adds ``result``, the result file or None, and ``config``, the configuration where there is none.
 
+    Args:
+        arguments: Those of the command line.
+        ending: What is written instead of ``.h5``.
+
     Returns:
-        Name of what is to be written, without its suffix, where nothing else is said: that of the result
-        (beside it, but not inside an archive) or that of the task.
+        What is to be written where nothing else is said: named like the result, and beside it (but not inside
+        an archive), or like the task.
 
     Raises:
         RenderError: If nothing is chosen, or two things are.
@@ -72,13 +76,13 @@ def settle(arguments: argparse.Namespace) -> Path:
         from plab.results.files import split_archive
 
         arguments.result = Path(files[0])
-        name = arguments.result.with_suffix("")
-        return Path(name.name) if split_archive(arguments.result) else name
+        folder = Path() if split_archive(arguments.result) else arguments.result.parent
+        return folder / (arguments.result.stem + ending)
     if not overrides:
         raise RenderError("say what to show: a result file, or a task such as task=Torus; --help explains")
     arguments.result = None
     cfg = arguments.config = load_config(overrides, arguments.config_dir)
-    return Path(f"{cfg.task.name}-v{cfg.variant}")
+    return Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
 
 
 def require_writable(path: Path) -> None:
