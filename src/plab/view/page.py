@@ -34,7 +34,7 @@ _OVERLAP = 1.5  # diameter of a particle, in mean distances of neighbours
 _FLOOR = np.linspace(0.0, 1.0, 11)  # where its lines are [domain units]
 _LINE = 0.0012  # their width [domain units]
 _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
-_LICENCES = ("LICENSE.txt", "standalone.js.LICENSE.txt")
+_LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt")
 
 
 def page(recording: Recording, every: int | None = None) -> str:
