@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import io
 import json
 import re
 import shutil
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from plab import results
 from plab.config import load_config
@@ -251,12 +253,9 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def colors(browser) -> set[tuple[int, ...]]:
-    """Colours of what is seen."""
-    import io
-
-    from PIL import Image
-
-    picture = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
+    """Colours of what is seen of the scene."""
+    canvas = browser.find_element("id", "canvasTarget").screenshot_as_png
+    picture = Image.open(io.BytesIO(canvas)).convert("RGB")
     return {color for _, color in picture.getcolors(picture.width * picture.height)}
 
 

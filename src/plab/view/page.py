@@ -30,7 +30,7 @@ _LEVELS = 2**16  # per domain unit, to which positions are rounded: what is not 
 _STEPS_PER_SECOND = 10
 _ASPECT = 4 / 3  # of the window that the camera is fitted to; the page moves it away in a narrower one
 _GHOST_OPACITY = 0.3
-_OVERLAP = 1.5  # diameter of a particle, in mean distances of neighbours
+_OVERLAP = 1.2  # diameter of a particle, in mean distances of neighbours
 _FLOOR = np.linspace(0.0, 1.0, 11)  # where its lines are [domain units]
 _LINE = 0.0012  # their width [domain units]
 _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -63,7 +63,6 @@ def page(recording: Recording, every: int | None = None) -> str:
     plot = k3d.plot(
         antialias=2,
         background_color=_number(PAPER),
-        camera=[*camera.position, *camera.look_at, 0.0, 1.0, 0.0],
         camera_auto_fit=False,
         camera_fov=camera.angle,
         camera_mode="orbit",
@@ -71,14 +70,16 @@ def page(recording: Recording, every: int | None = None) -> str:
         grid_visible=False,
         axes_helper=0,
         menu_visibility=False,
-        additional_js_code="play(K3DInstance);",
     )
     things = [*_bodies(recording, steps), *_manipulators(recording, steps), *_ghost(recording), _floor()]
     for number, thing in enumerate(things, start=1):
         # Not where it lies in memory: the same rollout gives the same page.
         thing.id = number
         plot += thing
-    return _with_bar(plot.get_snapshot(), recording, plot.camera, {thing.group for thing in things})
+    snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
+    # The page sets the camera itself, when it knows how wide its window is.
+    seen = [*camera.position, *camera.look_at, 0.0, 1.0, 0.0]
+    return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
 
 
 def _bodies(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
