@@ -37,7 +37,7 @@ _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
 _SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
 _TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
 _CLEAREST = 0.45  # opacity of a manipulator that hides what it does
-_HIDDEN_ENOUGH = 0.3  # plasticine that it has to hide for that, as a share of what is seen of itself
+_HIDES = (0.5, 0.8)  # share of itself with which it hides plasticine: it begins to be translucent, and is
 _SHADOW = 0.6  # strength of the shadows on the floor
 _LINE = 1.3  # width of the floor's lines [pixels]
 _LINE_OPACITY = 0.16
@@ -95,17 +95,17 @@ class Rigid:
         samples = [transform(m, points) for m, points in zip(matrices, self._samples, strict=True)]
         self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
 
-    def reveal(self, x: np.ndarray, particle_area: float, camera: Camera) -> None:
+    def reveal(self, x: np.ndarray, camera: Camera) -> None:
         """Let it be seen through where it hides plasticine that it is at work on.
 
         Args:
             x: Particle positions [domain units], shape [particle, 3].
-            particle_area: Area that a particle stands for [domain units^2].
             camera: Where the picture is taken from.
         """
-        hidden = hidden_share(self.cloud, Cloud(x, particle_area), camera)
+        low, high = _HIDES
+        share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
         for actor in self.actors:
-            actor.prop.opacity = 1.0 - (1.0 - _CLEAREST) * min(hidden / _HIDDEN_ENOUGH, 1.0)
+            actor.prop.opacity = 1.0 - (1.0 - _CLEAREST) * share
 
 
 class Target:
@@ -153,7 +153,7 @@ class Target:
         """Let the ghost vanish where the plasticine's surface has come to it."""
         density = sum(field.at(self.mesh.points) for field in bodies)
         outside = np.clip((0.12 - density) / 0.1, 0.0, 1.0)
-        inside = np.clip((density - 0.85) / 0.1, 0.0, 1.0)
+        inside = np.clip((density - 0.92) / 0.07, 0.0, 1.0)
         for bubble, share in zip(self._bubbles, (outside, inside), strict=True):
             bubble["color"][:, 3] = self._alpha * share
             bubble.Modified()

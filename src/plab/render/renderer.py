@@ -99,7 +99,7 @@ class Renderer:
         x = np.asarray(x, np.float64)
         clouds = [Cloud(x, self._particle_area), *(rigid.cloud for rigid in self._manipulators)]
         for rigid in self._manipulators:
-            rigid.reveal(x, self._particle_area, self.camera)
+            rigid.reveal(x, self.camera)
         fields = [surface.field(x[at]) for surface, at in zip(self._surfaces, self._slices, strict=True)]
         ambient = AmbientLight(clouds)
         for body, field in zip(self._bodies, fields, strict=True):

@@ -35,7 +35,7 @@ _LOOK_OUT = 0.03  # distance from a surface at which its light is measured
 _OWN_COVER = 0.06  # what a flat surface covers of its own view
 _STRENGTH = 1.1
 _VIEW_CELL = 0.012  # of the picture in which things hide each other [domain units where it looks at]
-_CONTACT = 0.06  # distance up to which a manipulator is at work on plasticine [domain units]
+_CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
 _DARKEST = 0.25
 
 
@@ -82,29 +82,28 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
     return lit
 
 
-def hidden_share(front: Cloud, clay: Cloud, camera: Camera) -> float:
-    """Return how much plasticine something hides that it touches, or nearly so.
+def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
+    """Return how much of what is seen of a thing hides plasticine that it touches, or nearly so.
 
     Args:
-        front: What may hide it.
-        clay: The plasticine.
+        front: Points of the thing [domain units], shape [point, 3].
+        clay: Points of the plasticine, likewise.
         camera: Where the picture is taken from.
 
     Returns:
-        Area of hidden plasticine next to it, divided by the area that it takes of the picture.
+        Share of the area that the thing takes of the picture.
     """
-    low, high = front.points.min(axis=0) - _CONTACT, front.points.max(axis=0) + _CONTACT
-    near = clay.points[np.all((clay.points > low) & (clay.points < high), axis=1)]
-    near = near[cKDTree(front.points).query(near, distance_upper_bound=_CONTACT)[0] < _CONTACT]
+    low, high = front.min(axis=0) - _CONTACT, front.max(axis=0) + _CONTACT
+    near = clay[np.all((clay > low) & (clay < high), axis=1)]
+    near = near[cKDTree(front).query(near, distance_upper_bound=_CONTACT)[0] < _CONTACT]
+    right, up, back = ((np.concatenate([front, near]) - np.array(camera.position)) @ camera.axes().T).T
     scale = math.dist(camera.position, camera.look_at) / _VIEW_CELL
-    points = np.concatenate([front.points, near])
-    right, up, back = ((points - np.array(camera.position)) @ camera.axes().T).T
     _, cell = np.unique((scale * np.stack([right, up]) / back).astype(np.int64), axis=1, return_inverse=True)
-    count = len(front.points)
-    nearest = np.full(len(points), np.inf)
+    count = len(front)
+    nearest = np.full(cell.max() + 1, np.inf)
     np.minimum.at(nearest, cell[:count], -back[:count])
-    hidden = np.count_nonzero(-back[count:] > nearest[cell[count:]])
-    return hidden * clay.area / (np.isfinite(nearest).sum() * _VIEW_CELL**2)
+    hides = np.unique(cell[count:][-back[count:] > nearest[cell[count:]]])
+    return len(hides) / np.count_nonzero(np.isfinite(nearest))
 
 
 class AmbientLight:
