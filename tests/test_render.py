@@ -241,14 +241,14 @@ def test_the_ghost_is_where_the_target_is_and_lets_the_floor_be_seen(pictures):
 
 
 @pytest.mark.parametrize(
-    ("height", "elevation", "hides"), [(0.22, 60.0, True), (0.22, -60.0, False), (0.4, 60.0, False)]
+    ("height", "elevation", "hides"), [(0.27, 60.0, True), (0.27, -60.0, False), (0.4, 60.0, False)]
 )
 def test_what_is_hidden_is_plasticine_behind_a_manipulator_and_near_it(height, elevation, hides):
     (part,) = manipulator_parts(SPHERE)
     sphere = part.scatter(2e-5) + np.array([0.4, height, 0.5])
     x = sample_particles(scene())
     share = hidden_share(sphere, x, fit_camera(x, View(0.0, elevation), SIZE[0] / SIZE[1]))
-    assert share > 0.9 if hides else share < 0.02
+    assert share > 0.5 if hides else share == 0.0
 
 
 @drawing
@@ -572,8 +572,11 @@ def test_the_film_strip(capsys, monkeypatch):
     monkeypatch.setattr(
         "plab.demonstrations.known_actions", lambda cfg: np.zeros((2, build_scene(cfg).action_dim))
     )
-    assert main(["--film-strip", "strip.jpg", "--size", "80x60", *COARSE]) == 0
-    assert capsys.readouterr().out == "strip.jpg\n"
+    assert (
+        main(["--film-strip", "strip.jpg", "--size", "80x60", "sim.grid_size=32", "sim.particles_scale=0.03"])
+        == 0
+    )
+    assert capsys.readouterr().out.endswith("\nstrip.jpg\n")
     with Image.open("strip.jpg") as strip:
         # Two rows of two: four frames each, a caption above, a gap between.
         assert strip.size == (2 * 4 * 80 + 10, 2 * (60 + 2 * 10))

@@ -34,7 +34,7 @@ _OPACITY = 1.5
 _LOOK_OUT = 0.03  # distance from a surface at which its light is measured
 _OWN_COVER = 0.06  # what a flat surface covers of its own view
 _STRENGTH = 1.1
-_VIEW_CELL = 0.012  # of the picture in which things hide each other [domain units where it looks at]
+_VIEW_CELL = 0.02  # of the picture in which things hide each other [domain units where it looks at]
 _CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
 _DARKEST = 0.25
 
