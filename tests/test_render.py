@@ -14,11 +14,12 @@ import torch
 
 import reference_mpm
 from plab import results
-from plab.config import choices, load_config
+from plab.config import build_scene, choices, load_config
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.__main__ import main
 from plab.render.camera import VIEWS, Camera, View, fit_camera, scene_camera
+from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, body_volume, target_field
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
@@ -239,6 +240,51 @@ def test_the_ghost_is_where_the_target_is_and_lets_the_floor_be_seen(pictures):
     assert np.array_equal(pictures["all"][:, :10], pictures["no target"][:, :10])
 
 
+@pytest.mark.parametrize(
+    ("height", "elevation", "hides"), [(0.27, 60.0, True), (0.27, -60.0, False), (0.4, 60.0, False)]
+)
+def test_what_is_hidden_is_plasticine_behind_a_manipulator_and_near_it(height, elevation, hides):
+    (part,) = manipulator_parts(SPHERE)
+    sphere = part.scatter(2e-5) + np.array([0.4, height, 0.5])
+    x = sample_particles(scene())
+    share = hidden_share(sphere, x, fit_camera(x, View(0.0, elevation), SIZE[0] / SIZE[1]))
+    assert share > 0.5 if hides else share == 0.0
+
+
+@drawing
+def test_a_manipulator_is_translucent_where_it_hides_plasticine():
+    from plab.render import Renderer
+
+    world = scene(Manipulator("Sphere", (0.06,), (0.4, 0.22, 0.5)))
+    x, poses = sample_particles(world), start_poses(world)
+    camera = fit_camera(x, View(0.0, 60.0), SIZE[0] / SIZE[1])
+    column, row = np.floor(camera.project(np.array([0.4, 0.22, 0.5]), SIZE)).astype(int)
+    with closing(Renderer(world, None, SIZE, camera)) as renderer:
+        pressed, alone = (
+            renderer.frame(shown, poses)[row, column].astype(float) for shown in (x, x - [0.25, 0.0, 0.0])
+        )
+    assert is_metal(alone)
+    assert pressed[0] > pressed[2] + 30
+
+
+@drawing
+def test_a_ghost_is_seen_inside_a_body():
+    from plab.render import Renderer
+
+    world, center = scene(), np.array(CUBE.center)
+    unit = np.random.default_rng(1).random((800, 3)) - 0.5
+    x, poses = sample_particles(world), start_poses(world)
+    camera = fit_camera(x, View(30.0, 30.0), SIZE[0] / SIZE[1])
+    column, row = np.floor(camera.project(center, SIZE)).astype(int)
+    seen = []
+    for mass in (None, spread_mass(center + 0.08 * unit, 32, 1e-4)):
+        with closing(Renderer(world, mass, SIZE, camera)) as renderer:
+            seen.append(renderer.frame(x, poses)[row, column].astype(float))
+    plain, ghost = seen
+    assert is_clay(plain)
+    assert ghost[0] < plain[0] - 15 and ghost[2] > plain[2] + 15
+
+
 @drawing
 def test_the_ghost_vanishes_where_the_target_is_reached(pictures):
     difference = np.abs(pictures["reached"].astype(int) - pictures["no target"])
@@ -314,7 +360,10 @@ def test_a_recording_holds_the_start_and_every_step(recording):
     assert recording.poses.shape == (4, 3, 8)
     moved = recording.poses[:, 0, 0] - recording.poses[0, 0, 0]
     assert moved == pytest.approx(0.5 * 0.01 * np.arange(4))
-    assert 0 <= recording.score <= 1
+    assert recording.scores.shape == (4,) and recording.scores[0] == 0
+    assert (
+        np.all((recording.scores >= 0) & (recording.scores <= 1)) and recording.score == recording.scores[3]
+    )
 
 
 @drawing
@@ -377,7 +426,7 @@ def refused(capsys) -> Callable[..., str]:
 
 
 REFUSED = [
-    ([], "say what to draw"),
+    ([], "say what to show"),
     (["task=Ropee"], "did you mean Rope?"),
     (["task=Rope", "variant=77"], "variant 77 of task Rope does not exist"),
     (["nothing.h5"], "nothing.h5 does not exist"),
@@ -391,6 +440,8 @@ REFUSED = [
     (["a.h5", "task=Rope"], "give one result file or overrides"),
     (["--contact-sheet", "sheet.gif"], "a contact sheet is a .png"),
     (["--contact-sheet", "sheet.png", "task=Rope"], "leave out 'task=Rope'"),
+    (["--film-strip", "strip.png"], "a film strip is a .jpg"),
+    (["--film-strip", "strip.jpg", "task=Rope"], "leave out 'task=Rope'"),
 ]
 
 
@@ -510,6 +561,26 @@ def test_the_contact_sheet(capsys, monkeypatch):
         assert sheet.width > 5 * 80 and sheet.height > 2 * 40
         assert sheet.mode == "P"
         assert np.asarray(sheet.convert("RGB")).std() > 10
+
+
+@drawing
+def test_the_film_strip(capsys, monkeypatch):
+    from PIL import Image
+
+    some = {name: path for name, path in choices("task").items() if name in ("Move", "Rope", "Torus")}
+    monkeypatch.setattr("plab.render.__main__.choices", lambda group, config_dir: some)
+    monkeypatch.setattr(
+        "plab.demonstrations.known_actions", lambda cfg: np.zeros((2, build_scene(cfg).action_dim))
+    )
+    assert (
+        main(["--film-strip", "strip.jpg", "--size", "80x60", "sim.grid_size=32", "sim.particles_scale=0.03"])
+        == 0
+    )
+    assert capsys.readouterr().out.endswith("\nstrip.jpg\n")
+    with Image.open("strip.jpg") as strip:
+        # Two rows of two: four frames each, a caption above, a gap between.
+        assert strip.size == (2 * 4 * 80 + 10, 2 * (60 + 2 * 10))
+        assert np.asarray(strip)[:60, :320].std() > 10 and np.asarray(strip)[80:, 330:].std() < 10
 
 
 def test_help(capsys):

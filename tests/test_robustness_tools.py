@@ -20,6 +20,7 @@ from plab.bench import accuracy, everyday, precision, release, rl, speed, stabil
 from plab.bench import results as bench_results
 from plab.command import command_line
 from plab.demonstrations import __main__ as demonstrations
+from plab.export import __main__ as export
 from plab.render import __main__ as render
 from plab.render import graphics
 from plab.report import __main__ as report
@@ -27,6 +28,7 @@ from plab.results import ResultsError
 from plab.results import __main__ as results
 from plab.sim import Simulator
 from plab.targets import __main__ as targets
+from plab.view import __main__ as view
 from refusals import refusal
 from rights import ordinary_rights
 
@@ -121,6 +123,18 @@ TOOLS = [
     (render.main, ["task=Rope", "--config-dir", "nowhere"]),
     (render.main, ["task=Rope", "--contact-sheet", "a.png"]),
     (render.main, ["--contact-sheet", "a.gif"]),
+    (render.main, ["--film-strip", "a.png"]),
+    (render.main, ["a.h5", "--film-strip", "a.jpg"]),
+    (render.main, ["--film-strip", "a.jpg", "--contact-sheet", "a.png"]),
+    (view.main, []),
+    (view.main, ["nowhere.h5"]),
+    (view.main, ["a.h5", "task=Rope"]),
+    (view.main, ["task=Rope", "--output", "a.htm"]),
+    (view.main, ["task=Rope", "--every", "0"]),
+    (export.main, []),
+    (export.main, ["nowhere.h5"]),
+    (export.main, ["task=Nope"]),
+    (export.main, ["task=Rope", "--format", "usd"]),
     (targets.main, ["--task", "Nope"]),
     (targets.main, ["--task", ""]),
     (targets.main, ["--task", "Rope", "task=Move"]),
@@ -203,7 +217,11 @@ SAID = {
     (targets.main, "--task", "Rope", "--rebuild", "targets.source=files"): "--rebuild has no effect with",
     (demonstrations.main, "--task", "Move", "--lr", "0.1"): "--lr has no effect without --search",
     (report.main, "tables", "--results", "nowhere", "--speed", "nowhere.csv"): "nowhere does not exist",
-    (render.main,): "say what to draw",
+    (render.main,): "say what to show",
+    (render.main, "a.h5", "--film-strip", "a.jpg"): "leave out 'a.h5'",
+    (render.main, "--film-strip", "a.jpg", "--contact-sheet", "a.png"): "leave out '--film-strip'",
+    (view.main,): "say what to show",
+    (export.main,): "say what to show",
     (render.main, "task=Rope", "--contact-sheet", "a.png"): "leave out 'task=Rope'",
     (targets.main, "--task", ""): "there is no task ''; choose from",
     (targets.main, "--task", "Rope", "colour=red"): "unknown key 'colour'",
@@ -240,6 +258,9 @@ def test_results_where_none_can_be_written(refused, tmp_path):
     assert "cannot write" in refused(["--output", "file/accuracy"], accuracy.main)
     assert "file is no folder" in refused(["task=Rope", "--output", "file/a.png"], render.main)
     assert "file is no folder" in refused(["--contact-sheet", "file/a.png"], render.main)
+    assert "file is no folder" in refused(["task=Rope", "--output", "file/a.html"], view.main)
+    assert "file is no folder" in refused(["task=Rope", "--output", "file"], export.main)
+    assert "results is not empty" in refused(["task=Rope", "--output", "results"], export.main)
 
 
 @pytest.mark.parametrize(
@@ -272,6 +293,8 @@ def test_what_goes_wrong_on_the_way_is_one_line(capsys, error, line):
         ("plab.run", ["-m", "variant=1,2", "task=Nope"]),
         ("plab.render", ["nowhere.h5"]),
         ("plab.render", ["task=Rope", "--output", "film.avi"]),
+        ("plab.view", ["nowhere.h5"]),
+        ("plab.export", ["nowhere.h5"]),
         ("plab.targets", ["--task", "Nope"]),
         ("plab.status", ["nowhere"]),
         ("plab.results", ["check", "nowhere"]),
@@ -312,6 +335,8 @@ UNWRITABLE = [
     (report.main, ["html", "--no-pictures", "--results", "example.plab.zip", "--out", "closed"]),
     (render.main, ["task=Rope", "--output", "closed/a.png"]),
     (render.main, ["--contact-sheet", "closed/a.png"]),
+    (view.main, ["task=Rope", "--output", "closed/a.html"]),
+    (export.main, ["task=Rope", "--output", "closed"]),
     (targets.main, ["--task", "Rope", "--csv", "closed/a.csv"]),
     (demonstrations.main, ["--task", "Move", "--markdown", "closed/a.md"]),
     (speed.main, ["--csv", "closed/new/a.csv"]),

@@ -6,16 +6,15 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from omegaconf import OmegaConf
 
-from plab.arguments import folder, positive, sources_and_words, to_write
-from plab.checks import check_sources
+from plab.arguments import folder
 from plab.command import command_line
 from plab.config import choices, load_config
+from plab.render.choice import WITHOUT_EFFECT, make_parser, require_writable, rollout, settle
 from plab.render.graphics import RenderError, require_graphics
-from plab.words import IDLE, require_effect
+from plab.words import require_effect
 
 __all__ = ["main"]
 
@@ -23,9 +22,10 @@ _USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
 python -m plab.render KEY=VALUE ... [--output FILE]
 python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
+python -m plab.render --film-strip FILE [KEY=VALUE ...]
 
-Draws the best actions of a run, the best actions known for a task, or start and target of every task and
-variant.
+Draws the best actions of a run, the best actions known for a task, start and target of every task and
+variant, or a few frames of the best actions known for every task.
 
 The suffix of FILE decides what is written:
   .png         start, target and the rollout's end, side by side
@@ -38,6 +38,7 @@ EXAMPLES
 
 _FRAME = (480, 360)
 _CELL = (360, 150)
+_STRIP_FRAME = (240, 180)
 
 _LARGEST = 4096
 """Pixels of a frame's side, at most: what every OpenGL can draw, and H.264 can hold."""
@@ -62,21 +63,17 @@ def _run(arguments: argparse.Namespace) -> None:
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
     from plab.render.pictures import check_output
 
-    check_output(arguments.output)
-    (_draw_contact_sheet if arguments.contact_sheet else _draw_rollout)(arguments)
+    if not arguments.all_tasks:
+        check_output(arguments.output)
+    arguments.draw(arguments)
     print(arguments.output)
 
 
 def _draw_rollout(arguments: argparse.Namespace) -> None:
-    from plab.render import recording
     from plab.render.pictures import save
+    from plab.render.recording import record
 
-    if arguments.result:
-        cfg, actions = recording.result(arguments.result)
-    else:
-        cfg = arguments.config
-        actions = recording.demonstration(cfg)
-    save(recording.record(cfg, actions), arguments.output, arguments.size or _FRAME, arguments.every)
+    save(record(*rollout(arguments)), arguments.output, arguments.size or _FRAME, arguments.every or 1)
 
 
 def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
@@ -89,12 +86,27 @@ def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
     with show_progress("contact sheet", 0, len(tasks)) as report:
         for number, (task, path) in enumerate(tasks.items(), start=1):
             variants = OmegaConf.load(path).variants
-            words = [[f"task={task}", f"variant={variant}", *arguments.overrides] for variant in variants]
+            words = [[f"task={task}", f"variant={variant}", *arguments.what] for variant in variants]
             cfgs = [load_config(each, arguments.config_dir) for each in words]
             if cfgs:
                 rows[task] = starts(cfgs)
             report(number, task)
     save_contact_sheet(rows, arguments.output, arguments.size or _CELL)
+
+
+def _draw_film_strip(arguments: argparse.Namespace) -> None:
+    from plab.progress import show_progress
+    from plab.render.pictures import save_film_strip
+    from plab.render.recording import demonstration, record
+
+    tasks = choices("task", arguments.config_dir)
+    recordings = []
+    with show_progress("film strip", 0, len(tasks)) as report:
+        for number, task in enumerate(tasks, start=1):
+            cfg = load_config([f"task={task}", *arguments.what], arguments.config_dir)
+            recordings.append(record(cfg, demonstration(cfg)))
+            report(number, task)
+    save_film_strip(recordings, arguments.output, arguments.size or _STRIP_FRAME)
 
 
 # -------------------------------------------------------------------------------------------------- arguments
@@ -103,52 +115,48 @@ def _draw_contact_sheet(arguments: argparse.Namespace) -> None:
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without drawing.
 
-    Adds ``result``, the result file or None; ``overrides``, the other words; ``config``, their configuration
-    where a rollout is to be drawn; ``output`` where it was not given.
+    Adds ``draw``, what carries them out; ``all_tasks``, whether it shows all tasks; ``output`` where it was
+    not given; and what :func:`plab.render.choice.settle` adds.
     """
     arguments = _parser().parse_args(argv)
-    files, arguments.overrides = sources_and_words(arguments.what)
-    require_effect(arguments.overrides, ("method", "seed", "sim.memory_mb", *IDLE), "a picture")
-    arguments.result = Path(files[0]) if files else None
-    if arguments.contact_sheet:
-        given = [word for word in arguments.overrides if word.startswith(("task=", "variant="))]
-        if files or given or arguments.output:
-            unwanted = (*files, *given, "--output")[0]
-            raise RenderError(f"--contact-sheet FILE shows all tasks and variants: leave out '{unwanted}'")
-        if arguments.contact_sheet.suffix.lower() != ".png":
-            raise RenderError(f"cannot write {arguments.contact_sheet}: a contact sheet is a .png")
-        arguments.output = arguments.contact_sheet
-    elif len(files) > 1 or (files and arguments.overrides):
-        raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
-    elif files:
-        arguments.output = arguments.output or arguments.result.with_suffix(".png")
-    elif arguments.overrides:
-        cfg = arguments.config = load_config(arguments.overrides, arguments.config_dir)
-        check_sources(cfg)
-        arguments.output = arguments.output or Path(f"{cfg.task.name}-v{cfg.variant}.png")
+    for option, path, suffix, draw in (
+        ("--contact-sheet", arguments.contact_sheet, ".png", _draw_contact_sheet),
+        ("--film-strip", arguments.film_strip, ".jpg", _draw_film_strip),
+    ):
+        if path:
+            _check_sheet(arguments, option, path, suffix)
+            arguments.output, arguments.draw, arguments.all_tasks = path, draw, True
+            break
     else:
-        raise RenderError("say what to draw: a result file, or a task such as task=Torus; --help explains")
-    try:
-        to_write(str(arguments.output))
-    except argparse.ArgumentTypeError as error:
-        raise RenderError(str(error)) from None
+        usual = settle(arguments, ".png")
+        arguments.output = arguments.output or usual
+        arguments.draw, arguments.all_tasks = _draw_rollout, False
+    require_writable(arguments.output)
     return arguments
 
 
+def _check_sheet(arguments: argparse.Namespace, option: str, path: Path, suffix: str) -> None:
+    """Refuse what goes with no picture of all tasks."""
+    require_effect([word for word in arguments.what if "=" in word], WITHOUT_EFFECT, "a picture")
+    variants = option == "--contact-sheet"
+    own = ("task=", "variant=") if variants else ("task=",)
+    unwanted = [word for word in arguments.what if "=" not in word or word.startswith(own)]
+    unwanted += ["--output"] if arguments.output else []
+    unwanted += ["--film-strip"] if variants and arguments.film_strip else []
+    if unwanted:
+        shown = "tasks and variants" if variants else "tasks"
+        raise RenderError(f"{option} FILE shows all {shown}: leave out '{unwanted[0]}'")
+    if path.suffix.lower() != suffix:
+        raise RenderError(f"cannot write {path}: a {option[2:].replace('-', ' ')} is a {suffix}")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(usage=_USAGE, allow_abbrev=False)
+    parser = make_parser(_USAGE, "a film")
     add = parser.add_argument
-    add("what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run")
     add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
+    add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
-    add("--every", type=positive, default=1, metavar="K", help="a film has a frame every K environment steps")
-    add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for python -m plab.run")
-
-    def refuse(message: str) -> NoReturn:
-        raise RenderError(message)
-
-    parser.error = refuse  # type: ignore[method-assign]
     return parser
 
 

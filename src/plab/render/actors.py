@@ -6,15 +6,26 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyvista as pv
+from vtkmodules.vtkRenderingCore import vtkRenderer
 
 from plab.objective import TARGET_MASS
 from plab.render.camera import Camera
-from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud
-from plab.render.shapes import manipulator_parts, pose_matrix, transform
+from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud, hidden_share
+from plab.render.shapes import Part, manipulator_parts, pose_matrix, transform
 from plab.render.surface import Field, target_field
 from plab.scene import Manipulator, Scene
 
-__all__ = ["Clay", "Floor", "Rigid", "Target", "surface_mesh"]
+__all__ = [
+    "MANIPULATOR_COLOR",
+    "TARGET_COLOR",
+    "Clay",
+    "Floor",
+    "Rigid",
+    "Target",
+    "part_mesh",
+    "surface_mesh",
+    "target_mesh",
+]
 
 MANIPULATOR_COLOR = "#5a6470"
 TARGET_COLOR = "#2b8c9b"
@@ -25,6 +36,8 @@ _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20,
 _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
 _SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
 _TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
+_CLEAREST = 0.45  # opacity of a manipulator that hides what it does
+_HIDES = (0.5, 0.8)  # share of itself with which it hides plasticine: it begins to be translucent, and is
 _SHADOW = 0.6  # strength of the shadows on the floor
 _LINE = 1.3  # width of the floor's lines [pixels]
 _LINE_OPACITY = 0.16
@@ -67,19 +80,32 @@ class Rigid:
         self.moves = manipulator.action_dim > 0
         self._parts = manipulator_parts(manipulator)
         self._samples = [part.scatter(_SAMPLE_AREA) for part in self._parts]
-        self.actors = []
+        self.actors: list[pv.Actor] = []
         for part in self._parts:
-            mesh = pv.PolyData(part.vertices, faces=_quads(part.faces)).clean()
-            mesh = mesh.compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=False)
-            self.actors.append(plotter.add_mesh(mesh, color=MANIPULATOR_COLOR, **_METAL))
+            self.actors.append(
+                plotter.add_mesh(part_mesh(part), color=MANIPULATOR_COLOR, culling="back", **_METAL)
+            )
 
     def place(self, pose: np.ndarray) -> None:
-        """Put it at a pose, shape [8]."""
+        """Put it at a pose, shape [8]; it is opaque there."""
         matrices = [pose_matrix(pose, part.side) for part in self._parts]
         for actor, matrix in zip(self.actors, matrices, strict=True):
             actor.user_matrix = matrix
+            actor.prop.opacity = 1.0
         samples = [transform(m, points) for m, points in zip(matrices, self._samples, strict=True)]
         self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
+
+    def reveal(self, x: np.ndarray, camera: Camera) -> None:
+        """Let it be seen through where it hides plasticine that it is at work on.
+
+        Args:
+            x: Particle positions [domain units], shape [particle, 3].
+            camera: Where the picture is taken from.
+        """
+        low, high = _HIDES
+        share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
+        for actor in self.actors:
+            actor.prop.opacity = 1.0 - (1.0 - _CLEAREST) * share
 
 
 class Target:
@@ -89,29 +115,48 @@ class Target:
         actors: What stands for both in the window.
         mesh: Its surface.
         cloud: What stands for the solid in shadows.
-        ghost: What stands for the ghost in the window.
+        ghost: What stands for the ghost: where it is outside plasticine, and inside.
         solid: The solid.
     """
 
-    def __init__(self, plotter: pv.Plotter, scene: Scene, mass: np.ndarray, camera: Camera) -> None:
-        """Add the target with a mass tensor, shape [n, n, n], to a window."""
-        self.mesh = surface_mesh(target_field(scene, mass), _TARGET_SMOOTHING)
+    def __init__(
+        self, plotter: pv.Plotter, inside: vtkRenderer, scene: Scene, mass: np.ndarray, camera: Camera
+    ) -> None:
+        """Add the target to a window.
+
+        Args:
+            plotter: The window.
+            inside: Its layer for what is seen inside plasticine.
+            scene: The scene.
+            mass: Mass tensor, shape [n, n, n].
+            camera: Where pictures are taken from.
+        """
+        self.mesh = target_mesh(scene, mass)
         self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
         self.solid = Clay(plotter, self.mesh.copy(), TARGET_COLOR)
         toward = camera.position - self.mesh.points
         facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
         # Like a bubble: clear where it faces the camera, dense at the rim.
         self._alpha = 255 * (0.2 + 0.6 * (1.0 - facing) ** 1.5)
-        self._bubble = self.mesh.copy()
-        self._bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (self.mesh.n_points, 1)).astype(np.uint8)
-        self.ghost = plotter.add_mesh(self._bubble, scalars="color", rgba=True, smooth_shading=True, **_GLASS)
-        self.actors = [self.ghost, *self.solid.actors]
+        self._bubbles = [self.mesh.copy() for _ in range(2)]
+        for bubble in self._bubbles:
+            bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (self.mesh.n_points, 1)).astype(np.uint8)
+        self.ghost = [
+            plotter.add_mesh(bubble, scalars="color", rgba=True, smooth_shading=True, **_GLASS)
+            for bubble in self._bubbles
+        ]
+        plotter.renderer.RemoveActor(self.ghost[1])
+        inside.AddActor(self.ghost[1])
+        self.actors = [*self.ghost, *self.solid.actors]
 
     def fade(self, bodies: Sequence[Field]) -> None:
         """Let the ghost vanish where the plasticine's surface has come to it."""
         density = sum(field.at(self.mesh.points) for field in bodies)
-        self._bubble["color"][:, 3] = self._alpha * np.clip((0.12 - density) / 0.1, 0.0, 1.0)
-        self._bubble.Modified()
+        outside = np.clip((0.12 - density) / 0.1, 0.0, 1.0)
+        inside = np.clip((density - 0.92) / 0.07, 0.0, 1.0)
+        for bubble, share in zip(self._bubbles, (outside, inside), strict=True):
+            bubble["color"][:, 3] = self._alpha * share
+            bubble.Modified()
 
 
 class Floor:
@@ -171,6 +216,17 @@ def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.
     iterations, pass_band = smoothing
     mesh = mesh.smooth_taubin(n_iter=iterations, pass_band=pass_band)
     return mesh.compute_normals(split_vertices=False, consistent_normals=False, auto_orient_normals=False)
+
+
+def part_mesh(part: Part) -> pv.PolyData:
+    """Return a part of a manipulator in its own frame, with normals, its edges sharp."""
+    mesh = pv.PolyData(part.vertices, faces=_quads(part.faces)).clean()
+    return mesh.compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=False)
+
+
+def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
+    """Return the surface of a target with a mass tensor, shape [n, n, n]."""
+    return surface_mesh(target_field(scene, mass), _TARGET_SMOOTHING)
 
 
 def _quads(corners: np.ndarray) -> np.ndarray:

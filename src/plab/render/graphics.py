@@ -6,11 +6,12 @@ import ctypes
 import functools
 import os
 import sys
+from collections.abc import Mapping
 from importlib.util import find_spec
 
 from plab.errors import PlabError
 
-__all__ = ["RenderError", "missing_graphics", "require_graphics"]
+__all__ = ["RenderError", "missing_graphics", "require_graphics", "require_packages"]
 
 _EGL_PLATFORM_DEVICE = 0x313F
 _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
@@ -27,6 +28,24 @@ def require_graphics() -> None:
         raise RenderError(reason)
 
 
+def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) -> None:
+    """Raise :class:`RenderError` if a package is missing.
+
+    Args:
+        who_needs: What begins the message: ``pictures need``.
+        packages: Names for readers by those that are imported.
+        extra: The extra that installs them.
+    """
+    if missing := _missing_package(who_needs, packages, extra):
+        raise RenderError(missing)
+
+
+def _missing_package(who_needs: str, packages: Mapping[str, str], extra: str) -> str | None:
+    lacking = (name for package, name in packages.items() if find_spec(package) is None)
+    message = f"{who_needs} {{}}, which is not installed: pip install 'plab[{extra}]'"
+    return next((message.format(name) for name in lacking), None)
+
+
 @functools.cache
 def missing_graphics() -> str | None:
     """Return what is missing for drawing, and how to install it; None if nothing is.
@@ -34,9 +53,8 @@ def missing_graphics() -> str | None:
     On Linux, VTK is told to draw through EGL, which needs no screen, unless the environment variable
     ``VTK_DEFAULT_OPENGL_WINDOW`` says otherwise.
     """
-    for package, name in (("pyvista", "PyVista"), ("PIL", "Pillow")):
-        if find_spec(package) is None:
-            return f"pictures need {name}, which is not installed: pip install 'plab[render]'"
+    if missing := _missing_package("pictures need", {"pyvista": "PyVista", "PIL": "Pillow"}, "render"):
+        return missing
     if sys.platform.startswith("linux") and _WINDOW not in os.environ:
         if not _egl_works():
             # VTK would end the process with a segmentation fault.

@@ -10,12 +10,20 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from plab.render.camera import scene_camera
+from plab.render.camera import Camera, scene_camera
 from plab.render.graphics import RenderError
 from plab.render.recording import Recording
 from plab.render.renderer import INK, PAPER, Renderer
 
-__all__ = ["STEPS_PER_SECOND", "SUFFIXES", "check_output", "save", "save_contact_sheet", "save_set"]
+__all__ = [
+    "STEPS_PER_SECOND",
+    "SUFFIXES",
+    "check_output",
+    "save",
+    "save_contact_sheet",
+    "save_film_strip",
+    "save_set",
+]
 
 STEPS_PER_SECOND = 20
 """Environment steps that a film shows in a second, whatever the number of its frames."""
@@ -26,6 +34,9 @@ SUFFIXES = (".png", ".gif", ".mp4")
 _HOLD = 1.0  # how long a film shows its last frame [s]
 _FILM_COLORS = 96  # of a GIF
 _SHEET_COLORS = 256
+_STRIP_FRAMES = 4  # of a task in the film strip
+_STRIP_COLUMNS = 2  # of tasks
+_STRIP_QUALITY = 88  # of JPEG
 
 
 def check_output(path: Path) -> None:
@@ -53,8 +64,7 @@ def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1
     Raises:
         RenderError: If the file cannot be written.
     """
-    scene, target_mass = recording.scene, recording.target_mass
-    camera = scene_camera(scene, target_mass, size, recording.x[[0, -1]], recording.poses[::5])
+    scene, target_mass, camera = recording.scene, recording.target_mass, _camera(recording, size)
     with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path):
         _WRITERS[path.suffix.lower()](recording, renderer, every, path)
 
@@ -125,6 +135,42 @@ def _start_and_target(recording: Recording, size: tuple[int, int]) -> Image.Imag
     with closing(Renderer(recording.scene, recording.target_mass, size)) as renderer:
         start = renderer.frame(recording.x[0], recording.poses[0])
         return Image.fromarray(np.concatenate([start, renderer.target(recording.poses[0])], axis=1))
+
+
+def save_film_strip(recordings: Sequence[Recording], path: Path, size: tuple[int, int]) -> None:
+    """Write one picture of many rollouts as JPEG: of each some frames, at equal distances in time.
+
+    Args:
+        recordings: The rollouts.
+        path: File to write.
+        size: Width and height of a frame [pixels].
+
+    Raises:
+        RenderError: If the file cannot be written.
+    """
+    width, height = size
+    text = max(10, height // 9)
+    across, down = _STRIP_FRAMES * width + text, height + 2 * text
+    rows = -(-len(recordings) // _STRIP_COLUMNS)
+    sheet = Image.new("RGB", (_STRIP_COLUMNS * across - text, rows * down), PAPER)
+    for number, recording in enumerate(recordings):
+        left, top = number // rows * across, number % rows * down
+        steps = np.linspace(0, len(recording.x) - 1, _STRIP_FRAMES).round().astype(int)
+        camera = _camera(recording, size)
+        with closing(Renderer(recording.scene, recording.target_mass, size, camera)) as renderer:
+            for column, step in enumerate(steps):
+                frame = renderer.frame(recording.x[step], recording.poses[step])
+                sheet.paste(Image.fromarray(frame), (left + column * width, top + 2 * text))
+        caption = f"{recording.task}, variant {recording.variant}: score {recording.score:.2f}"
+        _write(sheet, caption, (left + _STRIP_FRAMES * width // 2, top + text), text)
+    with _writing(path):
+        sheet.save(path, quality=_STRIP_QUALITY, optimize=True)
+
+
+def _camera(recording: Recording, size: tuple[int, int]) -> Camera:
+    """Return the camera that sees a whole rollout."""
+    x, poses = recording.x[[0, -1]], recording.poses[::5]
+    return scene_camera(recording.scene, recording.target_mass, size, x, poses)
 
 
 @contextmanager

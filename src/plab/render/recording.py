@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -16,13 +16,24 @@ from omegaconf import OmegaConf
 from plab.checks import cuda_is_usable
 from plab.config import build_scene, load_config
 from plab.config_types import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig
-from plab.problem import Problem
+from plab.objective import scores_from_iou, soft_iou
+from plab.problem import Problem, build_scenes, build_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scene import Scene
-from plab.sim import State
+from plab.sim import Simulator, State
+from plab.targets import TargetError
 
-__all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts"]
+__all__ = [
+    "Recording",
+    "demonstration",
+    "record",
+    "record_all",
+    "record_with_motion",
+    "result",
+    "say",
+    "starts",
+]
 
 
 Section = TypeVar("Section")
@@ -36,19 +47,28 @@ class Recording:
         task: Name of the task.
         variant: Name of the variant.
         scene: The scene.
-        target_mass: Mass tensor of the target, shape [n, n, n].
+        target_mass: Mass tensor of the target, shape [n, n, n]; None if it cannot be made here.
         x: Particle positions [domain units] at the start and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
-        score: Score of the last state.
+        scores: Scores of these states, shape [T + 1]; None without a target.
+        v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
+        F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
 
     task: str
     variant: str
     scene: Scene
-    target_mass: np.ndarray
+    target_mass: np.ndarray | None
     x: np.ndarray
     poses: np.ndarray
-    score: float
+    scores: np.ndarray | None
+    v: np.ndarray | None = None
+    F: np.ndarray | None = None
+
+    @property
+    def score(self) -> float:
+        """Score of the last state, NaN without a target."""
+        return float("nan") if self.scores is None else float(self.scores[-1])
 
 
 def result(path: Path) -> tuple[Config, np.ndarray]:
@@ -63,7 +83,7 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
     sim = _section(run.config["sim"], SimConfig)
     if sim.device == "cuda" and not cuda_is_usable():
-        _say("the run used CUDA, which this computer has not: replaying it on the CPU")
+        say("the run used CUDA, which this computer has not: replaying it on the CPU")
         sim.device = "cpu"
     cfg = dataclasses.replace(
         load_config(),
@@ -99,7 +119,7 @@ def demonstration(cfg: Config) -> np.ndarray:
 
     scene, actions = build_scene(cfg), known_actions(cfg)
     if actions is None:
-        _say(
+        say(
             f"no demonstration of {cfg.task.name}, variant {cfg.variant}, is known: the manipulators stay put"
         )
         return np.zeros((scene.horizon, scene.action_dim))
@@ -118,43 +138,89 @@ def record(cfg: Config, actions: np.ndarray) -> Recording:
 
 def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
     """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene."""
-    problem = Problem(cfgs)
-    simulator = problem.simulator
-    simulator.set_contact("hard")
-    simulator.reset()
-    states = [simulator.state()]
-    for step in range(actions.shape[1]):
-        simulator.step(actions[:, step])
-        states.append(simulator.state())
-    return _recordings(cfgs, problem, states, simulator.mass_tensor())
+    return _recordings(cfgs, Problem(cfgs), actions)
+
+
+def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
+    """Run actions as :func:`record` does, and keep velocities and deformation gradients.
+
+    A target that cannot be made here, such as one whose file is elsewhere, is left out, and a line says so.
+    """
+    try:
+        (recording,) = _recordings([cfg], Problem([cfg]), actions[None], motion=True)
+    except TargetError as error:
+        say(f"without target and scores: {error}")
+    else:
+        if cfg.targets.source is not None:
+            say(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
+        return recording
+    scenes = build_scenes([cfg])
+    states = list(_states(build_simulator(scenes, cfg), actions[None]))
+    return Recording(
+        task=cfg.task.name,
+        variant=cfg.variant,
+        scene=scenes[0],
+        target_mass=None,
+        scores=None,
+        **_history(states, 0, motion=True),
+    )
 
 
 def starts(cfgs: Sequence[Config]) -> list[Recording]:
     """Return recordings of no step, of configurations of one kind of scene."""
     problem = Problem(cfgs)
-    return _recordings(cfgs, problem, [problem.simulator.state()], problem.initial_mass)
+    return _recordings(cfgs, problem, np.zeros((len(cfgs), 0, problem.simulator.action_dim)))
+
+
+def _states(simulator: Simulator, actions: np.ndarray) -> Iterator[State]:
+    """Run actions, shape [batch, T, A], from the start; yield the first state and that after each step."""
+    simulator.set_contact("hard")
+    simulator.reset()
+    yield simulator.state()
+    for step in range(actions.shape[1]):
+        simulator.step(actions[:, step])
+        yield simulator.state()
 
 
 def _recordings(
-    cfgs: Sequence[Config], problem: Problem, states: Sequence[State], mass: np.ndarray
+    cfgs: Sequence[Config], problem: Problem, actions: np.ndarray, *, motion: bool = False
 ) -> list[Recording]:
-    """Return recordings of all environments, from the states of their batch and the last one's mass."""
-    scores = problem.scores(mass)
+    """Return recordings of actions, shape [batch, T, A], in all environments of a problem."""
+    states, scores = [], []
+    for state in _states(problem.simulator, actions):
+        states.append(state)
+        scores.append(_scores(problem, problem.simulator.mass_tensor()))
     return [
         Recording(
             task=cfg.task.name,
             variant=cfg.variant,
             scene=problem.scenes[number],
             target_mass=problem.target_mass[number],
-            x=np.stack([state.x[number] for state in states]),
-            poses=np.stack([state.poses[number] for state in states]),
-            score=scores[number].score,
+            scores=np.array([score[number] for score in scores]),
+            **_history(states, number, motion=motion),
         )
         for number, cfg in enumerate(cfgs)
     ]
 
 
+def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str, np.ndarray]:
+    """Return what a recording has of each state, of one environment of the batch."""
+    names = ("x", "poses", *(("v", "F") if motion else ()))
+    return {name: np.stack([getattr(state, name)[number] for state in states]) for name in names}
+
+
+def _scores(problem: Problem, mass: np.ndarray) -> list[float]:
+    """Return the scores of states by their mass tensors, shape [batch, n, n, n].
+
+    As :meth:`plab.problem.Problem.scores`, but what does not change is not computed again.
+    """
+    return [
+        scores_from_iou(first.iou_initial, soft_iou(now, target), first.iou_target_self).score
+        for first, now, target in zip(problem.initial_scores, mass, problem.target_mass, strict=True)
+    ]
+
+
 @functools.cache
-def _say(message: str) -> None:
+def say(message: str) -> None:
     """Print a message, once however many runs it is true of."""
     print(f"plab: {message}", file=sys.stderr)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyvista as pv
+from vtkmodules.vtkRenderingCore import vtkRenderer
 
 from plab.errors import ArgumentError
 from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
@@ -75,10 +76,12 @@ class Renderer:
         self._manipulators = [Rigid(self._plotter, manipulator) for manipulator in scene.manipulators]
         self._target: Target | None = None
         if target_mass is not None:
-            self._target = Target(self._plotter, scene, target_mass, self.camera)
+            self._target = Target(plotter, _layer_on_top(plotter), scene, target_mass, self.camera)
 
     def frame(self, x: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Draw a state, with the target's ghost in it.
+        """Draw a state, with the target's ghost in it, also inside plasticine.
+
+        Manipulators let be seen what they do to plasticine behind them.
 
         Args:
             x: Particle positions [domain units], shape [particle, 3].
@@ -96,6 +99,8 @@ class Renderer:
             raise ArgumentError(f"x has shape {np.shape(x)}, not {(self._scene.particle_count, 3)}")
         x = np.asarray(x, np.float64)
         clouds = [Cloud(x, self._particle_area), *(rigid.cloud for rigid in self._manipulators)]
+        for rigid in self._manipulators:
+            rigid.reveal(x, self.camera)
         fields = [surface.field(x[at]) for surface, at in zip(self._surfaces, self._slices, strict=True)]
         ambient = AmbientLight(clouds)
         for body, field in zip(self._bodies, fields, strict=True):
@@ -103,7 +108,7 @@ class Renderer:
         shown = [actor for thing in self._things if thing is not self._target for actor in thing.actors]
         if self._target is not None:
             self._target.fade(fields)
-            shown.append(self._target.ghost)
+            shown += self._target.ghost
         return self._draw(shown, clouds)
 
     def target(self, poses: np.ndarray) -> np.ndarray:
@@ -174,6 +179,17 @@ class Renderer:
         camera.up, camera.view_angle = (0.0, 1.0, 0.0), self.camera.angle
         plotter.camera_set = True
         return plotter
+
+
+def _layer_on_top(plotter: pv.Plotter) -> vtkRenderer:
+    """Add a layer that is drawn over all else of a window, seen by the same camera."""
+    window, layer = plotter.render_window, vtkRenderer()
+    layer.SetLayer(window.GetNumberOfLayers())
+    window.SetNumberOfLayers(layer.GetLayer() + 1)
+    layer.SetActiveCamera(plotter.renderer.GetActiveCamera())
+    layer.SetUseOIT(False)
+    window.AddRenderer(layer)
+    return layer
 
 
 def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:

@@ -1,17 +1,21 @@
-"""Soft shadows: on the floor, and where surfaces meet. Plain NumPy.
+"""Soft shadows, on the floor and where surfaces meet, and what hides what. Plain NumPy.
 
 Whatever throws a shadow is a cloud of points, each of which covers a small area.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.spatial import cKDTree
 
-__all__ = ["FLOOR_EDGE", "FLOOR_LOW", "AmbientLight", "Cloud", "floor_light"]
+from plab.render.camera import Camera
+
+__all__ = ["FLOOR_EDGE", "FLOOR_LOW", "AmbientLight", "Cloud", "floor_light", "hidden_share"]
 
 FLOOR_LOW = -0.4
 """Lowest x and z of the floor that can lie in shadow [domain units]."""
@@ -30,6 +34,8 @@ _OPACITY = 1.5
 _LOOK_OUT = 0.03  # distance from a surface at which its light is measured
 _OWN_COVER = 0.06  # what a flat surface covers of its own view
 _STRENGTH = 1.1
+_VIEW_CELL = 0.02  # of the picture in which things hide each other [domain units where it looks at]
+_CONTACT = 0.1  # distance up to which a manipulator is at work on plasticine [domain units]
 _DARKEST = 0.25
 
 
@@ -74,6 +80,30 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
             covered = 1.0 - np.exp(-layer.reshape(lit.shape).astype(np.float32))
             lit *= 1.0 - gaussian_filter(covered, blur / pixel, truncate=2.5)
     return lit
+
+
+def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
+    """Return how much of what is seen of a thing hides plasticine that it touches, or nearly so.
+
+    Args:
+        front: Points of the thing [domain units], shape [point, 3].
+        clay: Points of the plasticine, likewise.
+        camera: Where the picture is taken from.
+
+    Returns:
+        Share of the area that the thing takes of the picture.
+    """
+    low, high = front.min(axis=0) - _CONTACT, front.max(axis=0) + _CONTACT
+    near = clay[np.all((clay > low) & (clay < high), axis=1)]
+    near = near[cKDTree(front).query(near, distance_upper_bound=_CONTACT)[0] < _CONTACT]
+    right, up, back = ((np.concatenate([front, near]) - np.array(camera.position)) @ camera.axes().T).T
+    scale = math.dist(camera.position, camera.look_at) / _VIEW_CELL
+    _, cell = np.unique((scale * np.stack([right, up]) / back).astype(np.int64), axis=1, return_inverse=True)
+    count = len(front)
+    nearest = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest, cell[:count], -back[:count])
+    hides = np.unique(cell[count:][-back[count:] > nearest[cell[count:]]])
+    return len(hides) / np.count_nonzero(np.isfinite(nearest))
 
 
 class AmbientLight:

@@ -1,0 +1,165 @@
+"""The files: particles with what they have, surfaces of plasticine and manipulators, and the target.
+
+VTK's own writers write them, through PyVista.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pyvista as pv
+
+from plab.progress import show_progress
+from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, surface_mesh, target_mesh
+from plab.render.recording import Recording
+from plab.render.renderer import BODY_COLORS
+from plab.render.shapes import manipulator_parts, pose_matrix
+from plab.render.surface import body_slices, body_surfaces
+
+__all__ = ["quantities", "write_ply", "write_vtk"]
+
+Things = Callable[[int], Mapping[str, pv.PolyData]]
+"""Gives what there is at a step, by name."""
+
+
+def write_vtk(recording: Recording, folder: Path, every: int = 1) -> None:
+    """Write a rollout as VTK XML files and an index of each series over time [s], which ParaView opens.
+
+    Writes ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd``, with the
+    numbers of bodies and manipulators, and ``target.vtp``.
+
+    Args:
+        recording: The rollout, with motion.
+        folder: Folder to write to.
+        every: Environment steps from one frame to the next.
+    """
+    scene = recording.scene
+    series: dict[str, dict[float, str]] = {}
+    for step, things in _frames(recording, every, _vtk_things):
+        for name, mesh in things.items():
+            file = f"{name}_{step:04d}.vtp"
+            mesh.save(folder / file)
+            series.setdefault(name, {})[step * scene.substeps * scene.dt] = file
+    for name, files in series.items():
+        root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+        collection = ElementTree.SubElement(root, "Collection")
+        for time, file in files.items():
+            ElementTree.SubElement(collection, "DataSet", timestep=f"{time:.9g}", part="0", file=file)
+        ElementTree.ElementTree(root).write(folder / f"{name}.pvd", encoding="utf-8", xml_declaration=True)
+    if (target := _target(recording)) is not None:
+        target.save(folder / "target.vtp")
+
+
+def write_ply(recording: Recording, folder: Path, every: int = 1) -> None:
+    """Write surfaces as PLY files with colours, for Blender.
+
+    Writes ``plasticine_0000.ply`` and ``manipulators_0000.ply`` for each frame, and ``target.ply``.
+
+    Args:
+        recording: The rollout.
+        folder: Folder to write to.
+        every: Environment steps from one frame to the next.
+    """
+    colors = {"plasticine": ("body", BODY_COLORS), "manipulators": ("manipulator", (MANIPULATOR_COLOR,))}
+    for step, things in _frames(recording, every, _surfaces):
+        for name, mesh in things.items():
+            numbers, palette = colors[name]
+            _save_ply(mesh, mesh[numbers], palette, folder / f"{name}_{step:04d}.ply")
+    if (target := _target(recording)) is not None:
+        _save_ply(target, np.zeros(target.n_points, int), (TARGET_COLOR,), folder / "target.ply")
+
+
+def _frames(
+    recording: Recording, every: int, things: Callable[[Recording], Things]
+) -> Iterator[tuple[int, Mapping[str, pv.PolyData]]]:
+    """Yield steps and what there is at them, by name."""
+    last = len(recording.x) - 1
+    at = things(recording)
+    with show_progress("export", 0, last) as report:
+        for step in sorted({*range(0, last, every), last}):
+            yield step, at(step)
+            report(step, "")
+
+
+def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], path: Path) -> None:
+    """Write a mesh whose points have the colours of a palette, by their numbers."""
+    rgb = np.array([pv.Color(color).int_rgb for color in palette], np.uint8)
+    mesh.triangulate().save(path, texture=rgb[np.asarray(numbers) % len(rgb)])
+
+
+# ----------------------------------------------------------------------------------------------------- things
+
+
+def _vtk_things(recording: Recording) -> Things:
+    surfaces = _surfaces(recording)
+
+    def at(step: int) -> Mapping[str, pv.PolyData]:
+        particles = pv.PolyData(recording.x[step])
+        for name, values in quantities(recording, step).items():
+            particles[name] = values
+        return {"particles": particles, **surfaces(step)}
+
+    return at
+
+
+def quantities(recording: Recording, step: int) -> dict[str, np.ndarray]:
+    """Return what the particles of a recording with motion have, at a step.
+
+    Returns:
+        ``body``, its number; ``displacement`` since the start [domain units]; ``velocity`` [domain units /
+        s]; ``volume_ratio``, the determinant of the deformation gradient; ``elastic_strain``, the norm of its
+        deviatoric Hencky strain; ``yielding``, that strain divided by the one at which plasticine yields, 1
+        where it does (0 in purely elastic bodies). Vectors of shape [particle, 3], else [particle].
+    """
+    if recording.v is None or recording.F is None:
+        raise ValueError("the recording has no velocities and deformation gradients")
+    scene, F = recording.scene, recording.F[step]
+    hencky = np.log(np.linalg.svd(F, compute_uv=False))
+    strain = np.linalg.norm(hencky - hencky.mean(axis=1, keepdims=True), axis=1)
+    # A yield stress of 0 is that of a fluid: everything yields.
+    limit = max(scene.yield_stress / (2.0 * scene.shear_modulus), np.finfo(float).tiny)
+    return {
+        "body": np.repeat(np.arange(len(scene.bodies)), [body.particles for body in scene.bodies]),
+        "displacement": recording.x[step] - recording.x[0],
+        "velocity": recording.v[step],
+        "volume_ratio": np.linalg.det(F),
+        "elastic_strain": strain,
+        "yielding": np.minimum(strain / limit, 1.0),
+    }
+
+
+def _surfaces(recording: Recording) -> Things:
+    scene = recording.scene
+    bodies = list(zip(body_slices(scene), body_surfaces(scene), strict=True))
+    parts = [
+        (number, part.side, part_mesh(part))
+        for number, manipulator in enumerate(scene.manipulators)
+        for part in manipulator_parts(manipulator)
+    ]
+
+    def at(step: int) -> Mapping[str, pv.PolyData]:
+        x, poses = recording.x[step], recording.poses[step]
+        clay = [surface_mesh(surface.field(x[at])) for at, surface in bodies]
+        rigid = [mesh.transform(pose_matrix(poses[k], side), inplace=False) for k, side, mesh in parts]
+        return {
+            "plasticine": _merged(clay, range(len(clay)), "body"),
+            "manipulators": _merged(rigid, [k for k, *_ in parts], "manipulator"),
+        }
+
+    return at
+
+
+def _merged(meshes: Sequence[pv.PolyData], numbers: Sequence[int], name: str) -> pv.PolyData:
+    """Return meshes as one, whose points say which of them they are of."""
+    for number, mesh in zip(numbers, meshes, strict=True):
+        mesh[name] = np.full(mesh.n_points, number)
+    return pv.merge(meshes, merge_points=False)
+
+
+def _target(recording: Recording) -> pv.PolyData | None:
+    """Return the target's surface, if there is a target."""
+    mass = recording.target_mass
+    return None if mass is None else target_mesh(recording.scene, mass)

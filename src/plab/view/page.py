@@ -1,0 +1,182 @@
+"""The page: particles, manipulators and target as K3D-jupyter's objects, and a bar to play them with."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Iterator, Sequence
+from importlib.metadata import files as installed_files
+from importlib.resources import files
+from typing import Any
+
+import k3d
+import numpy as np
+import pyvista as pv
+from jinja2 import Environment, StrictUndefined
+
+from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, target_mesh
+from plab.render.camera import scene_camera
+from plab.render.recording import Recording
+from plab.render.renderer import BODY_COLORS, INK, PAPER
+from plab.render.shapes import manipulator_parts, pose_matrix
+from plab.render.surface import body_slices, body_volume
+
+__all__ = ["page"]
+
+_FRAMES = 60
+_POSITIONS = 600_000  # of particles in all frames together: some 6 MB of the page
+_LEVELS = 2**16  # per domain unit, to which positions are rounded: what is not there need not be packed
+_STEPS_PER_SECOND = 10
+_ASPECT = 4 / 3  # of the window that the camera is fitted to; the page moves it away in a narrower one
+_GHOST_OPACITY = 0.3
+_OVERLAP = 1.2  # diameter of a particle, in mean distances of neighbours
+_FLOOR = np.linspace(0.0, 1.0, 11)  # where its lines are [domain units]
+_LINE = 0.0012  # their width [domain units]
+_PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+_LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt")
+
+
+def page(recording: Recording, every: int | None = None) -> str:
+    """Return a page that plays a rollout, below 10 MB whatever its length.
+
+    Positions are rounded to 16 bits per domain unit. Of very many particles every second or third is shown.
+
+    Args:
+        recording: The rollout.
+        every: Environment steps from one frame to the next, between which the page interpolates; None: so
+            many that there are no more than 60 frames.
+
+    Returns:
+        HTML.
+    """
+    last = len(recording.x) - 1
+    every = every or max(1, -(-last // _FRAMES))
+    steps = sorted({*range(0, last, every), last})
+    camera = scene_camera(
+        recording.scene,
+        recording.target_mass,
+        (round(300 * _ASPECT), 300),
+        recording.x[[0, -1]],
+        recording.poses[::5],
+    )
+    plot = k3d.plot(
+        antialias=2,
+        background_color=_number(PAPER),
+        camera_auto_fit=False,
+        camera_fov=camera.angle,
+        camera_mode="orbit",
+        camera_up_axis="y",
+        grid_visible=False,
+        axes_helper=0,
+        menu_visibility=False,
+    )
+    things = [*_bodies(recording, steps), *_manipulators(recording, steps), *_ghost(recording), _floor()]
+    for number, thing in enumerate(things, start=1):
+        # Not where it lies in memory: the same rollout gives the same page.
+        thing.id = number
+        plot += thing
+    snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
+    # The page sets the camera itself, when it knows how wide its window is.
+    seen = [*camera.position, *camera.look_at, 0.0, 1.0, 0.0]
+    return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
+
+
+def _bodies(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
+    """Yield the particles of each body."""
+    scene = recording.scene
+    stride = -(-len(steps) * scene.particle_count // _POSITIONS)
+    for number, (body, at) in enumerate(zip(scene.bodies, body_slices(scene), strict=True)):
+        spacing = (stride * body_volume(body) / body.particles) ** (1 / 3)
+        x = np.round(recording.x[steps, at][:, ::stride] * _LEVELS) / _LEVELS
+        yield k3d.points(
+            {str(step): frame for step, frame in zip(steps, x.astype(np.float32), strict=True)},
+            color=_number(BODY_COLORS[number % len(BODY_COLORS)]),
+            point_size=_OVERLAP * spacing,
+            roughness=0.9,
+            group="plasticine",
+        )
+
+
+def _manipulators(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
+    """Yield the parts of the manipulators."""
+    for number, manipulator in enumerate(recording.scene.manipulators):
+        for part in manipulator_parts(manipulator):
+            poses = recording.poses[steps, number]
+            matrices = [pose_matrix(pose, part.side).astype(np.float32) for pose in poses]
+            mesh = _mesh(part_mesh(part), MANIPULATOR_COLOR, "manipulators")
+            mesh.model_matrix = {str(step): matrix for step, matrix in zip(steps, matrices, strict=True)}
+            yield mesh
+
+
+def _ghost(recording: Recording) -> Iterator[Any]:
+    """Yield the target, if there is one."""
+    if recording.target_mass is not None:
+        mesh = _mesh(target_mesh(recording.scene, recording.target_mass), TARGET_COLOR, "target")
+        mesh.opacity = _GHOST_OPACITY
+        yield mesh
+
+
+def _floor() -> Any:
+    low, high = np.full_like(_FLOOR, _FLOOR[0]), np.full_like(_FLOOR, _FLOOR[-1])
+    along = np.stack([np.stack([low, _FLOOR], axis=-1), np.stack([high, _FLOOR], axis=-1)], axis=1)
+    ends = np.concatenate([along, along[..., ::-1]]).reshape(-1, 2)
+    return k3d.lines(
+        np.insert(ends, 1, 0.0, axis=1).astype(np.float32),
+        np.arange(len(ends), dtype=np.uint32).reshape(-1, 2),
+        indices_type="segment",
+        color=_number(INK),
+        opacity=0.2,
+        width=_LINE,
+        group="floor",
+    )
+
+
+def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
+    mesh = mesh.triangulate()
+    return k3d.mesh(
+        np.asarray(mesh.points, np.float32),
+        mesh.regular_faces.astype(np.uint32),
+        normals=np.asarray(mesh.point_normals, np.float32),
+        color=_number(color),
+        flat_shading=False,
+        roughness=0.6,
+        group=group,
+    )
+
+
+def _with_bar(snapshot: str, recording: Recording, camera: Sequence[float], groups: set[str]) -> str:
+    """Return K3D-jupyter's page with a title, the bar, and the licences of what is in it."""
+    scores = recording.scores
+    content = {
+        "steps": len(recording.x) - 1,
+        "speed": _STEPS_PER_SECOND,
+        "scores": None if scores is None else [round(float(score), 3) for score in scores],
+        "camera": [round(float(number), 4) for number in camera],
+        "aspect": _ASPECT,
+    }
+    title = f"{recording.task}, variant {recording.variant}"
+    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(
+        (files("plab.view") / "web" / "bar.html").read_text(encoding="utf-8")
+    )
+    bar = template.render(
+        title=title,
+        # The only sign with which text could leave the script that it is in.
+        content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
+        faded=[group for group in ("plasticine", "manipulators", "target") if group in groups],
+    )
+    head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
+    snapshot = re.sub("<title>.*?</title>", lambda _: head, snapshot, count=1)
+    snapshot = snapshot.replace("<body>", f"<body>\n{bar}", 1)
+    return snapshot.replace("<head>", f"<head>\n<!--\n{_licences()}\n-->", 1)
+
+
+def _licences() -> str:
+    """Return the licences of K3D-jupyter and of what it brings along: they ask to be passed on."""
+    found = [path for path in installed_files("k3d") or [] if path.name in _LICENCES]
+    return "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in sorted(found))
+
+
+def _number(color: str) -> int:
+    """Return a colour, ``#rrggbb``, as K3D-jupyter has it."""
+    return int(color[1:], 16)
