@@ -26,7 +26,7 @@ from plab.problem import Problem
 from plab.submissions import record
 from plab.submissions.files import read, write
 from plab.submissions.members import SubmissionError
-from plab.submissions.schema import Digests, Entry, Submission, configuration_of
+from plab.submissions.schema import Submission
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, read_verification
 from plab.submissions.verifying import verify as simulate_again
 
@@ -175,10 +175,9 @@ def test_a_lie_is_found(recorded: Path, capsys: pytest.CaptureFixture[str]) -> N
     lying(recorded, score=claimed)
     assert verify.main([str(recorded), "--float32", *COARSE]) == 1
     out, err = capsys.readouterr()
-    assert err.splitlines() == [
-        f"plab: {recorded}: Move-v2 after 3 steps: claims {claimed:.4f}, scores {honest.score:.4f} in float32 "
-        "(tolerance 0.02)"
-    ]
+    reached = f"scores {honest.score:.4f} in float32 (tolerance 0.02)"
+    line = f"plab: {recorded}: Move-v2 after 3 steps: claims {claimed:.4f}, {reached}"
+    assert err.splitlines() == [line]
     assert "1 of 2 claim(s) hold" in out
     kept = read_verification(read(recorded))
     assert kept is not None and kept.outcomes == {HOLDS, LIES}
@@ -329,8 +328,6 @@ def test_an_agent_from_outside_gets_to_the_leaderboard(
     assert re.findall(r"^steps (\d+),", capsys.readouterr().out, re.MULTILINE) == ["12", "24"]
 
     usual = ["--card", str(CARD), "--output"]
-    assert submit.main(["recordings", *usual, "board/plan.plabsub.zip"]) == 2  # there is no such folder
-    Path("board").mkdir()
     assert submit.main(["recordings", *usual, "board/plan.plabsub.zip"]) == 0
     policy = ["--policy", "Move=policy.pt", "--steps", "24", *COARSE]
     assert submit.main([*policy, *usual, "board/policy.plabsub.zip"]) == 0

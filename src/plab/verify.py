@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -43,9 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = [word for word in options.arguments if "=" in word]
     precisions = PRECISIONS[:1] if options.float32 else PRECISIONS
     # A file that cannot be judged does not keep the others from it.
-    return max(
-        answered(lambda path=path: _run(path, words, options.run_policies, precisions)) for path in files
-    )
+    return max(answered(partial(_run, path, words, options.run_policies, precisions)) for path in files)
 
 
 def _files(sources: Sequence[Path]) -> list[Path]:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from plab.config import Config
 from plab.examples import example_archive
 from plab.report.budgets import BUDGETS
-from plab.report.collect import changed_settings
 from plab.report.methods import GRADIENT, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
-from plab.results import ResultsError, Row
+from plab.results import ResultsError, Row, config_dict
 from plab.results.loading import readable_rows
 from plab.submissions.card import Card
 from plab.submissions.collecting import steps_to_best, submission_files
@@ -202,6 +204,11 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
 # ------------------------------------------------------------------------------------------------- handed in
 
 
+@functools.cache
+def _composed(place: Configuration, overrides: tuple[str, ...]) -> Config:
+    return place.config(overrides)
+
+
 class _Known:
     """Digests of the configurations that belong to a board, composed once."""
 
@@ -216,7 +223,7 @@ class _Known:
             # The scene is the same, and the authors' files need not be here.
             own = replace(place, targets="suite")
             if own not in self._digests:
-                self._digests[own] = Digests.of(own.config(self._overrides))
+                self._digests[own] = Digests.of(_composed(own, self._overrides))
             known = self._digests[own]
             if entry.digests.scene != known.scene:
                 return f"the scene of {place.name}"
@@ -268,8 +275,10 @@ def _points(
 # -------------------------------------------------------------------------------------------- first entries
 
 
-def _own() -> Iterator[tuple[tuple[str, str], Line]]:
-    """Yield the lines of plab's own runs, of the archives that come with it."""
+@functools.cache
+def _own() -> tuple[tuple[tuple[str, str], Line], ...]:
+    """Return the lines of plab's own runs, of the archives that come with it, and their tables."""
+    found = []
     archives = {
         "example": ("suite", "plab"),
         "targets": ("authors", "plab"),
@@ -280,18 +289,28 @@ def _own() -> Iterator[tuple[tuple[str, str], Line]]:
             points = [
                 Point(_place(row, *place), steps_to_best(row), row.values["score_best"]) for row in runs
             ]
-            yield place, _line(card, "plans", "own runs", place[0], points)
+            found.append((place, _line(card, "plans", "own runs", place[0], points)))
+    return tuple(found)
 
 
-def _runs(name: str) -> Iterator[tuple[Card, list[Row]]]:
-    """Yield the runs of an archive by method: of gradient methods with seed 0, whose tasks are today's."""
+@functools.cache
+def _runs(name: str) -> list[tuple[Card, list[Row]]]:
+    """Return the runs of an archive by method: of gradient methods with seed 0, whose targets are today's."""
     groups: dict[str, list[Row]] = defaultdict(list)
     for row in readable_rows(example_archive(name))[0]:
-        stale = any(key.startswith(("task.", "sim.")) for key in changed_settings(row.config))
-        if row.values["seed"] == 0 and method(row.values["method"]).kind == GRADIENT and not stale:
+        gradient = method(row.values["method"]).kind == GRADIENT
+        if row.values["seed"] == 0 and gradient and _of_today(row.config):
             groups[row.values["method"]].append(row)
-    for own, rows in groups.items():
-        yield replace(OWN, name=method(own).label, gradient=True, hardware="NVIDIA H200"), rows
+    look = replace(OWN, gradient=True, hardware="NVIDIA H200")
+    return [(replace(look, name=method(own).label), rows) for own, rows in groups.items()]
+
+
+def _of_today(config: Mapping[str, Any]) -> bool:
+    """Return whether a run's target is what its task has today; those in files of the authors are."""
+    if config["targets"]["source"] is not None:
+        return True
+    today = _composed(Configuration(config["task"]["name"], str(config["variant"])), ())
+    return config["task"]["target"] == config_dict(today)["task"]["target"]
 
 
 def _place(row: Row, targets: str, terms: str) -> Configuration:

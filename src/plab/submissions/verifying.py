@@ -89,13 +89,15 @@ def verify(
     given = tuple(overrides)
     cfgs = _configs(submission, given)
     scores: dict[int, dict[str, Played]] = defaultdict(dict)
-    for numbers in _groups(submission):
-        entries = [submission.entries[number] for number in numbers]
-        if entries[0].policy and not run_policies:
-            continue
-        chosen = [cfgs[entry.configuration] for entry in entries]
-        play = _player(submission, entries)
-        for precision in precisions:
+    groups = [
+        (numbers, _player(submission, [submission.entries[number] for number in numbers]))
+        for numbers in _groups(submission)
+        if run_policies or not submission.entries[numbers[0]].policy
+    ]
+    # Going from one precision to the other starts Taichi anew.
+    for precision in precisions:
+        for numbers, play in groups:
+            chosen = [cfgs[submission.entries[number].configuration] for number in numbers]
             for number, played in zip(numbers, play(chosen, precision), strict=True):
                 scores[number][precision] = played
     verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
