@@ -365,7 +365,8 @@ def test_a_card_that_is_none(text: bytes, line: str) -> None:
 
 def test_cards_that_are_shown_are_good() -> None:
     example = (ROOT / "examples" / "outside_agent" / "card.yaml").read_text(encoding="utf-8")
-    assert parse_card(example.encode(), "card.yaml").name == "PPO in one file"
+    shown = parse_card(example.encode(), "card.yaml")
+    assert (shown.name, shown.hardware) == ("PPO in one file", "two CPU cores")
     assert example in (ROOT / "docs" / "submissions.md").read_text(encoding="utf-8")
 
 

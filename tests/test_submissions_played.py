@@ -20,9 +20,7 @@ from onnx import TensorProto, helper
 
 import plab  # noqa: F401
 from plab import leaderboard, submit, verify
-from plab.config import load_config
 from plab.envs.vector import PlabVectorEnv
-from plab.problem import Problem
 from plab.submissions import record
 from plab.submissions.files import read, write
 from plab.submissions.members import SubmissionError
@@ -33,12 +31,12 @@ from plab.submissions.verifying import verify as simulate_again
 pytestmark = pytest.mark.physics
 
 ROOT = Path(__file__).resolve().parents[1]
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+COARSE = ("sim.grid_size=32", "sim.horizon=6", "sim.substeps=7", "sim.dt=2.7e-4", "sim.particles_scale=0.03")
 CARD = ROOT / "examples" / "outside_agent" / "card.yaml"
 
 
 def make(variant: str = "1", **keywords: Any) -> gymnasium.Env:
-    return gymnasium.make(f"plab/Move-v{variant}", overrides=list(COARSE), **keywords)
+    return gymnasium.make(f"plab/RollingPin-v{variant}", overrides=list(COARSE), **keywords)
 
 
 def episode(env: gymnasium.Env, actions: np.ndarray) -> float:
@@ -49,14 +47,8 @@ def episode(env: gymnasium.Env, actions: np.ndarray) -> float:
 
 @pytest.fixture
 def plans() -> np.ndarray:
-    """Three plans of different score, the second the best: shape [plan, T, A]."""
-    rng = np.random.default_rng(0)
-    drawn = rng.uniform(-1.0, 1.0, (3, 3, 6)).astype(np.float32)
-    problem = Problem([load_config(["task=Move", *COARSE])] * 3)
-    problem.simulator.set_contact("hard")
-    iou = problem.rollout(drawn, gradient=False).iou[:, -1]
-    low, middle, high = np.argsort(iou)
-    return drawn[[middle, high, low]]
+    """Three plans, which score 0.004, 0.011 and 0.001 in variant 1; shape [plan, T, A]."""
+    return np.stack([np.tile(np.float32(action), (6, 1)) for action in ([0, 1, 0], [0, 0, -1], [-1, 0, 0])])
 
 
 def submission(tmp_path: Path, *argv: str, code: int = 0) -> Path:
@@ -71,14 +63,15 @@ def submission(tmp_path: Path, *argv: str, code: int = 0) -> Path:
 def test_the_best_episode_of_each_budget_is_kept(
     tmp_path: Path, plans: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plab.submissions.recording.BUDGETS", (4, 7))
+    monkeypatch.setattr("plab.submissions.recording.BUDGETS", (7, 13))
     env = record(make(), tmp_path)
     scores = [episode(env, plan) for plan in plans]
-    found = read(tmp_path / "Move-v1.plabsub.zip")
-    # The first within 4 steps, the second within 7 and of all.
-    assert [(e.steps, e.score) for e in found.entries] == [(3, scores[0]), (6, scores[1])]
+    found = read(tmp_path / "RollingPin-v1.plabsub.zip")
+    assert scores[1] > scores[0] > scores[2] > 0
+    # The first within 7 steps, the second within 13 and of all.
+    assert [(e.steps, e.score) for e in found.entries] == [(6, scores[0]), (12, scores[1])]
     assert np.array_equal(found.entries[1].actions, plans[1])
-    assert found.card is None and found.entries[0].configuration.name == "Move-v1"
+    assert found.card is None and found.entries[0].configuration.name == "RollingPin-v1"
 
 
 def test_an_episode_that_was_left_counts_its_steps(tmp_path: Path, plans: np.ndarray) -> None:
@@ -86,37 +79,36 @@ def test_an_episode_that_was_left_counts_its_steps(tmp_path: Path, plans: np.nda
     env.reset()
     env.step(plans[0][0])
     score = episode(env, plans[1])
-    (entry,) = read(tmp_path / "Move-v1.plabsub.zip").entries
-    assert (entry.steps, entry.score) == (4, score) and np.array_equal(entry.actions, plans[1])
+    (entry,) = read(tmp_path / "RollingPin-v1.plabsub.zip").entries
+    assert (entry.steps, entry.score) == (7, score) and np.array_equal(entry.actions, plans[1])
 
 
 def test_actions_beyond_the_bounds_are_recorded_as_the_simulator_takes_them(tmp_path: Path) -> None:
     env = record(make(disable_env_checker=True), tmp_path)
-    score = episode(env, np.full((3, 6), 7.0))
-    (entry,) = read(tmp_path / "Move-v1.plabsub.zip").entries
-    assert np.array_equal(entry.actions, np.ones((3, 6))) and entry.score == score
+    score = episode(env, np.full((6, 3), 7.0))
+    (entry,) = read(tmp_path / "RollingPin-v1.plabsub.zip").entries
+    assert np.array_equal(entry.actions, np.ones((6, 3))) and entry.score == score
 
 
 def test_environments_of_a_configuration_share_a_recording(tmp_path: Path, plans: np.ndarray) -> None:
     first, second = (record(make(), tmp_path) for _ in range(2))
     episode(first, plans[0])
     best = episode(second, plans[1])
-    found = read(tmp_path / "Move-v1.plabsub.zip").entries
-    assert [(e.steps, e.score) for e in found] == [(6, best)]
+    found = read(tmp_path / "RollingPin-v1.plabsub.zip").entries
+    assert [(e.steps, e.score) for e in found] == [(12, best)]
 
 
 def test_many_environments_in_one_simulator(tmp_path: Path, plans: np.ndarray) -> None:
     own = [["variant=1"], ["variant=1"], ["variant=2"]]
-    envs = gymnasium.make_vec(
-        "plab/Move-v1", num_envs=3, overrides=list(COARSE), vector_kwargs={"overrides_per_env": own}
-    )
+    overrides = list(COARSE)
+    envs = gymnasium.make_vec("plab/RollingPin-v1", num_envs=3, overrides=overrides, overrides_per_env=own)
     envs = record(envs, tmp_path)
     envs.reset()
     for actions in plans.swapaxes(0, 1):
         infos = envs.step(actions)[4]
     scores = infos["final_info"]["score"]
-    (one,), (two,) = (read(tmp_path / f"Move-v{v}.plabsub.zip").entries for v in "12")
-    assert (one.steps, one.score, two.steps, two.score) == (6, scores[1], 3, scores[2])
+    (one,), (two,) = (read(tmp_path / f"RollingPin-v{v}.plabsub.zip").entries for v in "12")
+    assert (one.steps, one.score, two.steps, two.score) == (12, scores[1], 6, scores[2])
     assert np.array_equal(one.actions, plans[1]) and np.array_equal(two.actions, plans[2])
 
 
@@ -135,7 +127,7 @@ def test_what_cannot_be_recorded(tmp_path: Path) -> None:
     each = "record each environment inside of it, or what make_vec gives at once"
     assert why(many) == f"SyncVectorEnv: {each}"
     assert not list(tmp_path.iterdir())
-    there = tmp_path / "Move-v1.plabsub.zip"
+    there = tmp_path / "RollingPin-v1.plabsub.zip"
     there.write_bytes(b"")
     assert why(make()) == f"{there} is there already: record into another folder, or remove it"
 
@@ -176,7 +168,7 @@ def test_a_lie_is_found(recorded: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert verify.main([str(recorded), "--float32", *COARSE]) == 1
     out, err = capsys.readouterr()
     reached = f"scores {honest.score:.4f} in float32 (tolerance 0.02)"
-    line = f"plab: {recorded}: Move-v2 after 3 steps: claims {claimed:.4f}, {reached}"
+    line = f"plab: {recorded}: RollingPin-v2 after 6 steps: claims {claimed:.4f}, {reached}"
     assert err.splitlines() == [line]
     assert "1 of 2 claim(s) hold" in out
     kept = read_verification(read(recorded))
@@ -185,8 +177,8 @@ def test_a_lie_is_found(recorded: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 def test_plans_of_another_shape(recorded: Path) -> None:
     with pytest.raises(SubmissionError) as caught:
-        simulate_again(lying(recorded, actions=np.zeros((3, 5))), COARSE)
-    assert str(caught.value) == "Move-v2: the plan has shape [3, 5], its task takes [3, 6]"
+        simulate_again(lying(recorded, actions=np.zeros((6, 2))), COARSE)
+    assert str(caught.value) == "RollingPin-v2: the plan has shape [6, 2], its task takes [6, 3]"
 
 
 def test_a_simulation_that_breaks_off(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +195,7 @@ def test_a_simulation_that_breaks_off(recorded: Path, monkeypatch: pytest.Monkey
     good, bad = simulate_again(read(recorded), COARSE, precisions=["float32"]).verdicts
     assert (good.outcome, bad.outcome) == (HOLDS, BROKE_OFF)
     why = "the simulation broke off, float32: at step 2: not finite"
-    assert bad.why == f"Move-v2 after 3 steps: {why}"
+    assert bad.why == f"RollingPin-v2 after 6 steps: {why}"
 
 
 # ------------------------------------------------------------------------------------------------ policies
@@ -212,7 +204,7 @@ def test_a_simulation_that_breaks_off(recorded: Path, monkeypatch: pytest.Monkey
 class Acting(torch.nn.Module):
     """Goes where its weights say, a little further the more it has seen."""
 
-    def __init__(self, entries: int, components: int = 6) -> None:
+    def __init__(self, entries: int, components: int = 3) -> None:
         super().__init__()
         self.layer = torch.nn.Linear(entries, components)
 
@@ -222,7 +214,7 @@ class Acting(torch.nn.Module):
 
 class Whim(Acting):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.layer(x.clamp(-1.0, 1.0)) + torch.rand(x.shape[0], 6)
+        return self.layer(x.clamp(-1.0, 1.0)) + torch.rand(x.shape[0], 3)
 
 
 def entries_of() -> int:
@@ -263,12 +255,12 @@ def test_policies_of_both_kinds_are_run_only_if_asked(
     files = [torchscript(tmp_path / "a.pt", module), as_onnx(tmp_path / "a.onnx", module)]
     scores = []
     for file in files:
-        made = submission(tmp_path, "--policy", f"Move={file}", "--steps", "60", *COARSE)
+        made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", *COARSE)
         assert [e.configuration.variant for e in read(made).entries] == list("12345")
         assert verify.main([str(made), *COARSE, "--float32"]) == 1
-        name = f"policies/Move{file.suffix}"
+        name = f"policies/RollingPin{file.suffix}"
         assert capsys.readouterr().err.splitlines() == [
-            f"plab: {made}: Move-v{v} after 60 steps: {name} was not run; --run-policies runs it"
+            f"plab: {made}: RollingPin-v{v} after 60 steps: {name} was not run; --run-policies runs it"
             for v in "12345"
         ]
         kept = read_verification(read(made))
@@ -282,7 +274,7 @@ def test_policies_of_both_kinds_are_run_only_if_asked(
 
 def test_a_policy_acts_in_unseen_configurations(tmp_path: Path) -> None:
     file = torchscript(tmp_path / "a.pt", Acting(entries_of()))
-    made = submission(tmp_path, "--policy", f"Move={file}", "--steps", "60", "--unseen", *COARSE)
+    made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
     assert sum(e.configuration.unseen for e in read(made).entries) == 10
     assert len({e.digests.scene for e in read(made).entries if e.configuration.unseen}) == 10
 
@@ -290,27 +282,29 @@ def test_a_policy_acts_in_unseen_configurations(tmp_path: Path) -> None:
 def test_policies_that_do_not_do(tmp_path: Path, told: Callable[..., str]) -> None:
     size = entries_of()
     file = tmp_path / "a.pt"
-    argv = ["--policy", f"Move={file}", "--steps", "60", *COARSE, "--card", str(CARD)]
+    argv = ["--policy", f"RollingPin={file}", "--steps", "60", *COARSE, "--card", str(CARD)]
     argv += ["--output", str(tmp_path / "x.plabsub.zip")]
 
     def line() -> str:
         return told(argv, submit.main).removeprefix(f"plab: {file}")
 
-    torchscript(file, Acting(size, 5))
-    assert line() == " gives actions of 5 components, its task takes 6"
+    torchscript(file, Acting(size, 2))
+    assert line() == " gives actions of 2 components, its task takes 3"
     torchscript(file, Whim(size))
     assert line() == " is not deterministic: one observation has two answers"
     broken = Acting(size)
     torch.nn.init.constant_(broken.layer.bias, float("nan"))
     torchscript(file, broken)
-    assert line().removeprefix("plab: ") == "policies/Move.pt gives actions that are not finite"
+    assert line().removeprefix("plab: ") == "policies/RollingPin.pt gives actions that are not finite"
     torchscript(file, Acting(size + 1))
-    assert line().startswith("plab: policies/Move.pt cannot be run (")
+    assert line().startswith("plab: policies/RollingPin.pt cannot be run (")
     file.write_bytes(b"no module")
-    assert line().startswith("plab: policies/Move.pt is no TorchScript module (")
+    assert line().startswith("plab: policies/RollingPin.pt is no TorchScript module (")
     file = file.rename(tmp_path / "a.onnx")
-    argv[1] = f"Move={file}"
-    assert told(argv, submit.main).startswith("plab: policies/Move.onnx is no ONNX model of one input (")
+    argv[1] = f"RollingPin={file}"
+    assert told(argv, submit.main).startswith(
+        "plab: policies/RollingPin.onnx is no ONNX model of one input ("
+    )
 
 
 # ---------------------------------------------------------------------------------------- from start to end
@@ -322,14 +316,24 @@ def test_an_agent_from_outside_gets_to_the_leaderboard(
     monkeypatch.chdir(tmp_path)
     script = ROOT / "examples" / "outside_agent" / "ppo.py"
     keywords = json.dumps({"overrides": list(COARSE)})
-    argv = [str(script), "--env-kwargs", keywords, "--total-steps", "24", "--minibatches", "2"]
+    argv = [
+        str(script),
+        "--env-id",
+        "plab:plab/RollingPin-v1",
+        "--env-kwargs",
+        keywords,
+        "--total-steps",
+        "48",
+        "--minibatches",
+        "2",
+    ]
     monkeypatch.setattr(sys, "argv", argv)
     runpy.run_path(str(script), run_name="__main__")
-    assert re.findall(r"^steps (\d+),", capsys.readouterr().out, re.MULTILINE) == ["12", "24"]
+    assert re.findall(r"^steps (\d+),", capsys.readouterr().out, re.MULTILINE) == ["24", "48"]
 
     usual = ["--card", str(CARD), "--output"]
     assert submit.main(["recordings", *usual, "board/plan.plabsub.zip"]) == 0
-    policy = ["--policy", "Move=policy.pt", "--steps", "24", *COARSE]
+    policy = ["--policy", "RollingPin=policy.pt", "--steps", "48", *COARSE]
     assert submit.main([*policy, *usual, "board/policy.plabsub.zip"]) == 0
     assert verify.main(["board", "--run-policies", *COARSE]) == 0
     assert leaderboard.main(["board", *COARSE, "--out", "page"]) == 0
@@ -342,5 +346,5 @@ def test_an_agent_from_outside_gets_to_the_leaderboard(
 
 def test_vector_environments_are_recorded_as_what_they_are() -> None:
     # record() takes what make_vec gives, which is no wrapper around it.
-    made = gymnasium.make_vec("plab/Move-v1", num_envs=1, overrides=list(COARSE))
+    made = gymnasium.make_vec("plab/RollingPin-v1", num_envs=1, overrides=list(COARSE))
     assert isinstance(made, PlabVectorEnv)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -53,9 +54,13 @@ def play_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], precision: s
                 raise SubmissionError(
                     f"{where}: the plan has shape {list(own.shape)}, its task takes {shape}"
                 )
-        stacked = np.stack(actions)
-        played += _play(batch, lambda t, _, stacked=stacked: stacked[:, t])
+        played += _play(batch, partial(_next_action, np.stack(actions)))
     return played
+
+
+def _next_action(plans: np.ndarray, t: int, _: np.ndarray) -> np.ndarray:
+    """Return the actions of a step, whatever is observed."""
+    return plans[:, t]
 
 
 def play_policy(cfgs: Sequence[Config], policy: Policy, name: str, precision: str) -> list[Played]:

@@ -121,7 +121,7 @@ class Recorder(
         (self._ledger,) = _ledgers_of(inner.batch, folder)
         self._actions: list[np.ndarray] = []
 
-    def reset(self, **kwargs: Any) -> tuple[Observation, dict[str, Any]]:  # type: ignore[override]
+    def reset(self, **kwargs: Any) -> tuple[Observation, dict[str, Any]]:
         """Start an episode; one that has not ended is not recorded, its steps count."""
         self._actions = []
         return self.env.reset(**kwargs)
@@ -150,7 +150,7 @@ class VectorRecorder(VectorWrapper):
         self._ledgers = _ledgers_of(env.batch, folder)
         self._actions: list[np.ndarray] = []
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:  # type: ignore[override]
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Start the episodes; those that have not ended are not recorded, their steps count."""
         self._actions = []
         return self.env.reset(**kwargs)
