@@ -202,11 +202,14 @@ def test_a_simulation_that_breaks_off(recorded: Path, monkeypatch: pytest.Monkey
 
 
 class Acting(torch.nn.Module):
-    """Goes where its weights say, a little further the more it has seen."""
+    """Goes down, and a little to where its weights say."""
 
     def __init__(self, entries: int, components: int = 3) -> None:
         super().__init__()
         self.layer = torch.nn.Linear(entries, components)
+        with torch.no_grad():
+            self.layer.weight.mul_(1e-3)
+            self.layer.bias.zero_()[-1] = -1.0
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.layer(x.clamp(-1.0, 1.0))
@@ -265,7 +268,7 @@ def test_policies_of_both_kinds_are_run_only_if_asked(
         ]
         kept = read_verification(read(made))
         assert kept is not None and kept.outcomes == {NOT_RUN}
-        assert verify.main([str(made), *COARSE, "--run-policies"]) == 0
+        assert verify.main([str(made), *COARSE, "--run-policies", "--float32"]) == 0
         capsys.readouterr()
         scores.append([e.score for e in read(made).entries])
     assert scores[0] == pytest.approx(scores[1], abs=1e-3)
@@ -335,7 +338,7 @@ def test_an_agent_from_outside_gets_to_the_leaderboard(
     assert submit.main(["recordings", *usual, "board/plan.plabsub.zip"]) == 0
     policy = ["--policy", "RollingPin=policy.pt", "--steps", "48", *COARSE]
     assert submit.main([*policy, *usual, "board/policy.plabsub.zip"]) == 0
-    assert verify.main(["board", "--run-policies", *COARSE]) == 0
+    assert verify.main(["board", "--run-policies", "--float32", *COARSE]) == 0
     assert leaderboard.main(["board", *COARSE, "--out", "page"]) == 0
     text = Path("page/index.html").read_text(encoding="utf-8")
     assert text.count(">PPO in one file</a>") == 2

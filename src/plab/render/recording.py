@@ -22,7 +22,7 @@ from plab.results import read
 from plab.scene import Scene
 from plab.sim import State
 
-__all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts"]
+__all__ = ["Recording", "demonstration", "record", "record_all", "result", "starts", "stored"]
 
 
 Section = TypeVar("Section")
@@ -52,6 +52,15 @@ class Recording:
 
 
 def result(path: Path) -> tuple[Config, np.ndarray]:
+    """Return what :func:`stored` does, for this computer: on the CPU where there is no CUDA device."""
+    cfg, actions = stored(path)
+    if cfg.sim.device == "cuda" and not cuda_is_usable():
+        _say("the run used CUDA, which this computer has not: replaying it on the CPU")
+        cfg.sim.device = "cpu"
+    return cfg, actions
+
+
+def stored(path: Path) -> tuple[Config, np.ndarray]:
     """Return the configuration, as far as a replay needs it, and the best actions of a result file.
 
     Raises:
@@ -61,16 +70,12 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
-    sim = _section(run.config["sim"], SimConfig)
-    if sim.device == "cuda" and not cuda_is_usable():
-        _say("the run used CUDA, which this computer has not: replaying it on the CPU")
-        sim.device = "cpu"
     cfg = dataclasses.replace(
         load_config(),
         variant=str(run.config["variant"]),
         task=_section(run.config["task"], TaskConfig),
         protocol=_section(run.config["protocol"], ProtocolConfig),
-        sim=sim,
+        sim=_section(run.config["sim"], SimConfig),
         # A target that came from a file of the user's is not in the result.
         targets=_section(run.config["targets"], TargetsConfig),
     )

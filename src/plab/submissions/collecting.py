@@ -70,7 +70,7 @@ def _rows(source: Path, chosen: Selection) -> list[Row]:
 def _of_run(row: Row) -> Entry:
     """Return the best actions of a run."""
     try:
-        cfg, actions = recording.result(row.path)
+        cfg, actions = recording.stored(row.path)
     except RenderError as error:
         raise SubmissionError(str(error)) from None
     return Entry(

@@ -36,7 +36,7 @@ def write_leaderboard(board: Board, out: Path, origin: Mapping[str, Any]) -> Pat
         style=_text("plab.report", "page.css") + _text("plab.submissions", "leaderboard.css"),
         script=_text("plab.report", "theme.js") + _text("plab.submissions", "leaderboard.js"),
         board=board,
-        budgets=[f"{budget:,.0f}" for budget in BUDGETS],
+        budgets=[_short(budget) for budget in BUDGETS],
         tasks=suite_tasks(),
         tolerance=TOLERANCE,
         origin=origin,
@@ -45,6 +45,11 @@ def write_leaderboard(board: Board, out: Path, origin: Mapping[str, Any]) -> Pat
     path = out / "index.html"
     path.write_text(html, encoding="utf-8", newline="\n")
     return path
+
+
+def _short(count: float) -> str:
+    """Write a round number with a letter: 10k."""
+    return f"{count / 1e6:g}M" if count >= 1e6 else f"{count / 1e3:g}k"
 
 
 def _text(package: str, name: str) -> str:
