@@ -19,6 +19,7 @@ import yaml
 
 import plab
 import synthetic
+from browsing import browsing, press
 from plab import leaderboard, submit, verify
 from plab.bench.results import synthetic_run, template
 from plab.config import load_config
@@ -628,3 +629,31 @@ def test_a_broken_verification_is_told(path: Path) -> None:
     with pytest.raises(SubmissionError) as caught:
         read_verification(read(path))
     assert str(caught.value) == f"{kept} cannot be read ('submission'): verify the submission again"
+
+
+@browsing
+def test_the_page_filters_and_sorts(browser, folder: Path, tmp_path: Path) -> None:
+    assert leaderboard.main([str(folder), "--out", str(tmp_path)]) == 0
+    browser.get((tmp_path / "index.html").as_uri())
+    table = "document.querySelector('.board')"
+
+    def shown() -> list[str]:
+        rows = f"[...{table}.tBodies[0].rows].filter((row) => !row.hidden)"
+        texts = browser.execute_script(f"return {rows}.map((row) => row.cells[0].innerText)")
+        return [text.splitlines()[0] for text in texts]
+
+    assert shown() == ["Adam", "GD", "Adam-H", "plans", "policy"]
+    press(browser, "[data-filter=track] button[value=policies]")
+    assert shown() == ["policy"]
+    press(browser, "[data-filter=gradient] button[value=yes]")
+    assert shown() == ["Nothing of this track."]
+    press(browser, "[data-filter=track] button[value='']")
+    assert shown() == ["Adam", "GD", "Adam-H", "plans"]
+    press(browser, ".board th button")
+    assert shown() == ["Adam", "Adam-H", "GD", "plans"]
+    press(browser, "#form button[value=tasks]")
+    visible = f"[...{table}.tHead.rows[0].cells].filter((head) => head.offsetParent)"
+    heads = browser.execute_script(f"return {visible}.map((head) => head.innerText.trim())")
+    assert heads == ["method", "score", "status", *suite_tasks(), "configurations"]
+    errors = [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert errors == []
