@@ -262,10 +262,8 @@ def test_policies_of_both_kinds_are_run_only_if_asked(
         assert [e.configuration.variant for e in read(made).entries] == list("12345")
         assert verify.main([str(made), *COARSE, "--float32"]) == 1
         name = f"policies/RollingPin{file.suffix}"
-        assert capsys.readouterr().err.splitlines() == [
-            f"plab: {made}: RollingPin-v{v} after 60 steps: {name} was not run; --run-policies runs it"
-            for v in "12345"
-        ]
+        line = f"plab: {made}: {name} was not run; --run-policies runs it"
+        assert capsys.readouterr().err.splitlines() == [line]
         kept = read_verification(read(made))
         assert kept is not None and kept.outcomes == {NOT_RUN}
         assert verify.main([str(made), *COARSE, "--run-policies", "--float32"]) == 0
@@ -313,6 +311,7 @@ def test_policies_that_do_not_do(tmp_path: Path, told: Callable[..., str]) -> No
 # ---------------------------------------------------------------------------------------- from start to end
 
 
+@pytest.mark.slow
 def test_an_agent_from_outside_gets_to_the_leaderboard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

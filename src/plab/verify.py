@@ -66,10 +66,9 @@ def _run(path: Path, words: Sequence[str], run_policies: bool, precisions: Seque
     submission = read(path)
     verification = verify(submission, words, run_policies=run_policies, precisions=precisions)
     _show(submission, verification, precisions)
-    for verdict in verification.verdicts:
-        if verdict.why:
-            advice = "; --run-policies runs it" if verdict.outcome == "not run" else ""
-            print(f"plab: {path}: {verdict.why}{advice}", file=sys.stderr)
+    # Of a policy that was not run one line is enough.
+    for why in dict.fromkeys(verdict.why for verdict in verification.verdicts if verdict.why):
+        print(f"plab: {path}: {why}", file=sys.stderr)
     kept = write_verification(verification, path)
     good = sum(verdict.outcome == "holds" for verdict in verification.verdicts)
     print(f"{path}: {good} of {len(verification.verdicts)} claim(s) hold; kept in {kept}")

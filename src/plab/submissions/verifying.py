@@ -150,7 +150,7 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
 
 def _verdict(entry: Entry, played: Mapping[str, Played]) -> Verdict:
     if not played:
-        return Verdict(entry, {}, NOT_RUN, f"{entry.name}: {entry.policy} was not run")
+        return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
     scores = {precision: one.score for precision, one in played.items()}
     if broken := [f"{precision}: {one.failure}" for precision, one in played.items() if one.failure]:
         return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation broke off, {broken[0]}")
