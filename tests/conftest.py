@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from browsing import browser  # noqa: F401
 from plab.checks import cuda_is_usable
 from plab.config import Config
 from plab.reuse import SimulatorCache

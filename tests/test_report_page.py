@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import urllib.parse
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import synthetic
+from browsing import browsing, press, until
 from plab.bench.results import synthetic_run, template
 from plab.examples import example_archive
 from plab.render.graphics import missing_graphics
@@ -24,10 +23,6 @@ from plab.selection import select
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
-BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
-browsing = pytest.mark.skipif(
-    not (BROWSER and DRIVER), reason="chromium and chromedriver are not installed: make browser-packages"
-)
 drawing = pytest.mark.skipif(missing_graphics() is not None, reason=str(missing_graphics()))
 
 
@@ -136,36 +131,10 @@ def test_nothing_finished_gives_one_line(tmp_path: Path, capsys) -> None:
 # --------------------------------------------------------------------------------------------- in the browser
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    selenium = pytest.importorskip("selenium.webdriver")
-    options = selenium.ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=1300,900"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = selenium.Chrome(options, selenium.ChromeService(DRIVER))
-    driver.set_script_timeout(60)
-    yield driver
-    driver.quit()
-
-
-def until(browser, script: str) -> None:
-    """Wait until a condition in the page is true; the script's own limit is selenium's, a minute."""
-    wait = (
-        "const done = arguments[0]; const look = () => (SCRIPT) ? done(true) : setTimeout(look, 30); look();"
-    )
-    assert browser.execute_async_script(wait.replace("SCRIPT", script))
-
-
 def shown_names(browser) -> list[str]:
     return browser.execute_script(
         "return [...document.querySelectorAll('#configurations tbody tr')].map((row) => row.dataset.name)"
     )
-
-
-def press(browser, selector: str) -> None:
-    browser.find_element("css selector", selector).click()
 
 
 @browsing

@@ -45,7 +45,7 @@ PYTHON = {
     "environments": (
         "Environments",
         "",
-        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs"),
+        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs", "plab.submissions.recording"),
     ),
     "results": (
         "Results",

@@ -166,6 +166,8 @@ class EpisodeBatch:
     """Sub-environments in one simulator, all in the same step of their episodes.
 
     Attributes:
+        configs: One configuration per sub-environment.
+        contact: Contact model of the episodes, ``hard`` or ``soft``.
         size: Number of sub-environments.
         horizon: Steps of an episode.
         observation_space: Space of one sub-environment's observation.
@@ -190,6 +192,7 @@ class EpisodeBatch:
         if contact not in CONTACT_MODELS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
         self._problem: Problem | None = Problem(cfgs)
+        self.configs, self.contact = tuple(cfgs), contact
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
         scenes = self.problem.scenes

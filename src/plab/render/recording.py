@@ -33,6 +33,7 @@ __all__ = [
     "result",
     "say",
     "starts",
+    "stored",
 ]
 
 
@@ -72,6 +73,15 @@ class Recording:
 
 
 def result(path: Path) -> tuple[Config, np.ndarray]:
+    """Return what :func:`stored` does, for this computer: on the CPU where there is no CUDA device."""
+    cfg, actions = stored(path)
+    if cfg.sim.device == "cuda" and not cuda_is_usable():
+        say("the run used CUDA, which this computer has not: replaying it on the CPU")
+        cfg.sim.device = "cpu"
+    return cfg, actions
+
+
+def stored(path: Path) -> tuple[Config, np.ndarray]:
     """Return the configuration, as far as a replay needs it, and the best actions of a result file.
 
     Raises:
@@ -81,16 +91,12 @@ def result(path: Path) -> tuple[Config, np.ndarray]:
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
-    sim = _section(run.config["sim"], SimConfig)
-    if sim.device == "cuda" and not cuda_is_usable():
-        say("the run used CUDA, which this computer has not: replaying it on the CPU")
-        sim.device = "cpu"
     cfg = dataclasses.replace(
         load_config(),
         variant=str(run.config["variant"]),
         task=_section(run.config["task"], TaskConfig),
         protocol=_section(run.config["protocol"], ProtocolConfig),
-        sim=sim,
+        sim=_section(run.config["sim"], SimConfig),
         # A target that came from a file of the user's is not in the result.
         targets=_section(run.config["targets"], TargetsConfig),
     )

@@ -58,9 +58,8 @@ def write_page(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
 def write_overview(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
     """Write ``index.html`` alone, as :func:`write_page` does: when there are more pictures than before."""
     folder = files("plab.report") / "web"
-    text = {
-        name: (folder / name).read_text(encoding="utf-8") for name in ("page.html", "page.css", "page.js")
-    }
+    names = ("page.html", "page.css", "page.js", "theme.js")
+    text = {name: (folder / name).read_text(encoding="utf-8") for name in names}
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["page.html"])
     content = {
         "methods": [_look(method(name)) for name in runs.methods],
@@ -71,7 +70,7 @@ def write_overview(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
     known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
     html = template.render(
         style=text["page.css"],
-        script=text["page.js"],
+        script=text["theme.js"] + text["page.js"],
         # The only sign with which text could leave the script that it is in.
         content=json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         methods=[method(name) for name in runs.methods],

@@ -23,19 +23,6 @@ const plab = (() => {
   const signed = (value) => (value === null ? "–" : (value >= 0.005 ? "+" : value <= -0.005 ? "−" : "") + fixed(Math.abs(value)));
   const own = (name) => `--own: var(--${name})`;
 
-  // ------------------------------------------------------------------------------------------------ theme
-  const root = document.documentElement;
-  const memory = { // storage may be forbidden for pages from the file system
-    get: () => { try { return localStorage.getItem("plab-theme"); } catch { return null; } },
-    set: (value) => { try { localStorage.setItem("plab-theme", value); } catch { /* the choice lasts as long as the page */ } },
-  };
-  if (["light", "dark"].includes(memory.get())) root.dataset.theme = memory.get();
-  find("#theme").addEventListener("click", () => {
-    const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
-    root.dataset.theme = dark ? "light" : "dark";
-    memory.set(root.dataset.theme);
-  });
-
   // --------------------------------------------------------------------------------------------- overview
   const state = { sort: "task", descending: false, form: "ours" };
   const runsOf = (one) => methods.reduce((sum, { name }) => sum + one.cells[name].ours.count, 0);

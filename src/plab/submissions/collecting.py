@@ -1,0 +1,126 @@
+"""Where submissions come from: recordings, plab's own results, policies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from plab.config import Config, load_config
+from plab.render import RenderError, recording
+from plab.report.series import load_rows
+from plab.results import Row
+from plab.results.loading import readable_rows
+from plab.selection import Selection
+from plab.submissions.files import read
+from plab.submissions.members import SubmissionError
+from plab.submissions.playing import play_policy
+from plab.submissions.policies import load
+from plab.submissions.schema import SUFFIX, UNSEEN, Configuration, Digests, Entry, configuration_of
+
+__all__ = ["from_policies", "from_sources", "steps_to_best", "submission_files"]
+
+
+def submission_files(source: Path) -> list[Path]:
+    """Return the submissions, or recordings, in a folder and its subfolders; of a file, itself if it is
+    one."""
+    if source.is_file():
+        return [source] if source.name.endswith(SUFFIX) else []
+    return sorted(source.rglob(f"*{SUFFIX}"))
+
+
+def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
+    """Collect plans.
+
+    Args:
+        sources: Folders of recordings, or folders, files and archives of results.
+        chosen: Which runs of results to take.
+
+    Returns:
+        The entries, in the order of their configurations.
+
+    Raises:
+        SubmissionError: If there is nothing, or something twice.
+        plab.results.ResultsError: If something cannot be read.
+    """
+    found: dict[Configuration, tuple[Path, list[Entry]]] = {}
+    for source in sources:
+        recordings = submission_files(source)
+        groups = [(path, list(read(path).entries)) for path in recordings]
+        groups += [] if recordings else [(row.path, [_of_run(row)]) for row in _rows(source, chosen)]
+        for path, entries in groups:
+            for place in {entry.configuration for entry in entries}:
+                if place in found:
+                    raise SubmissionError(
+                        f"{path} and {found[place][0]} are both of {place.name}: submit one training of each"
+                    )
+                found[place] = path, [entry for entry in entries if entry.configuration == place]
+    if not found:
+        raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
+    return [entry for place in sorted(found) for entry in found[place][1]]
+
+
+def _rows(source: Path, chosen: Selection) -> list[Row]:
+    """Return the finished runs that are meant."""
+    rows, unreadable = readable_rows(source)
+    if unreadable:
+        raise unreadable[0]
+    return [row for row in rows if row.values["status"] == "finished" and chosen(row.values, row.config)]
+
+
+def _of_run(row: Row) -> Entry:
+    """Return the best actions of a run."""
+    try:
+        cfg, actions = recording.stored(row.path)
+    except RenderError as error:
+        raise SubmissionError(str(error)) from None
+    return Entry(
+        configuration_of(cfg), Digests.of(cfg), steps_to_best(row), row.values["score_best"], actions
+    )
+
+
+def steps_to_best(row: Row) -> int:
+    """Return after how many simulated environment steps a run found its best actions."""
+    return int(load_rows(row.path)["simulated"].iloc[row.values["best_iteration"]])
+
+
+def from_policies(
+    policies: Mapping[str, Path], variants: Sequence[str], steps: int, overrides: Sequence[str]
+) -> tuple[list[Entry], dict[str, bytes]]:
+    """Let policies act, and collect what they reach.
+
+    Args:
+        policies: Files of TorchScript (``.pt``) or ONNX (``.onnx``), by task. They are executed.
+        variants: Variants to act in.
+        steps: Environment steps that the training of each took.
+        overrides: Overrides of every configuration.
+
+    Returns:
+        The entries, and the files by their names in the submission.
+
+    Raises:
+        SubmissionError: If a policy cannot be read or run, or breaks the simulation off.
+        plab.config.ConfigError: If an override does not fit.
+    """
+    entries: list[Entry] = []
+    files: dict[str, bytes] = {}
+    for task, path in policies.items():
+        name = f"policies/{task}{path.suffix}"
+        try:
+            files[name] = path.read_bytes()
+        except OSError as error:
+            raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
+        cfgs = list(_configs(task, variants, overrides))
+        played = play_policy(cfgs, load(name, files[name]), str(path), "float32")
+        for cfg, one in zip(cfgs, played, strict=True):
+            place = configuration_of(cfg)
+            if one.failure:
+                raise SubmissionError(f"{place.name}: the simulation broke off, {one.failure}")
+            entries.append(Entry(place, Digests.of(cfg), steps, one.score, policy=name))
+    return entries, files
+
+
+def _configs(task: str, variants: Sequence[str], overrides: Sequence[str]) -> Iterator[Config]:
+    for variant in variants:
+        seed = variant.removeprefix("random")
+        chosen = ["variant=random", f"seed_scene={seed}"] if variant in UNSEEN else [f"variant={variant}"]
+        yield load_config([f"task={task}", *chosen, *overrides])

@@ -1,0 +1,114 @@
+"""Plans and policies played in the hard contact model, many configurations of a task at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from plab.config import Config
+from plab.envs.core import EpisodeBatch
+from plab.submissions.members import SubmissionError
+from plab.submissions.policies import Policy
+
+__all__ = ["Played", "play_plans", "play_policy"]
+
+_BATCH = 25
+"""Configurations in one simulator, at most."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """What an episode came to.
+
+    Attributes:
+        score: Score of the last state; NaN if it broke off.
+        failure: When and why it broke off; empty if it did not.
+    """
+
+    score: float
+    failure: str = ""
+
+
+def play_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], precision: str) -> list[Played]:
+    """Play a plan in each configuration.
+
+    Args:
+        cfgs: Configurations of one task that fit into one simulator.
+        plans: Actions of each, shape [T, A].
+        precision: ``float32`` or ``float64``.
+
+    Raises:
+        SubmissionError: If a plan has not as many steps or components as its task.
+    """
+    played: list[Played] = []
+    for start in range(0, len(cfgs), _BATCH):
+        actions = plans[start : start + _BATCH]
+        batch = _batch(cfgs[start : start + _BATCH], precision)
+        shape = [batch.horizon, *(batch.action_space.shape or ())]
+        for cfg, own in zip(batch.configs, actions, strict=True):
+            if list(own.shape) != shape:
+                where = f"{cfg.task.name}-v{cfg.variant}"
+                raise SubmissionError(
+                    f"{where}: the plan has shape {list(own.shape)}, its task takes {shape}"
+                )
+        played += _play(batch, partial(_next_action, np.stack(actions)))
+    return played
+
+
+def _next_action(plans: np.ndarray, t: int, _: np.ndarray) -> np.ndarray:
+    """Return the actions of a step, whatever is observed."""
+    return plans[:, t]
+
+
+def play_policy(cfgs: Sequence[Config], policy: Policy, name: str, precision: str) -> list[Played]:
+    """Let a policy act in each configuration.
+
+    Args:
+        cfgs: Configurations of one task that fit into one simulator.
+        policy: The policy.
+        name: Its file, for messages.
+        precision: ``float32`` or ``float64``, of the simulator; observations are float32.
+
+    Raises:
+        SubmissionError: If it cannot be run, its actions do not fit, or it answers the same question twice
+            with different actions.
+    """
+    played: list[Played] = []
+    for start in range(0, len(cfgs), _BATCH):
+        batch = _batch(cfgs[start : start + _BATCH], precision)
+        components = (batch.action_space.shape or (0,))[0]
+
+        def act(t: int, observations: np.ndarray, components: int = components) -> np.ndarray:
+            actions = policy(observations)
+            if actions.shape[1] != components:
+                raise SubmissionError(
+                    f"{name} gives actions of {actions.shape[1]} components, its task takes {components}"
+                )
+            if t == 0 and not np.array_equal(actions, policy(observations)):
+                raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
+            return actions
+
+        played += _play(batch, act)
+    return played
+
+
+def _batch(cfgs: Sequence[Config], precision: str) -> EpisodeBatch:
+    return EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in cfgs])
+
+
+def _play(batch: EpisodeBatch, choose: Callable[[int, np.ndarray], np.ndarray]) -> list[Played]:
+    """Play an episode of each sub-environment, with the actions chosen for a step and its observations."""
+    failures: dict[int, str] = {}
+    observations, info = batch.reset()
+    for t in range(batch.horizon):
+        step = batch.step(choose(t, observations), strict=False)
+        observations, info = step.observation, step.info
+        failures |= step.failures
+    batch.close()
+    return [
+        Played(float("nan"), failures[number]) if number in failures else Played(float(score))
+        for number, score in enumerate(info["score"])
+    ]

@@ -1,0 +1,227 @@
+"""What submissions really score: every claim is simulated again, in float32 and in float64."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import plab
+from plab.config import PRECISIONS, Config
+from plab.provenance import now
+from plab.results.files import replace_file
+from plab.submissions.members import SubmissionError
+from plab.submissions.playing import Played, play_plans, play_policy
+from plab.submissions.policies import load
+from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission
+from plab.targets.store import PHYSICS_VERSION
+
+__all__ = ["TOLERANCE", "Verdict", "Verification", "read_verification", "verify", "write_verification"]
+
+TOLERANCE = 0.02
+"""How far a claimed score may be from what is simulated: on the CPU the same actions give the same bits, on
+CUDA the last digits vary and contact magnifies them."""
+
+HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a claim.
+
+    Attributes:
+        entry: The claim.
+        scores: What it really scores, by precision; empty if it was not run.
+        outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
+        why: A line, unless it holds.
+    """
+
+    entry: Entry
+    scores: Mapping[str, float]
+    outcome: str
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What became of all claims of a file.
+
+    Attributes:
+        digest: SHA-256 of the submission, in hex.
+        verdicts: A verdict for each entry, in the order of the file.
+        overrides: The overrides that it was simulated with.
+    """
+
+    digest: str
+    verdicts: tuple[Verdict, ...]
+    overrides: tuple[str, ...]
+
+    @property
+    def outcomes(self) -> set[str]:
+        """Which outcomes there are."""
+        return {verdict.outcome for verdict in self.verdicts}
+
+
+def verify(
+    submission: Submission,
+    overrides: Sequence[str] = (),
+    *,
+    run_policies: bool = False,
+    precisions: Sequence[str] = PRECISIONS,
+) -> Verification:
+    """Simulate all of a submission again.
+
+    Args:
+        submission: What was read from a file.
+        overrides: Overrides of every configuration, such as ``sim.device=cuda``.
+        run_policies: Whether to execute the policies in it. They are other people's programs.
+        precisions: Precisions to simulate in.
+
+    Raises:
+        SubmissionError: If it is of other physics, scenes or targets than these, or its plans or policies
+            are not for their tasks.
+        plab.config.ConfigError: If an override does not fit.
+    """
+    given = tuple(overrides)
+    cfgs = _configs(submission, given)
+    scores: dict[int, dict[str, Played]] = defaultdict(dict)
+    groups = [
+        (numbers, _player(submission, [submission.entries[number] for number in numbers]))
+        for numbers in _groups(submission)
+        if run_policies or not submission.entries[numbers[0]].policy
+    ]
+    # Going from one precision to the other starts Taichi anew.
+    for precision in precisions:
+        for numbers, play in groups:
+            chosen = [cfgs[submission.entries[number].configuration] for number in numbers]
+            for number, played in zip(numbers, play(chosen, precision), strict=True):
+                scores[number][precision] = played
+    verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
+    return Verification(submission.digest, verdicts, given)
+
+
+def _player(
+    submission: Submission, entries: Sequence[Entry]
+) -> Callable[[Sequence[Config], str], list[Played]]:
+    """Return what plays entries of one group."""
+    if name := entries[0].policy:
+        policy = load(name, submission.policies[name])
+        return lambda cfgs, precision: play_policy(cfgs, policy, name, precision)
+    plans = [entry.actions for entry in entries if entry.actions is not None]
+    return lambda cfgs, precision: play_plans(cfgs, plans, precision)
+
+
+def _groups(submission: Submission) -> Iterator[list[int]]:
+    """Yield the numbers of entries that one simulator can play."""
+    groups: dict[Any, list[int]] = defaultdict(list)
+    for number, entry in enumerate(submission.entries):
+        place = entry.configuration
+        groups[place.task, place.targets, place.terms, entry.policy].append(number)
+    yield from groups.values()
+
+
+def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
+    """Compose all configurations, and refuse those that are not what the submission was made for."""
+    if submission.physics != PHYSICS_VERSION:
+        raise SubmissionError(
+            f"{submission.path} is of physics version {submission.physics} (plab {submission.plab}), this "
+            f"plab ({plab.__version__}) simulates version {PHYSICS_VERSION}"
+        )
+    found: dict[Configuration, Config] = {}
+    digests: dict[Configuration, Digests] = {}
+    for entry in submission.entries:
+        place = entry.configuration
+        if place not in found:
+            found[place] = place.config(overrides)
+            digests[place] = Digests.of(found[place])
+        for part in ("scene", "target"):
+            if getattr(entry.digests, part) != getattr(digests[place], part):
+                raise SubmissionError(
+                    f"{submission.path}: the {part} of {place.name} is another one than here: give the "
+                    f"overrides that it was made with, or use its plab ({submission.plab}, this is "
+                    f"{plab.__version__})"
+                )
+    return found
+
+
+def _verdict(entry: Entry, played: Mapping[str, Played]) -> Verdict:
+    if not played:
+        return Verdict(entry, {}, NOT_RUN, f"{entry.policy} was not run; --run-policies runs it")
+    scores = {precision: one.score for precision, one in played.items()}
+    if broken := [f"{precision}: {one.failure}" for precision, one in played.items() if one.failure]:
+        return Verdict(entry, scores, BROKE_OFF, f"{entry.name}: the simulation broke off, {broken[0]}")
+    if min(abs(score - entry.score) for score in scores.values()) <= TOLERANCE:
+        return Verdict(entry, scores, HOLDS)
+    reached = ", ".join(f"{score:.4f} in {precision}" for precision, score in scores.items())
+    why = f"{entry.name}: claims {entry.score:.4f}, scores {reached} (tolerance {TOLERANCE})"
+    return Verdict(entry, scores, LIES, why)
+
+
+# ------------------------------------------------------------------------------------------------------ files
+
+
+def verification_path(submission: Path) -> Path:
+    """Return the file that keeps what became of a submission, beside it."""
+    return submission.with_name(submission.name.removesuffix(SUFFIX) + ".verified.json")
+
+
+def write_verification(verification: Verification, submission: Path) -> Path:
+    """Write what became of a submission beside it; return the file.
+
+    Raises:
+        plab.results.ResultsError: If it cannot be written.
+    """
+    path = verification_path(submission)
+    record = {
+        "submission": verification.digest,
+        "plab": plab.__version__,
+        "physics": PHYSICS_VERSION,
+        "overrides": list(verification.overrides),
+        "tolerance": TOLERANCE,
+        "time": now(),
+        "entries": [
+            {
+                "name": verdict.entry.name,
+                "claimed": verdict.entry.score,
+                "scores": {name: None if math.isnan(v) else v for name, v in verdict.scores.items()},
+                "outcome": verdict.outcome,
+                "why": verdict.why,
+            }
+            for verdict in verification.verdicts
+        ],
+    }
+    replace_file(path, (json.dumps(record, indent=1) + "\n").encode(), sync=False)
+    return path
+
+
+def read_verification(submission: Submission) -> Verification | None:
+    """Return what became of a submission, None if nobody has verified this very file with these physics.
+
+    Raises:
+        SubmissionError: If the file beside it cannot be read.
+    """
+    if submission.path is None:
+        return None
+    path = verification_path(submission.path)
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
+            return None
+        verdicts = tuple(
+            Verdict(
+                entry,
+                {name: math.nan if v is None else float(v) for name, v in own["scores"].items()},
+                own["outcome"],
+                own["why"],
+            )
+            for entry, own in zip(submission.entries, record["entries"], strict=True)
+        )
+        return Verification(record["submission"], verdicts, tuple(record["overrides"]))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SubmissionError(f"{path} cannot be read ({error}): verify the submission again") from None
