@@ -125,6 +125,8 @@ def _check_config_dir(config_dir: str | Path) -> None:
     Raises:
         ConfigError: If the folder does not do.
     """
+    if not isinstance(config_dir, str | Path):
+        raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
     if not Path(config_dir).is_dir():
         raise ConfigError(f"config folder '{config_dir}' does not exist")
     for group in (*GROUPS, EXPERIMENT):
