@@ -218,8 +218,9 @@ def test_a_bug_is_one_line_or_its_traceback(monkeypatch, capsys, error):
     line = fail.__code__.co_firstlineno + 1
     assert main([]) == 70
     assert capsys.readouterr().err == (
-        f"plab: a bug of plab: {error.__name__} in test_cli.py, line {line}: {error('a bug')}; please report "
-        "it to plab's maintainers, with the command and what it prints with PLAB_TRACEBACK=1\n"
+        f"plab: a bug: {error.__name__} in test_cli.py, line {line}: {error('a bug')}; unless test_cli.py is "
+        "yours, please report it to plab's maintainers, with the command and what it prints with "
+        "PLAB_TRACEBACK=1\n"
     )
 
 

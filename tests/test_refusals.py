@@ -218,6 +218,15 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
         "the scene needs at least 324 GB, and there are 16 GB: use fewer particles, grid nodes, substeps or "
         "steps",
     ),
+    "no scenes": (lambda: Simulator("Rope"), "scenes are what build_scene() returns, not 'R'"),
+    "a number for a folder": (
+        lambda: load_config(config_dir=5),
+        "a config folder is named by a text or a path, not 5",
+    ),
+    "no results": (
+        lambda: load(None),
+        "results are in a folder, an archive, a file, or a list of them, not None",
+    ),
     "a text of keys": (
         lambda: load(keys="task.name"),
         "keys are a list of dotted keys, such as ['task.name'], not the text 'task.name'",

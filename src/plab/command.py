@@ -116,8 +116,8 @@ def _close_output() -> None:
 
 def _bug(error: Exception) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
-    where = f"{Path(last.filename).name}, line {last.lineno}"
+    file = Path(last.filename).name
     return (
-        f"a bug of plab: {type(error).__name__} in {where}: {error}; please report it to plab's maintainers, "
-        f"with the command and what it prints with {TRACEBACK}=1"
+        f"a bug: {type(error).__name__} in {file}, line {last.lineno}: {error}; unless {file} is yours, "
+        f"please report it to plab's maintainers, with the command and what it prints with {TRACEBACK}=1"
     )

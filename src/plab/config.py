@@ -15,6 +15,7 @@ from typing import Any, cast
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.types import OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -125,6 +126,10 @@ def _check_config_dir(config_dir: str | Path) -> None:
     Raises:
         ConfigError: If the folder does not do.
     """
+    if not isinstance(config_dir, str | Path):
+        raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
+    if not str(config_dir).strip():
+        raise ConfigError("the config folder's name is empty: give one, or . for this one")
     if not Path(config_dir).is_dir():
         raise ConfigError(f"config folder '{config_dir}' does not exist")
     for group in (*GROUPS, EXPERIMENT):
@@ -208,6 +213,9 @@ def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = No
             continue
         if override.is_delete():
             raise ConfigError(f"'{text}': keys cannot be removed, only set")
+        changes = override.type is OverrideType.CHANGE and not key.startswith("task.variants.")
+        if changes and override.value() == {}:
+            raise ConfigError(f"'{text}' has no effect: sections are changed key by key")
         if key == EXPERIMENT and not override.is_add():
             raise ConfigError(f"'{text}': write +{text.lstrip('+')}")
         if key == EXPERIMENT and not isinstance(override.value(), str):

@@ -144,6 +144,7 @@ class Config:
         if self.seed >= 2**32:
             raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
         at_least("seed", self.seed, 0)
+        at_least("seed_scene", self.seed_scene or 0, 0)
         at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")

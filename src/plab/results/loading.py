@@ -128,6 +128,8 @@ def rows(
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
+    if not isinstance(source, str | Path | Sequence):
+        raise ResultsError(f"results are in a folder, an archive, a file, or a list of them, not {source!r}")
     sources = [source] if isinstance(source, str | Path) else source
     found: list[Row] = []
     unreadable: list[ResultsError] = []

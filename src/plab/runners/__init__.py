@@ -91,7 +91,7 @@ def _outcome(job: Job, how: str) -> Outcome:
     refused = isinstance(job.error, USER_ERRORS)
     what = str(job.error) if refused or isinstance(job.error, RunError) else describe(job.error)
     if not (refused or isinstance(job.error, RunError) or traceback_wanted()):
-        what += f"; a bug of plab: {TRACEBACK}=1 shows where"
+        what += f"; a bug: {TRACEBACK}=1 shows where"
     return outcome(job.cfg, "refused" if refused else "failed", message=what)
 
 

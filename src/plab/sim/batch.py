@@ -21,6 +21,8 @@ def require_alike(scenes: Sequence[Scene]) -> None:
         raise SceneError("a simulator needs at least one scene")
     first = scenes[0]
     for scene in scenes:
+        if not isinstance(scene, Scene):
+            raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
         scene.validate()
     for number, scene in enumerate(scenes[1:], start=1):
         for name in ("particle_count", "grid_size", "dt", "substeps", "numbers", "floor"):

@@ -197,8 +197,6 @@ class ForwardSimulator:
         self._require_runtime()
         if len(scenes) != self.batch:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
-        for scene in scenes:
-            scene.validate()
         require_alike([self.scenes[0], *scenes])
         self._require_compiled(scenes)
         self.scenes = tuple(scenes)
