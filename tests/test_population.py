@@ -34,11 +34,11 @@ from plab.reuse import SimulatorCache
 from plab.runners import run_batch, run_config
 from plab.runners.common import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.population.agents import Agents, Spaces
+from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
 from plab.runners.population.population import Population
 from plab.runners.population.replay import Replay, Sizes
-from plab.runners.rl_models import CLIP, model_kind
+from plab.runners.rl_models import CLIP, Spaces, model_kind
 from plab.sweep.plan import plan
 from plab.tally import Outcome
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 
 from plab.families import known_family
 from plab.objective import scores_from_iou
-from plab.results.files import explained, read
-from plab.results.loading import run_files
+from plab.results.files import opened_archive, read
+from plab.results.loading import members, run_files
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     BUDGETS,
@@ -25,6 +24,7 @@ from plab.results.schema import (
     RunResult,
     config_hash,
     loss_columns,
+    resume_fault,
     row_count,
 )
 
@@ -85,8 +85,8 @@ _GET_RIGHTS = "ask whom it belongs to for the right to read it"
 
 def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
     try:
-        with explained(path), zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
+        with opened_archive(path) as archive:
+            names = members(archive)
     except ResultsError as error:
         reason = _reason(error, path)
         hidden = reason.startswith("may not be read")
@@ -120,7 +120,9 @@ def _advice_unreadable(path: Path, reason: str) -> str:
         return _GET_RIGHTS
     if "schema version" in reason:
         return "read it with the plab that wrote it"
-    if "not a plab" in reason or not h5py.is_hdf5(path):
+    if reason.startswith("cannot be read: it is"):
+        return "move it out of the results"
+    if "not a plab" in reason or not (path.is_file() and h5py.is_hdf5(path)):
         begun = path.name.endswith(PARTIAL_SUFFIX)
         cut = "delete it; the run starts afresh" if begun else "delete it and run it again"
         return "move it out of the results" if "not a plab" in reason else cut
@@ -137,6 +139,8 @@ def _status(run: RunResult) -> Iterator[str]:
         yield "it failed without a message"
     if config_hash(run.config) != run.config_hash:
         yield "config_hash is not that of config"
+    if fault := resume_fault(run):
+        yield fault
 
 
 def _times(run: RunResult) -> Iterator[str]:
