@@ -1,8 +1,8 @@
 """Trained policies: kept in a file beside the result, and taken from there.
 
-The file is an ``.npz`` of arrays alone: the networks' parameters by their names, the bounds of observations and
-actions, and a header in JSON with the section ``method`` of the run, from which the networks are made anew.
-Reading it unpickles and imports nothing.
+The file is an ``.npz`` of arrays alone: the networks' parameters by their names, the bounds of observations
+and actions, and a header in JSON with the section ``method`` of the run, from which the networks are made
+anew. Reading it unpickles and imports nothing.
 """
 
 from __future__ import annotations
@@ -154,11 +154,8 @@ def _policy(path: Path) -> Policy:
         raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
     method = _method(header["method"], path)
     spaces = Spaces(*(_space(arrays, name) for name in ("observation", "action")))
-    parameters = {
-        name.removeprefix(_PARAMETER): values
-        for name, values in arrays.items()
-        if name.startswith(_PARAMETER)
-    }
+    own = [name for name in arrays if name.startswith(_PARAMETER)]
+    parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}
     _require_room(method, spaces, parameters)
     network = model_kind(method.family, method.algorithm).policy(method, spaces)
     restore_module(network, parameters)

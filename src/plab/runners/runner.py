@@ -283,15 +283,13 @@ class Runner:
     def _start(self, track: Track) -> None:
         """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
         state, scene = track.job.run.result.resume, self.problem.scenes[0]
+        best, shape = track.best_actions, (scene.horizon, scene.action_dim)
         if state is None:
             self.start(track, None)
             return
         try:
-            if track.best_actions is not None and track.best_actions.shape != (
-                scene.horizon,
-                scene.action_dim,
-            ):
-                raise ValueError(f"the best actions have shape {list(track.best_actions.shape)}")
+            if best is not None and best.shape != shape:
+                raise ValueError(f"the best actions have shape {list(best.shape)}, not {list(shape)}")
             self.start(track, state)
         except (DeviceError, SimulationError, RunError, *USER_ERRORS):
             raise

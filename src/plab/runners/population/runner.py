@@ -23,7 +23,7 @@ from plab.results import ResultsError
 from plab.runners.common import environment_key, torch_settings
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
-from plab.runners.population.agents import OffPolicyAgents, Spaces, trained_policy
+from plab.runners.population.agents import OffPolicyAgents, trained_policy
 from plab.runners.population.population import Population
 from plab.runners.population.replay import Sizes, require_file
 from plab.runners.rl import check_torch_device
