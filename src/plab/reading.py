@@ -69,8 +69,9 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open a zip file for :func:`member_bytes`.
 
     Raises:
-        UnreadableError: If it is no zip file, or one whose members lead out of it, share a name or their
-            bytes, are encrypted, or are too many.
+        UnreadableError: If its members lead out of it, share a name or their bytes, are encrypted, or are too
+            many.
+        ValueError: If it is no zip file, or damaged.
         OSError: If it cannot be opened.
     """
     size = regular_file(path).st_size
@@ -81,7 +82,7 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
             raise
         # The library's parser answers to damage with whatever error it runs into.
         except Exception as error:
-            raise UnreadableError(f"it is no zip file ({error})") from error
+            raise ValueError(str(error)) from error
         with archive:
             _check_members(archive, size)
             yield archive
@@ -91,7 +92,8 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
     """Return what a member of an archive holds.
 
     Raises:
-        UnreadableError: If it is damaged, or would take more room than a file of plab's does.
+        UnreadableError: If it would take more room than a file of plab's does.
+        ValueError: If it is damaged.
         KeyError: If there is none of this name.
     """
     info = archive.getinfo(name)
@@ -100,8 +102,10 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
         raise UnreadableError(f"{sizes}: no file of plab's does that")
     try:
         return archive.read(info)
+    except (OSError, MemoryError):
+        raise
     except Exception as error:
-        raise UnreadableError(str(error)) from error
+        raise ValueError(str(error)) from error
 
 
 def read_array(path: Path) -> np.ndarray:
@@ -120,7 +124,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of an ``.npz`` file by their names.
 
     Raises:
-        UnreadableError: If it is no such file, damaged, or holds anything but numbers and text.
+        UnreadableError: If it holds anything but numbers and text.
+        ValueError: If it is no such file, or damaged.
         OSError: If it cannot be opened.
     """
     arrays = {}

@@ -217,7 +217,8 @@ def _take(run: Run, row: Row) -> None:
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
     run.rate = run.left = None
-    run.message = row.values["message"] if state == "failed" else ""
+    message = row.values["message"] if state == "failed" else ""
+    run.message = "".join(letter if letter.isprintable() else " " for letter in message)
     run.total = row_count(row.config["method"]) or row.config["method"].get("episodes") or 0
     run.done = run.total if state == "done" else int(row.values["iterations"])
     if state == "running":

@@ -118,7 +118,7 @@ def _reason(error: ResultsError, path: Path) -> str:
 def _advice_unreadable(path: Path, reason: str) -> str:
     if reason.startswith("may not be read"):
         return _GET_RIGHTS
-    if "schema version" in reason:
+    if reason.startswith(("was written by a newer plab", "has schema version")):
         return "read it with the plab that wrote it"
     if reason.startswith("cannot be read: it is"):
         return "move it out of the results"
@@ -131,7 +131,8 @@ def _advice_unreadable(path: Path, reason: str) -> str:
 
 def _status(run: RunResult) -> Iterator[str]:
     if run.status not in STATUSES:
-        yield f"status '{run.status}' is none of {', '.join(STATUSES)}"
+        yield f"status {run.status!r:.80} is none of {', '.join(STATUSES)}"
+        return
     partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
     if partial == (run.status == "finished"):
         yield f"the name says that the run is {'not ' if partial else ''}finished, the status is {run.status}"

@@ -21,6 +21,8 @@ from plab.reading import LARGEST, UnreadableError, member_bytes, opened_zip, reg
 from plab.results.hdf5 import array, attributes, columns, groups, numbers, take, tree
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
+    BUDGETS,
+    COLUMNS,
     SCHEMA_VERSION,
     NewerSchemaError,
     ResultsError,
@@ -146,8 +148,13 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """
     path = Path(path)
     with opened(path) as file:
-        config = take(attributes(file, names=("config",)), "config", str)
-        return stored_config(config), pd.DataFrame(columns(file, "iterations"))
+        config = stored_config(take(attributes(file, names=("config",)), "config", str))
+        table = pd.DataFrame(columns(file, "iterations"))
+        if missing := [name for name in COLUMNS if len(table) and name not in (*table, *BUDGETS)]:
+            raise ValueError(f"iterations lack {missing[0]}")
+        for name in ("horizon", "substeps"):
+            take(config["sim"], name, int)
+        return config, table
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
@@ -207,11 +214,11 @@ def opened(path: Path) -> Iterator[h5py.File]:
                 yield _of_this_version(file, path)
             return
         archive, member = inside
-        try:
-            with opened_archive(archive) as members:
+        with opened_archive(archive) as members:
+            if member not in members.NameToInfo:
+                raise ResultsError(f"{archive} holds no run {member}")
+            with explained(path):
                 image = member_bytes(members, member)
-        except KeyError:
-            raise ResultsError(f"{archive} holds no run {member}") from None
     with opened_image(image, path) as file:
         yield file
 
@@ -248,7 +255,8 @@ def explained(path: Path) -> Iterator[None]:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return " ".join(text.split())[:300] or type(error).__name__
 
 
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
@@ -257,7 +265,7 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
         raise ResultsError(f"{path} is not a plab result file")
     version = own.get("schema_version")
     if type(version) is not int:
-        raise ResultsError(f"{path} has no number as its schema version: it is damaged")
+        raise ValueError("its schema version is no number")
     if version > SCHEMA_VERSION:
         raise NewerSchemaError(
             f"{path} was written by a newer plab (schema version {version}, this one knows "

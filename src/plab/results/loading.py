@@ -148,7 +148,7 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
     """
     found, unreadable = rows(source)
     sources = [source] if isinstance(source, str | Path) else source
-    if unreadable and not found and all(Path(root).is_file() for root in sources):
+    if unreadable and not found and not any(Path(root).is_dir() for root in sources):
         raise unreadable[0]
     return found, unreadable
 
@@ -213,8 +213,8 @@ def members(archive: zipfile.ZipFile) -> list[str]:
 
 def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
     """Yield the rows of all files below a folder, or of one file, from the index where it knows them."""
-    known = Index(root) if use_index else None
     paths = list(run_files(root))
+    known = Index(root) if use_index else None
     present = {path for path, _ in paths}
     for path, facts in paths:
         if path.name.endswith(PARTIAL_SUFFIX) and final_path(path) in present:

@@ -83,6 +83,7 @@ _NEEDED = {
     "method.name": str,
     "method.family": str,
     "protocol.name": str,
+    "sim.device": str,
     "seed": int,
 }
 """What every configuration says, and the types of it."""
@@ -177,17 +178,22 @@ def stored_config(text: str) -> dict[str, Any]:
             raise ValueError(f"{key} in config is {value!r:.80}")
         if isinstance(value, str) and not _NAME.fullmatch(value):
             raise ValueError(f"{key} in config is no name: {value!r:.80}")
-    _check_counts(config["method"])
+    _check_tables(config)
     usual = "last" if config["protocol"]["name"] == "release" else "best"
     config["protocol"] = {"score": usual} | config["protocol"]
     return config
 
 
-def _check_counts(method: Mapping[str, Any]) -> None:
-    """See that :func:`row_count` can count."""
+def _check_tables(config: Mapping[str, Any]) -> None:
+    """See that what readers look into are tables, and that :func:`row_count` can count."""
+    method, variants = config["method"], config["task"].get("variants") or {}
     stages = method.get("stages", {})
-    if not isinstance(stages, dict) or not all(isinstance(stage, dict) for stage in stages.values()):
-        raise ValueError("method.stages in config is no table of stages")
+    tables = {"task.variants": variants, "method.stages": stages}
+    for key, table in tables.items():
+        if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
+            raise ValueError(f"{key} in config is no table")
+    if not isinstance(method.get("loss_weights", {}), dict):
+        raise ValueError("method.loss_weights in config is no table")
     counts = [stage.get("iterations") for stage in stages.values()]
     counts += [method[name] for name in ("iterations", "episodes") if method.get(name) is not None]
     if not all(type(count) is int and count >= 0 for count in counts):
