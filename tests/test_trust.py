@@ -58,7 +58,10 @@ def said(reading: Any) -> str:
 
 
 ATTRIBUTES = {
-    "a text as schema": ({"schema_version": "1"}, "is truncated or damaged (its schema version is no number)"),
+    "a text as schema": (
+        {"schema_version": "1"},
+        "is truncated or damaged (its schema version is no number)",
+    ),
     "a list as config": (
         {"config": "[1, 2]"},
         "is truncated or damaged (config is a list, not sections and values)",

@@ -28,6 +28,7 @@ from plab.results.schema import (
     ResultsError,
     RunResult,
     stored_config,
+    stored_hash,
 )
 from plab.selection import lookup
 
@@ -116,7 +117,7 @@ def read(path: str | Path) -> RunResult:
         own, best, there = attributes(file), attributes(file, "best"), groups(file, "/")
         return RunResult(
             config=stored_config(take(own, "config", str)),
-            config_hash=take(own, "config_hash", str),
+            config_hash=stored_hash(take(own, "config_hash", str)),
             status=take(own, "status", str),
             message=take(own, "message", str),
             provenance=_scalars(attributes(file, "provenance")),

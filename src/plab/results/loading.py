@@ -28,6 +28,7 @@ from plab.results.schema import (
     counts_last,
     final_path,
     stored_config,
+    stored_hash,
 )
 from plab.selection import lookup
 
@@ -281,7 +282,7 @@ def _row(file: h5py.File, path: Path) -> Row:
         "best_iteration": take(best, "iteration", int),
         "best_loss": take(best, "loss", float),
         "seconds": float(sum(phases.values())),
-        "config_hash": take(own, "config_hash", str),
+        "config_hash": stored_hash(take(own, "config_hash", str)),
         "path": str(path),
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}

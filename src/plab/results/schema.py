@@ -40,6 +40,7 @@ __all__ = [
     "resume_fault",
     "row_count",
     "stored_config",
+    "stored_hash",
 ]
 
 SCHEMA_VERSION = 1
@@ -182,6 +183,17 @@ def stored_config(text: str) -> dict[str, Any]:
     usual = "last" if config["protocol"]["name"] == "release" else "best"
     config["protocol"] = {"score": usual} | config["protocol"]
     return config
+
+
+def stored_hash(text: str) -> str:
+    """Return the hash that a result file holds as ``text``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if not re.fullmatch("[0-9a-f]{64}", text):
+        raise ValueError(f"config_hash is {text!r:.80}")
+    return text
 
 
 def _check_tables(config: Mapping[str, Any]) -> None:
