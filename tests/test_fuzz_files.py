@@ -13,6 +13,7 @@ import traceback
 import warnings
 import zipfile
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +25,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
+from plab import status
 from plab.config import Config, ConfigError, build_scene, load_config
+from plab.report.collect import MixedRunsError, collect, collect_ablation
+from plab.report.series import load_series
 from plab.results import ResultsError, check, load, pack, read
 from plab.runners.policy import load_policy, policy_path, save_policy
 from plab.runners.rl_models import Spaces, model_kind
 from plab.scene import SceneError
-from plab.selection import Selection
-from plab.status import survey
+from plab.selection import Selection, SelectionError
 from plab.targets import TargetError, load_release_target
 
-OWN = (ResultsError, TargetError, ConfigError, SceneError)
+OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError)
 
 CASES = {"few": 34, "many": 334}
 """Cases of each of the six kinds of files, in CI and in the slow tests: 204 and 2,004."""
@@ -110,7 +113,11 @@ def read_results(path: Path) -> None:
     for place, problem in check(path):
         assert problem is None or "\n" not in problem.reason + problem.advice
         answered(lambda place=place: read(place))
-    survey(path, Selection())
+    # What is said is another test's; here it is to be said at all.
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        assert status.main([str(path), "task=Rope", "variant=1"]) in (0, 2)
+    answered(lambda: load_series(collect(path, Selection())))
+    answered(lambda: collect_ablation(path, Selection(), "task.yield_stress"))
 
 
 def read_target(path: Path) -> None:
@@ -552,6 +559,11 @@ EVERY = {
         [("attribute", s / 8, odd) for odd in ATTRIBUTES for s in range(8)],
     ),
     "arrays": ("target", changed_npy, [("array", odd) for odd in ARRAYS if odd != "columns"]),
+    "configurations": (
+        "result",
+        changed_hdf5,
+        [("config", s / 31, odd) for odd in ("nothing", "list") for s in range(31)],
+    ),
     "headers": ("target", changed_npy, [("header", odd) for odd in HEADERS]),
 }
 

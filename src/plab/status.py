@@ -11,6 +11,7 @@ import argparse
 import csv
 import itertools
 import json
+import math
 import sys
 import time
 from collections import Counter
@@ -246,6 +247,8 @@ def _measure(run: Run) -> None:
             table = columns(file, "iterations")
             seconds = table["seconds"]
             done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
+            if not math.isfinite(sum(seconds) + sum(done)):
+                raise ValueError("seconds or episodes are not finite")
             written = Path(run.path).stat().st_mtime
             run.seconds = float(sum(numbers(attributes(file, "wall_time")).values()))
             run.together = _together(attributes(file, "provenance"), written, run.seconds)
@@ -326,7 +329,7 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 def duration(seconds: float | None) -> str:
     """Write a time for people: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
-    if seconds is None:
+    if seconds is None or not math.isfinite(seconds):
         return "?"
     if seconds < 100:
         return f"{seconds:.0f} s"

@@ -75,7 +75,7 @@ def problems(run: RunResult) -> list[str]:
     found = [*_status(run), *_iterations(run), *_best(run), *_times(run)]
     if run.status == "finished":
         found += [*_evaluation(run), *_masses(run), *_complete(run)]
-    return found
+    return list(dict.fromkeys(found))
 
 
 # ---------------------------------------------------------------------------------------------------- details
@@ -103,7 +103,7 @@ def _check_file(path: Path) -> Problem | None:
     except ResultsError as error:
         reason = _reason(error, path)
         return Problem(path, reason, _advice_unreadable(path, reason))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
     if found:
         return Problem(path, "; ".join(found), "run it again with force=true, or delete it")

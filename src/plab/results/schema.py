@@ -78,7 +78,7 @@ _BEFORE_PROTOCOLS = {
 
 _SECTIONS = ("task", "method", "sim", "protocol")
 
-_NEEDED = {
+_NEEDED: dict[str, type | tuple[type, ...]] = {
     "task.name": str,
     "variant": (str, int),
     "method.name": str,
@@ -268,10 +268,13 @@ def resume_fault(run: RunResult) -> str:
         return f"there is no iteration {run.best_iteration}, which is to be the best"
     if missing := [name for name in ("loss", "score") if name not in table]:
         return f"iterations lack {missing[0]}"
+    if endless := [name for name in BUDGETS if name in table and not np.isfinite(table[name]).all()]:
+        return f"iterations are not finite: {endless[0]}"
     if run.config["method"]["family"] == "trajectory":
         state = run.resume.get("actions")
         if not isinstance(state, np.ndarray) or state.shape != actions.shape:
-            return f"the actions to go on from have shape {list(np.shape(state))}, not {list(actions.shape)}"
+            shape = list(getattr(state, "shape", ()))
+            return f"the actions to go on from have shape {shape}, not {list(actions.shape)}"
         if not (np.abs(state) <= 1.0).all():
             return "the actions to go on from leave [-1, 1]"
     return ""

@@ -139,9 +139,9 @@ class Agents:
             ValueError: If one of them is that of another agent.
         """
         for state, own in zip(states, self.states(), strict=True):
-            shapes = {name: np.shape(value) for name, value in own.items()}
-            if wrong := [name for name in shapes if shapes[name] != np.shape(state.get(name))]:
-                raise ValueError(f"its {wrong[0]} has shape {list(np.shape(state.get(wrong[0])))}")
+            for name, value in own.items():
+                if (shape := np.asarray(state[name]).shape) != np.shape(value):
+                    raise ValueError(f"its {name} has shape {list(shape)}, not {list(np.shape(value))}")
         first = states[0]
         self.steps, self.updates = int(first["steps"]), int(first["updates"])
 
