@@ -111,14 +111,28 @@ def test_unpacked_files_are_result_files(folder: Path, tmp_path: Path) -> None:
         assert {Path(name) for name in members.namelist()} == names
 
 
-def test_archive_does_not_lead_out_of_the_folder(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_leads_out_of_the_folder_is_not_packed(folder: Path, tmp_path: Path) -> None:
     config = synthetic.config(folder, task="../../../away")
     synthetic.write(dataclasses.replace(synthetic.run(folder), config=config), folder / "away.h5")
     archive = tmp_path / "all.plab.zip"
-    pack(folder, archive, wanted=lambda row: "away" in row.values["task"])
+    with pytest.raises(ResultsError) as caught:
+        pack(folder, archive, wanted=lambda row: "away" in row.values["task"])
+    assert str(caught.value) == (
+        f"there is nothing to pack: no run fits; 1 cannot be read: {folder / 'away.h5'} is truncated "
+        "or damaged (task.name in config is no name: '../../../away')"
+    )
+    assert not archive.exists()
+
+
+def test_a_link_in_a_folder_does_not_lead_out_of_it(folder: Path, tmp_path: Path) -> None:
+    archive, out = tmp_path / "all.plab.zip", tmp_path / "out"
+    pack(folder, archive)
+    (tmp_path / "elsewhere").mkdir()
+    out.mkdir()
+    (out / "Rope-v1").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(ResultsError, match="outside of"):
-        unpack(archive, tmp_path / "a" / "b")
-    assert not list(tmp_path.rglob("away*/**/*.h5"))
+        unpack(archive, out)
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_damaged_member_is_left_out_and_named(folder: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ method's YAML names as ``family: module:NAME``; see docs/own_method.md. Classes 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -227,9 +228,12 @@ def family(name: str) -> Family:
 
 
 def known_family(name: str) -> Family | None:
-    """Return the family of a name, None if its module is not at hand: readers of results can do without."""
+    """Return the family of a name, None if its module has not been imported: readers of results can do
+    without, and no result file chooses what is imported."""
     if name in FAMILIES:
         return FAMILIES[name]
+    if name.partition(":")[0] not in sys.modules:
+        return None
     from plab.config_errors import ConfigError
 
     try:

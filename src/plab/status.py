@@ -25,9 +25,9 @@ from plab.arguments import sources_and_words
 from plab.command import command_line
 from plab.locks import held
 from plab.possible import require_possible
-from plab.results import ResultsError, Row, lookup, row_count
+from plab.results import ResultsError, Row, row_count
 from plab.results.files import opened, split_archive
-from plab.results.hdf5 import attributes
+from plab.results.hdf5 import attributes, columns, numbers
 from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
 from plab.selection import Selection, SelectionError, one_protocol, select
@@ -226,8 +226,9 @@ def _take(run: Run, row: Row) -> None:
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
     run.rate = run.left = None
-    run.message = row.values["message"] if state == "failed" else ""
-    run.total = row_count(row.config["method"]) or int(lookup(row.config, "method.episodes"))
+    message = row.values["message"] if state == "failed" else ""
+    run.message = "".join(letter if letter.isprintable() else " " for letter in message)
+    run.total = row_count(row.config["method"]) or row.config["method"].get("episodes") or 0
     run.done = run.total if state == "done" else int(row.values["iterations"])
     if state == "running":
         _measure(run)
@@ -251,14 +252,15 @@ def _measure(run: Run) -> None:
     """Take speed and rest of a run under way from its latest rows."""
     try:
         with opened(Path(run.path)) as file:
-            table = file["iterations"]
-            seconds = table["seconds"][()]
-            in_episodes = "train_reward" in table
-            done = table["episodes"][()] if in_episodes else range(1, len(seconds) + 1)
+            table = columns(file, "iterations")
+            seconds = table["seconds"]
+            done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
+            if not math.isfinite(sum(seconds) + sum(done)):
+                raise ValueError("seconds or episodes are not finite")
             written = Path(run.path).stat().st_mtime
-            run.seconds = float(sum(attributes(file, "wall_time").values()))
+            run.seconds = float(sum(numbers(attributes(file, "wall_time")).values()))
             run.together = _together(attributes(file, "provenance"), written, run.seconds)
-    except (ResultsError, OSError, KeyError):
+    except (ResultsError, OSError):
         # It may just have ended, and its partial file be gone.
         return
     if len(seconds) == 0:
@@ -335,7 +337,7 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 def duration(seconds: float | None) -> str:
     """Write a time for people: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
-    if seconds is None:
+    if seconds is None or not math.isfinite(seconds):
         return "?"
     if seconds < 100:
         return f"{seconds:.0f} s"
@@ -349,6 +351,7 @@ def duration(seconds: float | None) -> str:
 def _show(found: Survey) -> None:
     # Imported here: scripts that read --json need no tables.
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     # Not narrower than the table where the output is no terminal.
@@ -362,7 +365,7 @@ def _show(found: Survey) -> None:
         mean = "" if group.mean_seconds is None else duration(group.mean_seconds)
         left = "" if group.left == 0 else duration(group.left)
         done = f"{group.counts['done']}/{group.expected}"
-        table.add_row(group.task, group.method, done, *counts, mean, rate, left)
+        table.add_row(escape(group.task), escape(group.method), done, *counts, mean, rate, left)
     console.print(table)
     if found.protocol != "plab":
         console.print(f"protocol: {found.protocol}", highlight=False)
@@ -371,9 +374,9 @@ def _show(found: Survey) -> None:
         if run.state == "running":
             left = None if run.left is None else run.left * run.together
             progress = f"{run.done}/{run.total}, {duration(left)} left" if run.total else "starting"
-            console.print(f"running: {name}: {progress}", highlight=False)
+            console.print(f"running: {name}: {progress}", highlight=False, markup=False)
         if run.state == "failed":
-            console.print(f"[red]failed[/]: {name}: {run.message}", highlight=False)
+            console.print(f"[red]failed[/]: {escape(f'{name}: {run.message}')}", highlight=False)
     totals = Counter(run.state for run in found.runs)
     counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
     console.print(f"{len(found.runs)} runs: {counts}", highlight=False)
@@ -383,7 +386,7 @@ def _show(found: Survey) -> None:
         text = "further run(s) in the results, of other names or other settings"
         console.print(f"{found.others} {text}", highlight=False)
     for error in found.unreadable:
-        console.print(f"left out: {error}", highlight=False)
+        console.print(f"left out: {error}", highlight=False, markup=False)
 
 
 def _json(found: Survey) -> dict[str, Any]:

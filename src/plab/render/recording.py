@@ -12,6 +12,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from plab.checks import cuda_is_usable
 from plab.config import build_scene, load_config
@@ -91,16 +92,21 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
     run = read(path)
     if run.best_actions is None:
         raise RenderError(f"{path} has no actions yet: the run did not finish its first iteration")
-    cfg = dataclasses.replace(
-        load_config(),
-        variant=str(run.config["variant"]),
-        task=_section(run.config["task"], TaskConfig),
-        protocol=_section(run.config["protocol"], ProtocolConfig),
-        sim=_section(run.config["sim"], SimConfig),
-        # A target that came from a file of the user's is not in the result.
-        targets=_section(run.config["targets"], TargetsConfig),
-    )
-    actions, components = run.best_actions, build_scene(cfg).action_dim
+    try:
+        cfg = dataclasses.replace(
+            load_config(),
+            variant=str(run.config["variant"]),
+            task=_section(run.config["task"], TaskConfig),
+            protocol=_section(run.config["protocol"], ProtocolConfig),
+            sim=_section(run.config["sim"], SimConfig),
+            # A target that came from a file of the user's is not in the result.
+            targets=_section(run.config["targets"], TargetsConfig),
+        )
+        components = build_scene(cfg).action_dim
+    except (OmegaConfBaseException, LookupError, TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise RenderError(f"{path} has a configuration that cannot be replayed: {reason}") from error
+    actions = run.best_actions
     if actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
         shape = list(actions.shape)
         raise RenderError(f"{path} has actions of shape {shape}, but its task takes [steps, {components}]")

@@ -201,8 +201,9 @@ def collect_ablation(
     found = [row for row in rows(source)[0] if row.values["status"] == "finished"]
     groups: dict[tuple[str, ...], dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in found:
-        if chosen(row.values, row.config):
-            groups[tuple(str(row.values[name]) for name in NAMES[:3])][lookup(row.config, key)].append(row)
+        value = lookup(row.config, key)
+        if chosen(row.values, row.config) and isinstance(value, str | int | float):
+            groups[tuple(str(row.values[name]) for name in NAMES[:3])][value].append(row)
     if not groups:
         return None
     (task, variant, method), by_value = max(groups.items(), key=lambda item: len(item[1]))

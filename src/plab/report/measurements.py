@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from plab.reading import regular_file
 from plab.results import ResultsError
 
 __all__ = ["ACCURACY", "PRECISION", "SPEED", "Benchmark", "measured", "origin"]
@@ -69,6 +70,7 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
     """
     advice = f"`{benchmark.maker(path)}` makes it"
     try:
+        regular_file(path)
         content = path.read_bytes()
         table = pd.read_csv(io.BytesIO(content), comment="#")
     except FileNotFoundError:

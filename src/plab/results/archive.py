@@ -77,6 +77,9 @@ def pack(
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = readable_rows(source)
     chosen = _members(filter(wanted or _finished, found))
+    if not chosen:
+        hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
+        raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as members:
         for name, row in sorted(chosen.items()):
@@ -122,8 +125,6 @@ def _members(wanted: Iterable[Row]) -> dict[str, Row]:
                 f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
             )
         chosen[name] = row
-    if not chosen:
-        raise ResultsError("there is nothing to pack: no run fits")
     return chosen
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 
 from plab.families import known_family
 from plab.objective import scores_from_iou
-from plab.results.files import explained, read
-from plab.results.loading import run_files
+from plab.results.files import opened_archive, read
+from plab.results.loading import members, run_files
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     BUDGETS,
@@ -25,6 +24,7 @@ from plab.results.schema import (
     RunResult,
     config_hash,
     loss_columns,
+    resume_fault,
     row_count,
 )
 
@@ -75,7 +75,7 @@ def problems(run: RunResult) -> list[str]:
     found = [*_status(run), *_iterations(run), *_best(run), *_times(run)]
     if run.status == "finished":
         found += [*_evaluation(run), *_masses(run), *_complete(run)]
-    return found
+    return list(dict.fromkeys(found))
 
 
 # ---------------------------------------------------------------------------------------------------- details
@@ -85,8 +85,8 @@ _GET_RIGHTS = "ask whom it belongs to for the right to read it"
 
 def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
     try:
-        with explained(path), zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
+        with opened_archive(path) as archive:
+            names = members(archive)
     except ResultsError as error:
         reason = _reason(error, path)
         hidden = reason.startswith("may not be read")
@@ -103,7 +103,7 @@ def _check_file(path: Path) -> Problem | None:
     except ResultsError as error:
         reason = _reason(error, path)
         return Problem(path, reason, _advice_unreadable(path, reason))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
     if found:
         return Problem(path, "; ".join(found), "run it again with force=true, or delete it")
@@ -118,9 +118,11 @@ def _reason(error: ResultsError, path: Path) -> str:
 def _advice_unreadable(path: Path, reason: str) -> str:
     if reason.startswith("may not be read"):
         return _GET_RIGHTS
-    if "schema version" in reason:
+    if reason.startswith(("was written by a newer plab", "has schema version")):
         return "read it with the plab that wrote it"
-    if "not a plab" in reason or not h5py.is_hdf5(path):
+    if reason.startswith("cannot be read: it is"):
+        return "move it out of the results"
+    if "not a plab" in reason or not (path.is_file() and h5py.is_hdf5(path)):
         begun = path.name.endswith(PARTIAL_SUFFIX)
         cut = "delete it; the run starts afresh" if begun else "delete it and run it again"
         return "move it out of the results" if "not a plab" in reason else cut
@@ -129,7 +131,8 @@ def _advice_unreadable(path: Path, reason: str) -> str:
 
 def _status(run: RunResult) -> Iterator[str]:
     if run.status not in STATUSES:
-        yield f"status '{run.status}' is none of {', '.join(STATUSES)}"
+        yield f"status {run.status!r:.80} is none of {', '.join(STATUSES)}"
+        return
     partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
     if partial == (run.status == "finished"):
         yield f"the name says that the run is {'not ' if partial else ''}finished, the status is {run.status}"
@@ -137,6 +140,8 @@ def _status(run: RunResult) -> Iterator[str]:
         yield "it failed without a message"
     if config_hash(run.config) != run.config_hash:
         yield "config_hash is not that of config"
+    if fault := resume_fault(run):
+        yield fault
 
 
 def _times(run: RunResult) -> Iterator[str]:

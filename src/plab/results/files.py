@@ -6,6 +6,7 @@ import contextlib
 import errno
 import itertools
 import json
+import math
 import os
 import zipfile
 import zlib
@@ -18,14 +19,18 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.results.hdf5 import attributes, columns
+from plab.reading import LARGEST, UnreadableError, member_bytes, opened_zip, regular_file
+from plab.results.hdf5 import array, attributes, columns, groups, numbers, take, tree
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
+    BUDGETS,
+    COLUMNS,
     SCHEMA_VERSION,
     NewerSchemaError,
     ResultsError,
     RunResult,
     stored_config,
+    stored_hash,
 )
 from plab.selection import lookup
 
@@ -35,6 +40,7 @@ __all__ = [
     "explained",
     "make_folder",
     "opened",
+    "opened_archive",
     "opened_image",
     "read",
     "read_iterations",
@@ -52,8 +58,18 @@ _images = itertools.count()
 _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
 
-_UNREADABLE = (OSError, KeyError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""What h5py, zlib and zipfile raise on files that are cut short, damaged or something else."""
+_UNREADABLE = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    zlib.error,
+)
+"""What h5py, json and zlib raise on files that are cut short, damaged or something else."""
 
 
 def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
@@ -139,24 +155,23 @@ def read(path: str | Path) -> RunResult:
     """
     path = Path(path)
     with opened(path) as file:
-        masses = {name: _read_sparse(group) for name, group in file["mass"].items()}
-        own, best = attributes(file), attributes(file, "best")
+        own, best, there = attributes(file), attributes(file, "best"), groups(file, "/")
         return RunResult(
-            config=stored_config(own["config"]),
-            config_hash=own["config_hash"],
-            status=own["status"],
-            message=own["message"],
-            provenance=attributes(file, "provenance"),
-            wall_time=attributes(file, "wall_time"),
+            config=stored_config(take(own, "config", str)),
+            config_hash=stored_hash(take(own, "config_hash", str)),
+            status=take(own, "status", str),
+            message=take(own, "message", str),
+            provenance=_scalars(attributes(file, "provenance")),
+            wall_time=numbers(attributes(file, "wall_time")),
             iterations=pd.DataFrame(columns(file, "iterations")),
-            best_actions=file["best/actions"][()] if "actions" in file["best"] else None,
-            best_iteration=int(best["iteration"]),
-            best_loss=float(best["loss"]),
-            evaluation=attributes(file, "evaluation"),
+            best_actions=array(file, "best", "actions"),
+            best_iteration=take(best, "iteration", int),
+            best_loss=take(best, "loss", float),
+            evaluation=numbers(attributes(file, "evaluation")),
             # Files of plab 0.1 have none.
-            labels=attributes(file, "labels") if "labels" in file else {},
-            masses=masses,
-            resume=_read_tree(file["resume"]) if "resume" in file else None,
+            labels=_scalars(attributes(file, "labels")) if "labels" in there else {},
+            masses={name: _read_sparse(file, f"mass/{name}") for name in groups(file, "mass")},
+            resume=tree(file, "resume") if "resume" in there else None,
             path=path,
         )
 
@@ -175,8 +190,13 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """
     path = Path(path)
     with opened(path) as file:
-        config = attributes(file, names=("config",))["config"]
-        return stored_config(config), pd.DataFrame(columns(file, "iterations"))
+        config = stored_config(take(attributes(file, names=("config",)), "config", str))
+        table = pd.DataFrame(columns(file, "iterations"))
+        if missing := [name for name in COLUMNS if len(table) and name not in (*table, *BUDGETS)]:
+            raise ValueError(f"iterations lack {missing[0]}")
+        for name in ("horizon", "substeps"):
+            take(config["sim"], name, int)
+        return config, table
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
@@ -231,17 +251,25 @@ def opened(path: Path) -> Iterator[h5py.File]:
     inside = split_archive(path)
     with explained(path):
         if inside is None:
+            regular_file(path)
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
         archive, member = inside
-        try:
-            with zipfile.ZipFile(archive) as members:
-                image = members.read(member)
-        except KeyError:
-            raise ResultsError(f"{archive} holds no run {member}") from None
+        with opened_archive(archive) as members:
+            if member not in members.NameToInfo:
+                raise ResultsError(f"{archive} holds no run {member}")
+            with explained(path):
+                image = member_bytes(members, member)
     with opened_image(image, path) as file:
         yield file
+
+
+@contextmanager
+def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive, turning whatever is wrong with it into a ResultsError; see :mod:`plab.reading`."""
+    with explained(path), opened_zip(path) as members:
+        yield members
 
 
 @contextmanager
@@ -262,15 +290,24 @@ def explained(path: Path) -> Iterator[None]:
         raise
     except PermissionError as error:
         raise ResultsError(f"{path} may not be read ({error.strerror or error})") from error
+    except UnreadableError as error:
+        raise ResultsError(f"{path} cannot be read: {_one_line(error)}") from error
     except _UNREADABLE as error:
-        raise ResultsError(f"{path} is truncated or damaged ({error})") from error
+        raise ResultsError(f"{path} is truncated or damaged ({_one_line(error)})") from error
+
+
+def _one_line(error: BaseException) -> str:
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return " ".join(text.split())[:300] or type(error).__name__
 
 
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     own = attributes(file, names=("format", "schema_version"))
-    if own.get("format") != "plab-run":
+    if own.get("format") != "plab-run" or not isinstance(own["format"], str):
         raise ResultsError(f"{path} is not a plab result file")
-    version = own["schema_version"]
+    version = own.get("schema_version")
+    if type(version) is not int:
+        raise ValueError("its schema version is no number")
     if version > SCHEMA_VERSION:
         raise NewerSchemaError(
             f"{path} was written by a newer plab (schema version {version}, this one knows "
@@ -289,11 +326,29 @@ def _write_sparse(group: h5py.Group, mass: np.ndarray, options: dict[str, Any]) 
     group.create_dataset("value", data=flat[index], **options)
 
 
-def _read_sparse(group: h5py.Group) -> np.ndarray:
-    values = group["value"][()]
-    flat = np.zeros(int(np.prod(group.attrs["shape"])), dtype=values.dtype)
-    flat[group["index"][()]] = values
-    return flat.reshape(group.attrs["shape"])
+def _scalars(values: dict[str, Any]) -> dict[str, Any]:
+    if strange := [name for name, value in values.items() if not isinstance(value, str | int | float)]:
+        raise ValueError(f"{strange[0]} is neither number nor text")
+    if "resumed" in values:
+        take(values, "resumed", int)
+    return values
+
+
+def _read_sparse(file: h5py.File, group: str) -> np.ndarray:
+    shape = np.asarray(attributes(file, group, ("shape",))["shape"])
+    index, values = array(file, group, "index"), array(file, group, "value")
+    if index is None or values is None or index.shape != values.shape or index.ndim != 1:
+        raise ValueError(f"{group} is no sparse tensor")
+    if shape.ndim != 1 or shape.dtype.kind not in "iu" or index.dtype.kind not in "iu" or (shape < 0).any():
+        raise ValueError(f"{group} has no shape")
+    lengths = [int(size) for size in shape]
+    if (size := math.prod(lengths)) * values.itemsize > LARGEST:
+        raise ValueError(f"{group} claims {size} entries")
+    if len(index) and not 0 <= index.min() <= index.max() < size:
+        raise ValueError(f"{group} has entries outside of its shape")
+    flat = np.zeros(size, dtype=values.dtype)
+    flat[index] = values
+    return flat.reshape(lengths)
 
 
 def _write_tree(group: h5py.Group, tree: Mapping[str, Any]) -> None:
@@ -302,14 +357,3 @@ def _write_tree(group: h5py.Group, tree: Mapping[str, Any]) -> None:
             _write_tree(group.create_group(str(key)), value)
         else:
             group.create_dataset(str(key), data=value)
-
-
-def _read_tree(group: h5py.Group) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
-    for key, item in group.items():
-        if isinstance(item, h5py.Group):
-            tree[key] = _read_tree(item)
-        else:
-            value = item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
-            tree[key] = value if isinstance(value, str) else np.asarray(value)
-    return tree

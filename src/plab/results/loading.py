@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import warnings
 import zipfile
 from collections import defaultdict
@@ -15,8 +16,9 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.results.files import explained, opened, opened_image, split_archive
-from plab.results.hdf5 import attributes
+from plab.reading import member_bytes
+from plab.results.files import explained, opened, opened_archive, opened_image, split_archive
+from plab.results.hdf5 import attributes, columns, length, numbers, take
 from plab.results.index import Index
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
@@ -26,10 +28,11 @@ from plab.results.schema import (
     counts_last,
     final_path,
     stored_config,
+    stored_hash,
 )
 from plab.selection import lookup
 
-__all__ = ["Row", "load", "read_rows", "readable_rows", "rows", "run_files"]
+__all__ = ["Row", "load", "members", "read_rows", "readable_rows", "rows", "run_files"]
 
 _SUMMARY_COLUMNS = (
     "task",
@@ -150,40 +153,53 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
     """
     found, unreadable = rows(source)
     sources = [source] if isinstance(source, str | Path) else source
-    if unreadable and not found and all(Path(root).is_file() for root in sources):
+    if unreadable and not found and not any(Path(root).is_dir() for root in sources):
         raise unreadable[0]
     return found, unreadable
 
 
-def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
+def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result | None]]:
     """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
+
+    Beside each is what the system says of it; None where nothing can be read, such as of a link that leads in
+    a circle, or a folder that may not be searched.
 
     Raises:
         ResultsError: If there is nothing at ``root``.
     """
-    if root.is_file():
-        yield root, root.stat()
+    try:
+        found = root.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise ResultsError(f"there are no results: {root} does not exist") from None
+    except OSError as error:
+        raise ResultsError(f"there are no results: {root} cannot be read ({error.strerror})") from None
+    if not stat.S_ISDIR(found.st_mode):
+        yield root, found
         return
-    if not root.exists():
-        raise ResultsError(f"there are no results: {root} does not exist")
-    for folder, subfolders, names in os.walk(root):
+    closed: list[Path] = []
+    for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
         subfolders.sort()
-        for name in sorted(names):
+        wrong = {name for name in subfolders if name.endswith(SUFFIX)}
+        for name in sorted([*names, *wrong]):
             if name.endswith((SUFFIX, ARCHIVE_SUFFIX)):
                 path = Path(folder, name)
                 try:
-                    yield path, path.stat()
-                except FileNotFoundError:
+                    yield path, None if name in wrong else path.stat()
+                except OSError:
                     # A run that ends removes its partial file, any moment.
-                    continue
+                    if path.is_symlink() or os.path.lexists(path):
+                        yield path, None
+    if root in closed:
+        raise ResultsError(f"there are no results: {root} may not be read")
+    yield from ((path, None) for path in sorted(closed))
 
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
     """Yield the rows of a result file or an archive, and what is wrong where there is none."""
     try:
         if path.name.endswith(ARCHIVE_SUFFIX):
-            with explained(path), zipfile.ZipFile(path) as archive:
-                for name in archive.namelist():
+            with opened_archive(path) as archive:
+                for name in members(archive):
                     yield _member_row(archive, path, name)
         else:
             with opened(path) as file:
@@ -192,18 +208,23 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
         yield error
 
 
+def members(archive: zipfile.ZipFile) -> list[str]:
+    """Return the names of the runs in an archive; folders, which other programs put there, are none."""
+    return [info.filename for info in archive.infolist() if not info.is_dir()]
+
+
 # ---------------------------------------------------------------------------------------------------- details
 
 
 def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
     """Yield the rows of all files below a folder, or of one file, from the index where it knows them."""
-    known = Index(root) if use_index else None
     paths = list(run_files(root))
+    known = Index(root) if use_index else None
     present = {path for path, _ in paths}
-    for path, stat in paths:
+    for path, facts in paths:
         if path.name.endswith(PARTIAL_SUFFIX) and final_path(path) in present:
             continue
-        entry = None if known is None else known.find(path, stat)
+        entry = None if known is None or facts is None else known.find(path, facts)
         if entry is not None:
             yield from (
                 Row(values | {"path": str(path / member)}, config) for member, values, config in entry
@@ -211,8 +232,8 @@ def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
             continue
         fresh = list(read_rows(path))
         sound = [row for row in fresh if isinstance(row, Row)]
-        if known is not None and len(sound) == len(fresh):
-            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in sound])
+        if known is not None and facts is not None and len(sound) == len(fresh):
+            known.add(path, facts, [(row.path.relative_to(path), row.values, row.config) for row in sound])
         yield from fresh
     if known is not None:
         known.save()
@@ -241,7 +262,7 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | ResultsError:
     try:
         with explained(path / name):
-            image = archive.read(name)
+            image = member_bytes(archive, name)
         with opened_image(image, path / name) as file:
             return _row(file, path / name)
     except ResultsError as error:
@@ -251,26 +272,26 @@ def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | Result
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, from its attributes; of its arrays it reads the last score alone."""
     own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
-    config, table = stored_config(own["config"]), file["iterations"]
-    evaluation, phases = attributes(file, "evaluation"), attributes(file, "wall_time")
-    columns = [str(name) for name in table.attrs["columns"]]
+    config = stored_config(take(own, "config", str))
+    evaluation = numbers(attributes(file, "evaluation"))
+    phases = numbers(attributes(file, "wall_time"))
     known = {
         "task": config["task"]["name"],
         "variant": str(config["variant"]),
         "method": config["method"]["name"],
         "seed": config["seed"],
-        "status": own["status"],
-        "message": own["message"],
-        "iterations": table[columns[0]].shape[0] if columns else 0,
-        "best_iteration": int(best["iteration"]),
-        "best_loss": float(best["loss"]),
+        "status": take(own, "status", str),
+        "message": take(own, "message", str),
+        "iterations": length(file, "iterations"),
+        "best_iteration": take(best, "iteration", int),
+        "best_loss": take(best, "loss", float),
         "seconds": float(sum(phases.values())),
-        "config_hash": own["config_hash"],
+        "config_hash": stored_hash(take(own, "config_hash", str)),
         "path": str(path),
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):
-        values["score"] = float(table["score"][-1])
+        values["score"] = float(columns(file, "iterations")["score"][-1])
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

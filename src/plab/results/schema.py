@@ -39,8 +39,10 @@ __all__ = [
     "member_name",
     "parse_member",
     "result_path",
+    "resume_fault",
     "row_count",
     "stored_config",
+    "stored_hash",
 ]
 
 SCHEMA_VERSION = 1
@@ -75,6 +77,23 @@ _BEFORE_PROTOCOLS = {
     "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"}
 }
 """What the configurations of runs say that are older than protocols."""
+
+
+_SECTIONS = ("task", "method", "sim", "protocol")
+
+_NEEDED: dict[str, type | tuple[type, ...]] = {
+    "task.name": str,
+    "variant": (str, int),
+    "method.name": str,
+    "method.family": str,
+    "protocol.name": str,
+    "sim.device": str,
+    "seed": int,
+}
+"""What every configuration says, and the types of it."""
+
+_NAME = re.compile(r"(?!/)(?!(?:.*/)?\.\.(?:/|$))[^\\\x00-\x1f\x7f]{1,200}")
+"""Names with which :func:`member_name` stays in its folder."""
 
 
 class ResultsError(PlabError, RuntimeError):
@@ -147,11 +166,53 @@ def config_dict(cfg: Any) -> dict[str, Any]:
 
 
 def stored_config(text: str) -> dict[str, Any]:
-    """Return the configuration that a result file holds as ``text``, with what older ones lack."""
-    config = _BEFORE_PROTOCOLS | json.loads(text)
+    """Return the configuration that a result file holds as ``text``, with what older ones lack.
+
+    Raises:
+        ValueError: If it is no configuration of a run.
+    """
+    loaded = json.loads(text)
+    if not isinstance(loaded, dict):
+        raise ValueError(f"config is a {type(loaded).__name__}, not sections and values")
+    config = _BEFORE_PROTOCOLS | loaded
+    if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
+        raise ValueError(f"config has no section {strange[0]}")
+    for key, kind in _NEEDED.items():
+        if not isinstance(value := lookup(config, key), kind) or isinstance(value, bool):
+            raise ValueError(f"{key} in config is {value!r:.80}")
+        if isinstance(value, str) and not _NAME.fullmatch(value):
+            raise ValueError(f"{key} in config is no name: {value!r:.80}")
+    _check_tables(config)
     usual = "last" if config["protocol"]["name"] == "release" else "best"
     config["protocol"] = {"score": usual} | config["protocol"]
     return config
+
+
+def stored_hash(text: str) -> str:
+    """Return the hash that a result file holds as ``text``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if not re.fullmatch("[0-9a-f]{64}", text):
+        raise ValueError(f"config_hash is {text!r:.80}")
+    return text
+
+
+def _check_tables(config: Mapping[str, Any]) -> None:
+    """See that what readers look into are tables, and that :func:`row_count` can count."""
+    method, variants = config["method"], config["task"].get("variants") or {}
+    stages = method.get("stages", {})
+    tables = {"task.variants": variants, "method.stages": stages}
+    for key, table in tables.items():
+        if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
+            raise ValueError(f"{key} in config is no table")
+    if not isinstance(method.get("loss_weights", {}), dict):
+        raise ValueError("method.loss_weights in config is no table")
+    counts = [stage.get("iterations") for stage in stages.values()]
+    counts += [method[name] for name in ("iterations", "episodes") if method.get(name) is not None]
+    if not all(type(count) is int and count >= 0 for count in counts):
+        raise ValueError("method in config counts iterations or episodes by something that is no number")
 
 
 def config_hash(cfg: Any) -> str:
@@ -197,6 +258,29 @@ def row_count(method: Mapping[str, Any]) -> int | None:
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")
+
+
+def resume_fault(run: RunResult) -> str:
+    """Return why a run cannot go on from what its file holds, empty if nothing speaks against it."""
+    table, actions = run.iterations, run.best_actions
+    if run.resume is None or table.empty:
+        return ""
+    if actions is None or actions.ndim != 2:
+        return "it has iterations, but no best actions"
+    if not 0 <= run.best_iteration < len(table):
+        return f"there is no iteration {run.best_iteration}, which is to be the best"
+    if missing := [name for name in ("loss", "score") if name not in table]:
+        return f"iterations lack {missing[0]}"
+    if endless := [name for name in BUDGETS if name in table and not np.isfinite(table[name]).all()]:
+        return f"iterations are not finite: {endless[0]}"
+    if run.config["method"]["family"] == "trajectory":
+        state = run.resume.get("actions")
+        if not isinstance(state, np.ndarray) or state.shape != actions.shape:
+            shape = list(getattr(state, "shape", ()))
+            return f"the actions to go on from have shape {shape}, not {list(actions.shape)}"
+        if not (np.abs(state) <= 1.0).all():
+            return "the actions to go on from leave [-1, 1]"
+    return ""
 
 
 def result_path(cfg: Any) -> Path:

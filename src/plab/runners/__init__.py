@@ -16,6 +16,7 @@ from plab.command import TRACEBACK, traceback_wanted
 from plab.config_errors import ConfigError
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile
+from plab.results.schema import resume_fault
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
 from plab.runners.runner import Runner, Step, Track
@@ -111,6 +112,7 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
     try:
         for number, job in enumerate(jobs):
             try:
+                _require_usable(job.run)
                 own = family(job.cfg.method.family)
                 kind = _runner(job, in_sweep=in_sweep)
                 shares = own.batching or kind is not own.runner_type()
@@ -122,6 +124,14 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
     finally:
         for job in jobs:
             job.run.release()
+
+
+def _require_usable(run: RunFile) -> None:
+    """Raise ResultsError if a run cannot go on from what an earlier process left."""
+    if fault := resume_fault(run.result):
+        raise ResultsError(
+            f"{run.partial_path} cannot be gone on from: {fault}; start afresh with force=true"
+        )
 
 
 def _carry_out(jobs: Sequence[Job], kind: type[Runner], note: str, cache: SimulatorCache) -> None:

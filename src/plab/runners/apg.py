@@ -9,7 +9,6 @@ reproduce a result:
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -20,6 +19,7 @@ import torch
 
 from plab.config_types import ApgConfig
 from plab.runners.common import policy_episode, shared_batches, torch_settings
+from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.runner import Runner, Step, Track
 from plab.torch import rollout
 
@@ -96,16 +96,19 @@ class PolicyTraining:
         return float(norm)
 
     def state(self) -> dict[str, Any]:
-        """Return everything that the next steps depend on, as an array of bytes."""
-        file = io.BytesIO()
-        torch.save({"policy": self.policy.state_dict(), "optimizer": self._optimizer.state_dict()}, file)
-        return {"training": np.frombuffer(file.getvalue(), np.uint8)}
+        """Return everything that the next steps depend on, as arrays."""
+        return {"policy": module_arrays(self.policy), "optimizer": optimizer_arrays(self._optimizer)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
-        content = torch.load(io.BytesIO(state["training"].tobytes()), weights_only=True)
-        self.policy.load_state_dict(content["policy"])
-        self._optimizer.load_state_dict(content["optimizer"])
+        """Return to a :meth:`state`.
+
+        Raises:
+            ValueError: If it is that of another network, or was pickled.
+        """
+        if "training" in state:
+            raise ValueError("its network is pickled, as by earlier versions of plab")
+        restore_module(self.policy, state["policy"])
+        restore_optimizer(self._optimizer, state["optimizer"])
 
 
 def _network(widths: Sequence[int]) -> torch.nn.Sequential:

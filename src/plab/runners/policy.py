@@ -1,31 +1,58 @@
-"""Trained policies: kept in a file beside the result, and taken from there."""
+"""Trained policies: kept in a file beside the result, and taken from there.
+
+The file is an ``.npz`` of arrays alone: the networks' parameters by their names, the bounds of observations
+and actions, and a header in JSON with the section ``method`` of the run, from which the networks are made
+anew. Reading it unpickles and imports nothing.
+"""
 
 from __future__ import annotations
 
 import io
-import pickle
-import zipfile
+import itertools
+import json
+import math
+import sys
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
+from gymnasium.spaces import Box
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
-from plab.config_errors import ConfigError
+from plab.config import ConfigError, RlConfig
+from plab.families import FAMILIES, family
+from plab.reading import read_arrays
 from plab.results import ResultsError
 from plab.results.files import replace_file
-from plab.runners.rl_models import CLIP, model_kind
+from plab.runners.model_state import module_arrays, restore_module
+from plab.runners.rl_models import CLIP, Spaces, model_kind
 
-__all__ = ["Policy", "load_policy", "model_policy", "policy_path", "save_policy"]
+__all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
 
 EPSILON = 1e-8
 """Added to variances of observations, as Stable-Baselines3 does."""
 
-_BROKEN = (OSError, ValueError, KeyError, EOFError, RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile)
-"""What NumPy and PyTorch raise at a file that is cut off or of another kind."""
+_FORMAT = "plab-policy 1"
+
+_PARAMETER = "policy/"
+"""What the names of the networks' parameters begin with."""
+
+_BROKEN = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+)
+"""What is raised at a file that is cut off or of another kind, or whose arrays do not fit."""
 
 
 class Policy:
@@ -60,38 +87,14 @@ def policy_path(result: Path) -> Path:
     return result.with_suffix(".policy.npz")
 
 
-def model_policy(family: str, algorithm: str, state: Mapping[str, Any]) -> BasePolicy:
-    """Return the policy of a checkpoint.
-
-    Args:
-        family: Family of the method, as ``method.family`` names it.
-        algorithm: Learning algorithm, as ``method.algorithm`` names it.
-        state: The checkpoint, a :meth:`plab.runners.rl_trainer.Trainer.state`.
-    """
-    # The replay buffer of a training that is over is not to be looked for.
-    without_buffer: dict[str, Any] = {
-        "replay_buffer_class": None,
-        "replay_buffer_kwargs": {},
-        "buffer_size": 1,
-    }
-    kind: type[BaseAlgorithm] = model_kind(family, algorithm).model
-    model = kind.load(io.BytesIO(state["model"].tobytes()), device="cpu", custom_objects=without_buffer)
-    return model.policy
-
-
 def save_policy(
-    result: Path,
-    family: str,
-    algorithm: str,
-    policy: BasePolicy,
-    moments: tuple[np.ndarray, np.ndarray] | None,
+    result: Path, method: RlConfig, policy: BasePolicy, moments: tuple[np.ndarray, np.ndarray] | None
 ) -> None:
     """Write a policy beside the result.
 
     Args:
         result: The run's result file.
-        family: Family of the method, as ``method.family`` names it.
-        algorithm: Learning algorithm, as ``method.algorithm`` names it.
+        method: The section ``method`` of its configuration.
         policy: Stable-Baselines3's policy.
         moments: Means and variances of the observations that scale them, shape [entry]; None if they were not
             scaled.
@@ -99,16 +102,14 @@ def save_policy(
     Raises:
         ResultsError: If the file cannot be written.
     """
-    buffer = io.BytesIO()
-    # torch takes files as it takes paths.
-    policy.save(cast(str, buffer))
-    arrays: dict[str, Any] = {
-        "family": np.array(family),
-        "algorithm": np.array(algorithm),
-        "policy": np.frombuffer(buffer.getvalue(), np.uint8),
-    }
+    header = json.dumps({"format": _FORMAT, "method": asdict(method)})
+    arrays: dict[str, Any] = {"header": np.array(header)}
+    for name in ("observation", "action"):
+        space = cast(Box, getattr(policy, f"{name}_space"))
+        arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
     if moments is not None:
         arrays |= {"mean": np.asarray(moments[0]), "variance": np.asarray(moments[1])}
+    arrays |= {f"{_PARAMETER}{name}": values for name, values in module_arrays(policy).items()}
     packed = io.BytesIO()
     np.savez(packed, **arrays)
     replace_file(policy_path(result), packed.getvalue(), sync=True)
@@ -123,25 +124,83 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
 
     Raises:
         ResultsError: If there is no policy beside the result, its file is broken, or it is of a family
-            outside plab whose module is not found.
+            outside plab whose module has not been imported.
     """
     path = policy_path(Path(result))
     try:
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
-        # Files of earlier versions are all of plab's own family.
-        family = str(arrays.get("family", "rl"))
-        kind = model_kind(family, str(arrays["algorithm"])).model.policy_aliases["MlpPolicy"]
-        network = kind.load(cast(str, io.BytesIO(arrays["policy"].tobytes())), device="cpu")
+        policy = _policy(path)
     except FileNotFoundError:
         raise ResultsError(
             f"{path} is not there: sac, td3 and ppo write it when a run ends; see docs/rl.md"
         ) from None
-    except ConfigError as error:
-        raise ResultsError(f"{path}: {error}") from error
+    except ResultsError:
+        raise
     except _BROKEN as error:
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise ResultsError(
-            f"{path} is no policy of plab's ({error}): run it again with force=true"
+            f"{path} is no policy of plab's ({reason}): run it again with force=true"
         ) from error
     # What the device answers says nothing about the file.
-    return Policy(network.to(get_device(device)), arrays.get("mean"), arrays.get("variance"))
+    policy.network = policy.network.to(get_device(device))
+    return policy
+
+
+def _policy(path: Path) -> Policy:
+    arrays = read_arrays(path)
+    if "header" not in arrays and "policy" in arrays:
+        raise ValueError("it is pickled, as by earlier versions of plab, and not read any more")
+    header = json.loads(str(arrays["header"][()]))
+    if header["format"] != _FORMAT:
+        raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
+    method = _method(header["method"], path)
+    spaces = Spaces(*(_space(arrays, name) for name in ("observation", "action")))
+    own = [name for name in arrays if name.startswith(_PARAMETER)]
+    parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}
+    _require_room(method, spaces, parameters)
+    network = model_kind(method.family, method.algorithm).policy(method, spaces)
+    restore_module(network, parameters)
+    moments = [arrays.get(name) for name in ("mean", "variance")]
+    for values in moments:
+        if values is not None and values.shape != spaces.observation_space.shape:
+            raise ValueError(f"its statistics have shape {list(values.shape)}")
+    return Policy(network, *moments)
+
+
+def _method(section: Any, path: Path) -> RlConfig:
+    """Return the section ``method`` that a policy's header holds, of the type of its family."""
+    name = section["family"]
+    if not isinstance(name, str):
+        raise ValueError("its method has no family")
+    # A file does not choose what is imported.
+    if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
+        raise ResultsError(f"{path}: its method is {name}, outside plab: import {module} before")
+    if "${" in json.dumps(section):
+        raise ValueError("its method refers to something else")
+    try:
+        kind = family(name).config_type(section["algorithm"])
+        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section))
+        cast(RlConfig, method).check("method")
+    except ConfigError as error:
+        raise ResultsError(f"{path}: {error}") from error
+    except OmegaConfBaseException as error:
+        raise ValueError(f"its method is none: {(error.msg or str(error)).splitlines()[0]}") from error
+    if not isinstance(method, RlConfig):
+        raise ValueError(f"policies are no part of {name}")
+    return method
+
+
+def _space(arrays: Mapping[str, np.ndarray], name: str) -> Box:
+    low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
+    if low.ndim != 1 or low.shape != high.shape or not (low <= high).all():
+        raise ValueError(f"the bounds of its {name}s are none")
+    return Box(low, high, dtype=np.float32)
+
+
+def _require_room(method: RlConfig, spaces: Spaces, parameters: Mapping[str, np.ndarray]) -> None:
+    """See that networks of this size can be what the file holds, before they are made."""
+    sizes = [space.shape[0] for space in spaces]
+    widths = [sizes[0], *getattr(method, "hidden", ()), sizes[1]]
+    needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
+    there = sum(values.size for values in parameters.values())
+    if needed > there:
+        raise ValueError(f"it has {there} parameters, its networks at least {needed}")

@@ -17,6 +17,7 @@ from typing import Any, cast
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.policies import BasePolicy
 
 from plab.checks import check_packages
 from plab.config import ConfigError, RlConfig
@@ -24,8 +25,9 @@ from plab.progress import Report
 from plab.results import RunFile
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
-from plab.runners.policy import model_policy, save_policy
-from plab.runners.rl_models import total_steps
+from plab.runners.model_state import restore_policy
+from plab.runners.policy import save_policy
+from plab.runners.rl_models import Spaces, model_kind, total_steps
 from plab.runners.rl_trainer import Trainer
 from plab.runners.runner import Runner, Step, Track
 
@@ -57,6 +59,9 @@ class RlRunner(Runner):
         if state is None or int(state["steps"]) < total_steps(self._method, track.cfg.sim.horizon):
             self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
             self._trainer.set_logger(_logger(self._method, track.job.run))
+        else:
+            # Now, where what does not fit is answered.
+            self._policy(state)
 
     def has_more(self, track: Track) -> bool:
         """Whether there are steps to train for."""
@@ -99,12 +104,23 @@ class RlRunner(Runner):
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last checkpoint, after which nothing is sampled any more."""
         state = cast("dict[str, Any]", track.job.run.result.resume)
-        family, algorithm = self._method.family, self._method.algorithm
         moments = None
         if state["statistics"]:
             moments = state["statistics"]["observation"]["mean"], state["statistics"]["observation"]["var"]
-        save_policy(track.job.run.path, family, algorithm, model_policy(family, algorithm, state), moments)
+        save_policy(track.job.run.path, self._method, self._policy(state), moments)
         self._replay_path.unlink(missing_ok=True)
+
+    def _policy(self, state: Mapping[str, Any]) -> BasePolicy:
+        """Return the policy of a checkpoint.
+
+        Raises:
+            ValueError: If it is that of another model, or was pickled.
+        """
+        kind = model_kind(self._method.family, self._method.algorithm)
+        spaces = Spaces(self._evaluation.observation_space, self._evaluation.action_space)
+        policy = kind.policy(self._method, spaces)
+        restore_policy(policy, state["model"])
+        return policy
 
     def _train(self, trainer: Trainer, track: Track) -> None:
         self.enter("optimise")

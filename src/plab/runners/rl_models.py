@@ -6,12 +6,14 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
 from plab.config import PpoConfig, SacConfig, Td3Config
@@ -26,6 +28,7 @@ __all__ = [
     "TD3",
     "LinearDecay",
     "ModelKind",
+    "Spaces",
     "cycle_steps",
     "model_kind",
     "off_policy",
@@ -35,6 +38,18 @@ __all__ = [
 
 CLIP = 10.0
 """Largest observation and reward, in units of their running standard deviations."""
+
+
+class Spaces(NamedTuple):
+    """Spaces of environments.
+
+    Attributes:
+        observation_space: That of an observation.
+        action_space: That of an action.
+    """
+
+    observation_space: Box
+    action_space: Box
 
 
 @dataclass(frozen=True)
@@ -60,6 +75,13 @@ class ModelKind:
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             arguments = self.arguments(method, env) | extra
             return self.model("MlpPolicy", env, seed=seed, device=method.torch_device, **arguments)
+
+    def policy(self, method: RlConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
+        """Return the policy with which a model would begin, on the CPU; random numbers stay as they are."""
+        options = self.arguments(method, cast(Any, spaces))["policy_kwargs"]
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return self.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
 
 
 class LinearDecay:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 from plab.config_types import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
+from plab.runners.model_state import model_arrays, restore_model
 from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import CLIP, LinearDecay, cycle_steps, model_kind, total_steps
 
@@ -54,6 +54,7 @@ class Trainer:
 
         Raises:
             plab.results.ResultsError: If there is no room for the replay buffer, or it is gone.
+            ValueError: If the state is that of another model, or was pickled.
         """
         method, self.horizon = cfg.method_as(RlConfig), cfg.sim.horizon
         self._cycle = cycle_steps(method, self.horizon)
@@ -67,11 +68,12 @@ class Trainer:
         self._statistics = _statistics(cfg, self._monitor)
         self._env = self._monitor if self._statistics is None else self._statistics
         extra = self._replay_arguments(cfg, state)
+        if state is not None:
+            self._replay_episode(state)
         kind = model_kind(method.family, method.algorithm)
-        if state is None:
-            self.model: BaseAlgorithm = kind.make(method, self._env, cfg.seed, **extra)
-        else:
-            self.model = self._restored(kind.model, method.torch_device, state, extra)
+        self.model: BaseAlgorithm = kind.make(method, self._env, cfg.seed, **extra)
+        if state is not None:
+            self._restore(state)
 
     @property
     def steps(self) -> int:
@@ -137,12 +139,10 @@ class Trainer:
         """Return everything that further training depends on, except the replay buffer's content."""
         if self._replay is not None:
             self._replay.flush()
-        buffer = io.BytesIO()
-        self.model.save(buffer)
         shape = (-1, self._env.num_envs, *(self._env.action_space.shape or ()))
         return {
             "steps": self.steps,
-            "model": np.frombuffer(buffer.getvalue(), np.uint8),
+            "model": model_arrays(self.model),
             "episode_actions": np.array(self._episode_actions, np.float32).reshape(shape),
             "statistics": {} if self._statistics is None else _statistics_state(self._statistics),
             "random": _random_state(self.model),
@@ -174,21 +174,22 @@ class Trainer:
         }
         return {"replay_buffer_class": EpisodeReplay, "replay_buffer_kwargs": arguments}
 
-    def _restored(
-        self, kind: type[BaseAlgorithm], device: str, state: Mapping[str, Any], extra: dict[str, Any]
-    ) -> BaseAlgorithm:
-        """Return the model of a checkpoint, with environments and random numbers as they were then."""
+    def _replay_episode(self, state: Mapping[str, Any]) -> None:
+        """Bring the environments to where they were at a checkpoint."""
+        if state["episode_actions"].shape[1:] != (self._env.num_envs, *(self._env.action_space.shape or ())):
+            raise ValueError(f"the episode's actions have shape {list(state['episode_actions'].shape)}")
         self._monitor.reset()
         # Below the statistics: they have seen these steps.
         for actions in state["episode_actions"]:
             self._monitor.step(actions)
             self._episode_actions.append(np.array(actions))
-        file = io.BytesIO(state["model"].tobytes())
-        model = kind.load(file, env=self._env, device=device, force_reset=False, **extra)
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        """Take up the model of a checkpoint, with statistics and random numbers as they were then."""
+        restore_model(self.model, state["model"])
         if self._statistics is not None:
             _restore_statistics(self._statistics, state["statistics"])
-        _restore_random(model, state["random"])
-        return model
+        _restore_random(self.model, state["random"])
 
 
 def _statistics(cfg: Config, env: VecEnv) -> VecNormalize | None:
@@ -209,9 +210,14 @@ def _statistics_state(env: VecNormalize) -> dict[str, Any]:
 def _restore_statistics(env: VecNormalize, state: Mapping[str, Any]) -> None:
     parts = {"observation": cast(RunningMeanStd, env.obs_rms), "return": env.ret_rms}
     for name, moments in parts.items():
-        moments.mean, moments.var = state[name]["mean"], state[name]["var"]
+        for part in ("mean", "var"):
+            if state[name][part].shape != np.shape(getattr(moments, part)):
+                raise ValueError(f"the statistics' {part} has shape {list(state[name][part].shape)}")
+            setattr(moments, part, state[name][part].copy())
         moments.count = float(state[name]["count"])
-    env.returns = state["returns"]
+    if state["returns"].shape != env.returns.shape:
+        raise ValueError(f"the statistics' returns have shape {list(state['returns'].shape)}")
+    env.returns = state["returns"].copy()
 
 
 def _random_state(model: BaseAlgorithm) -> dict[str, Any]:

@@ -21,13 +21,16 @@ from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import BUDGETS, ResultsError, row_count
 from plab.reuse import SimulatorCache
 from plab.runners.common import episode_columns, measures, simulation_errors
-from plab.runners.jobs import Job, RunError, TogetherError, batch_title
-from plab.sim import DeviceError
+from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
+from plab.sim import DeviceError, SimulationError
 
 if TYPE_CHECKING:
     from plab.config import Config
 
 __all__ = ["Runner", "Step", "Track"]
+
+_MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
+"""What NumPy and torch answer to a state that has other arrays than it should."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +278,26 @@ class Runner:
             result.labels = self.problem.labels
             if self._family.batching:
                 result.provenance["batch"] = len(self.tracks)
-            self.start(track, result.resume)
+            self._start(track)
+
+    def _start(self, track: Track) -> None:
+        """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
+        state, scene = track.job.run.result.resume, self.problem.scenes[0]
+        best, shape = track.best_actions, (scene.horizon, scene.action_dim)
+        if state is None:
+            self.start(track, None)
+            return
+        try:
+            if best is not None and best.shape != shape:
+                raise ValueError(f"the best actions have shape {list(best.shape)}, not {list(shape)}")
+            self.start(track, state)
+        except (DeviceError, SimulationError, RunError, *USER_ERRORS):
+            raise
+        except _MISFITS as error:
+            reason, file = " ".join(str(error).split()), track.job.run.partial_path
+            track.job.fail(
+                ResultsError(f"{file} cannot be gone on from: {reason[:300]}; start afresh with force=true")
+            )
 
     def _optimise(self) -> None:
         """Do the iterations that the files do not hold yet."""

@@ -20,6 +20,7 @@ import torch
 from plab.config_types import TrajectoryConfig
 from plab.families import family
 from plab.runners.common import measures, shared_problem
+from plab.runners.model_state import alike, moments
 from plab.runners.runner import Runner, Step, Track
 
 __all__ = ["ActionSequence", "TrajectoryRunner", "adam", "momentum"]
@@ -144,7 +145,6 @@ class ActionSequence:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to a :meth:`state`."""
         with torch.no_grad():
-            self.parameter.copy_(torch.from_numpy(state["actions"]))
-        buffers = {name: torch.from_numpy(array) for name, array in state["optimizer"].items()}
-        self._optimizer.state[self.parameter] = buffers
+            self.parameter.copy_(alike(state["actions"], self.parameter, "actions"))
+        self._optimizer.state[self.parameter] = moments(state["optimizer"], self.parameter)
         self._generator.set_state(torch.from_numpy(state["random"]))

@@ -9,11 +9,11 @@ from dataclasses import asdict, replace
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
 
 from plab.cache import cache_dir
+from plab.reading import UnreadableError, read_array, read_arrays
 from plab.scene import Scene
 from plab.targets.recipe import TargetError
 
@@ -62,12 +62,12 @@ class TargetStore:
         """Return a target's mass tensor, shape [n, n, n], or None if it is not there or not readable."""
         n = scene.grid_size
         try:
-            with np.load(self.path(scene, actions)) as file:
-                mass = np.zeros(n**3)
-                mass[file["node"]] = file["mass"]
-        except (OSError, EOFError, KeyError, ValueError, IndexError, BadZipFile):
+            kept = read_arrays(self.path(scene, actions))
+            mass = np.zeros(n**3)
+            mass[kept["node"]] = kept["mass"]
+        except (OSError, KeyError, ValueError, IndexError, TypeError, MemoryError):
             return None
-        return mass.reshape(n, n, n)
+        return mass.reshape(n, n, n) if np.isfinite(mass).all() and mass.any() else None
 
     def save(self, scene: Scene, actions: np.ndarray, mass: np.ndarray) -> None:
         """Keep a mass tensor, shape [n, n, n]; where the folder cannot be written, do nothing."""
@@ -103,15 +103,16 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
     if not Path(folder).is_dir():
         raise TargetError(f"targets.source: there is no folder {folder}")
     try:
-        mass = np.load(path, allow_pickle=False)
+        mass = read_array(path)
     except FileNotFoundError:
         raise TargetError(
             f"targets.source: {path} does not exist; name the files like Move3D-v1.npy"
         ) from None
     except PermissionError:
         raise TargetError(f"targets.source: {path} may not be read") from None
-    except (OSError, ValueError, EOFError) as error:
-        raise TargetError(f"targets.source: {path} is no NumPy array file: {error}") from None
+    except (UnreadableError, OSError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise TargetError(f"targets.source: {path} cannot be read: {reason}") from None
     _check_release_target(str(path), mass, scene)
     return mass.astype(np.float64)
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from plab.config_types import MultistartConfig
+from plab.runners.model_state import alike, moments
 from plab.runners.planners.planner import Asking, Planner, Request, Start
 
 __all__ = ["Multistart"]
@@ -102,14 +103,18 @@ class Multistart(Planner):
         moments = {k: {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in held.items()}
         return super().state() | {"actions": self._actions().cpu().numpy(), "moments": moments}
 
+    def shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Return the shapes of what the memory may hold."""
+        return super().shapes() | {"order": (len(self._places),)}
+
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to a :meth:`state`."""
         super().restore(state)
-        self._put(torch.as_tensor(state["actions"], device=self.start.device), range(len(self._places)))
+        actions = alike(state["actions"], self._actions(), "actions")
+        if "order" in self.memory and sorted(self.memory["order"].tolist()) != list(range(len(self._places))):
+            raise ValueError("its order is none of the candidates")
+        self._put(actions, range(len(self._places)))
         for k, own in state.get("moments", {}).items():
             place = self._places[int(k)]
             # The number of steps stays on the CPU, as Adam has it.
-            self._adam.state[place] = {
-                name: torch.as_tensor(v, device="cpu" if name == "step" else self.start.device)
-                for name, v in own.items()
-            }
+            self._adam.state[place] = moments(own, place)

@@ -165,12 +165,26 @@ class Planner(ABC):
         return {"iteration": self.iteration, "memory": arrays}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
+        """Return to a :meth:`state`.
+
+        Raises:
+            ValueError: If it is that of another run.
+        """
         self.iteration = int(state["iteration"])
-        arrays = state.get("memory", {})
+        arrays, shapes = state.get("memory", {}), self.shapes()
+        for name, array in arrays.items():
+            shape, wanted = np.shape(array), shapes.get(name)
+            if wanted is None or len(shape) != len(wanted):
+                raise ValueError(f"its {name} has shape {list(shape)}")
+            if any(size not in (None, own) for size, own in zip(wanted, shape, strict=True)):
+                raise ValueError(f"its {name} has shape {list(shape)}")
         self.memory = {
             name: torch.as_tensor(array, device=self.start.device) for name, array in arrays.items()
         }
+
+    def shapes(self) -> dict[str, tuple[int | None, ...]]:
+        """Return the shapes of what :attr:`memory` may hold; a size of None is any."""
+        return {"champion": self.start.shape, "cost": ()}
 
 
 def make_planner(method: MethodConfig, start: Start) -> Any:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 from torch.optim import Adam
@@ -20,46 +19,37 @@ from plab.runners.captured import CapturedUpdate
 from plab.runners.population.draws import Block, Draws
 from plab.runners.population.networks import Networks, fill, flat
 from plab.runners.population.replay import Replay, Sizes
-from plab.runners.rl_models import model_kind, total_steps
+from plab.runners.rl_models import Spaces, model_kind, total_steps
 
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["Agents", "OffPolicyAgents", "Spaces", "first_policy", "trained_policy"]
+__all__ = ["Agents", "OffPolicyAgents", "first_policy", "trained_policy"]
 
 BLOCK = 50
 """Entries that are drawn at once."""
 
 
-class Spaces(NamedTuple):
-    """Spaces of environments.
-
-    Attributes:
-        observation_space: That of an observation.
-        action_space: That of an action.
-    """
-
-    observation_space: Box
-    action_space: Box
-
-
 def first_policy(cfg: Config, spaces: Spaces) -> BasePolicy:
     """Return the policy with which Stable-Baselines3 would begin a run, on the CPU."""
     method = cfg.method_as(RlConfig)
-    kind = model_kind(method.family, method.algorithm)
-    options = kind.arguments(method, cast(Any, spaces))["policy_kwargs"]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(cfg.seed)
-        return kind.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
+    return model_kind(method.family, method.algorithm).policy(method, spaces, cfg.seed)
 
 
 def trained_policy(cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
-    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`."""
+    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`.
+
+    Raises:
+        ValueError: If they are others.
+    """
     method = cfg.method_as(RlConfig)
     policy = first_policy(cfg, spaces)
     kind: type[Agents] = family(method.family).agents(method.algorithm)
     networks = Networks([policy], kind.PARTS, torch.device("cpu"))
-    fill(networks.parameters(), torch.from_numpy(state["networks"])[None])
+    row = torch.from_numpy(state["networks"])[None]
+    if row.shape != flat(networks.parameters(), 1).shape:
+        raise ValueError(f"its networks have {row.numel()} parameters")
+    fill(networks.parameters(), row)
     networks.write_to(policy, 0)
     return policy
 
@@ -143,7 +133,15 @@ class Agents:
         ]
 
     def restore(self, states: Sequence[Mapping[str, Any]]) -> None:
-        """Return to :meth:`states`, of agents that stand at the same step."""
+        """Return to :meth:`states`, of agents that stand at the same step.
+
+        Raises:
+            ValueError: If one of them is that of another agent.
+        """
+        for state, own in zip(states, self.states(), strict=True):
+            for name, value in own.items():
+                if (shape := np.asarray(state[name]).shape) != np.shape(value):
+                    raise ValueError(f"its {name} has shape {list(shape)}, not {list(np.shape(value))}")
         first = states[0]
         self.steps, self.updates = int(first["steps"]), int(first["updates"])
 
@@ -159,7 +157,10 @@ class Agents:
                 fill([optimizer.state[p][moment] for p in parameters], table(f"{name}_{moment}"))
             for parameter in parameters:
                 optimizer.state[parameter]["step"].fill_(int(first[f"{name}_steps"]))
-        self.draws.restore([state["random"] for state in states])
+        try:
+            self.draws.restore([state["random"] for state in states])
+        except RuntimeError as error:
+            raise ValueError(f"its random numbers are none ({error})") from error
 
     def _optimizer_steps(self, name: str) -> int:
         optimizer = self.optimizers[name]

@@ -13,8 +13,8 @@ from torch import Tensor
 from plab.config_types import RlConfig
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
-from plab.runners.population.agents import Agents, Spaces
-from plab.runners.rl_models import cycle_steps, total_steps
+from plab.runners.population.agents import Agents
+from plab.runners.rl_models import Spaces, cycle_steps, total_steps
 from plab.torch import TensorEnv
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from plab.config_types import PpoConfig
 from plab.runners.captured import require_capturable
-from plab.runners.population.agents import Agents, Spaces
+from plab.runners.population.agents import Agents
 from plab.runners.population.networks import adam, descend, linear, mlp
-from plab.runners.rl_models import CLIP, rollout_steps
+from plab.runners.rl_models import CLIP, Spaces, rollout_steps
 
 if TYPE_CHECKING:
     from plab.config import Config

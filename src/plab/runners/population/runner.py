@@ -24,11 +24,11 @@ from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.common import environment_key, torch_settings
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
-from plab.runners.population.agents import OffPolicyAgents, Spaces, trained_policy
+from plab.runners.population.agents import OffPolicyAgents, trained_policy
 from plab.runners.population.population import Population
 from plab.runners.population.replay import Sizes, require_file
 from plab.runners.rl import check_torch_device
-from plab.runners.rl_models import total_steps
+from plab.runners.rl_models import Spaces, total_steps
 from plab.runners.runner import Runner, Step, Track
 from plab.torch import TensorEnv
 
@@ -78,6 +78,9 @@ class PopulationRunner(Runner):
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """See that the replay buffer is there; the networks are made with those of the others."""
         track.job.run.result.provenance |= {"batch": len(self.tracks), "population": True}
+        if state is not None:
+            # Now, where what does not fit is answered.
+            trained_policy(track.cfg, self._spaces, state)
         if isinstance(self._method, OffPolicyConfig) and self.has_more(track):
             try:
                 require_file(_replay_path(track), self._sizes, self._episodes(state) // self._sizes.envs)
@@ -147,7 +150,7 @@ class PopulationRunner(Runner):
         moments = None
         if getattr(self._method, "normalise", False):
             moments = state["observation_mean"], state["observation_var"]
-        save_policy(track.job.run.path, self._method.family, self._method.algorithm, policy, moments)
+        save_policy(track.job.run.path, self._method, policy, moments)
         _replay_path(track).unlink(missing_ok=True)
 
     def _population_of(self, members: Sequence[Track]) -> Population:
@@ -157,7 +160,13 @@ class PopulationRunner(Runner):
             # Let go of the old one first: there may be no room for two.
             self._population = None
             cfgs, states = [t.cfg for t in members], [t.job.run.result.resume for t in members]
-            self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
+            try:
+                self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
+            except (LookupError, ValueError, TypeError) as error:
+                files = ", ".join(str(track.job.run.partial_path) for track in members)
+                raise ResultsError(
+                    f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
+                ) from error
             self._members = members
             paths = [_replay_path(track) for track in members]
             for stack in self._population.stacks:
@@ -193,7 +202,8 @@ class PopulationRunner(Runner):
             )
 
     def _least(self, tracks: Sequence[Track]) -> int:
-        return min(self._episodes(track.job.run.result.resume) for track in tracks)
+        states = [track.job.run.result.resume for track in tracks if track.job.error is None]
+        return min(map(self._episodes, states), default=0)
 
     def _episodes(self, state: Mapping[str, Any] | None) -> int:
         return 0 if state is None else int(state["steps"]) // self._sizes.horizon

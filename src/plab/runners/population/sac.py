@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from plab.runners.population.agents import OffPolicyAgents, Spaces
+from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.networks import Part, adam, descend, follow, linear, mlp, twin_values
+from plab.runners.rl_models import Spaces
 
 if TYPE_CHECKING:
     from plab.config import Config

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from plab.config_types import Td3Config
-from plab.runners.population.agents import OffPolicyAgents, Spaces
+from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.population.replay import Samples
+from plab.runners.rl_models import Spaces
 
 if TYPE_CHECKING:
     from plab.config import Config
