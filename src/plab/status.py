@@ -20,6 +20,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from plab.examples import EXAMPLES, resolve
 from plab.locks import held
 from plab.results import ResultsError, Row, lookup, row_count
 from plab.results.files import opened, split_archive
@@ -393,7 +394,8 @@ def _csv(found: Survey) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
-    what = "folder of results or archive (default: results), and runs: task=Rope,Move variant=1 seed=0,1,2"
+    where = f"folder of results, archive, or one of {', '.join(EXAMPLES)} (default: results)"
+    what = f"{where}, and runs: task=Rope,Move variant=1 seed=0,1,2"
     parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print everything, for scripts")
@@ -404,7 +406,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if len(sources) > 1:
             raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
-        found = survey(sources[0], select(words, NAMES))
+        found = survey(resolve(sources[0]), select(words, NAMES))
     except (ResultsError, SelectionError) as error:
         print(f"plab: {error}", file=sys.stderr)
         return 2

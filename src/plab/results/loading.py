@@ -6,18 +6,18 @@ import os
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import h5py
 import numpy as np
 import pandas as pd
 
+from plab.results.database import COLUMNS, Database, Row
 from plab.results.files import explained, opened, opened_image, split_archive
 from plab.results.hdf5 import attributes
-from plab.results.index import Index
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
@@ -27,33 +27,23 @@ from plab.results.schema import (
     final_path,
     stored_config,
 )
+from plab.results.store import File
+from plab.results.workers import each
 from plab.selection import lookup
 
-__all__ = ["Row", "load", "read_rows", "readable_rows", "rows", "run_files"]
+__all__ = [
+    "Row",
+    "counting_files",
+    "load",
+    "read_each",
+    "read_rows",
+    "readable_rows",
+    "rows",
+    "run_files",
+    "up_to_date",
+]
 
-_SUMMARY_COLUMNS = (
-    "task",
-    "variant",
-    "method",
-    "seed",
-    "status",
-    "message",
-    "score",
-    "iou",
-    "loss",
-    "iterations",
-    "best_iteration",
-    "best_loss",
-    "seconds",
-    "started",
-    "device",
-    "precision",
-    "batch",
-    "plab",
-    "git_commit",
-    "config_hash",
-    "path",
-)
+T = TypeVar("T")
 
 _ORIGIN = {
     "started": "start_time",
@@ -68,26 +58,8 @@ _ORIGIN = {
 _NAMES = frozenset(_ORIGIN.values())
 
 
-@dataclass(frozen=True)
-class Row:
-    """What a table of runs says about one of them.
-
-    Attributes:
-        values: Value of each column of :func:`load`.
-        config: The run's configuration.
-    """
-
-    values: dict[str, Any]
-    config: dict[str, Any]
-
-    @property
-    def path(self) -> Path:
-        """The run's file, or its place in an archive."""
-        return Path(self.values["path"])
-
-
 def load(
-    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
+    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, database: bool = True
 ) -> pd.DataFrame:
     """Load results, a row per run.
 
@@ -98,7 +70,7 @@ def load(
     Args:
         source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
         keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
-        index: Take rows of unchanged files from the index in the user's cache folder, and keep it up to date.
+        database: Take rows of unchanged files from the folder's database, and keep it up to date.
 
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
@@ -110,16 +82,16 @@ def load(
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    found, unreadable = rows(source, index=index)
+    found, unreadable = rows(source, database=database)
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)
         warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=2)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
-    return pd.DataFrame(table, columns=None if table else [*_SUMMARY_COLUMNS, *keys])
+    return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
 
 
 def rows(
-    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
+    source: str | Path | Sequence[str | Path] = "results", *, database: bool = True
 ) -> tuple[list[Row], list[ResultsError]]:
     """Return the rows of :func:`load` with their configurations, and what could not be read.
 
@@ -130,7 +102,7 @@ def rows(
     found: list[Row] = []
     unreadable: list[ResultsError] = []
     for root in map(Path, sources):
-        for entry in _all_rows(root, index):
+        for entry in _all_rows(root, database):
             if isinstance(entry, ResultsError):
                 unreadable.append(entry)
             else:
@@ -149,6 +121,14 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
     if unreadable and not found and all(Path(root).is_file() for root in sources):
         raise unreadable[0]
     return found, unreadable
+
+
+@contextmanager
+def up_to_date(root: Path) -> Iterator[Database]:
+    """Open the database of a folder, and read the files that it does not know."""
+    with closing(Database(root, counting_files(root))) as known:
+        known.take(each(_read, known.changed))
+        yield known
 
 
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
@@ -174,16 +154,37 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
                     continue
 
 
+def counting_files(root: Path) -> list[File]:
+    """Return the files below a folder but for what is left of runs that have finished since."""
+    files = list(run_files(root))
+    present = {str(path) for path, _ in files}
+    return [
+        (path, stat)
+        for path, stat in files
+        if not path.name.endswith(PARTIAL_SUFFIX) or str(final_path(path)) not in present
+    ]
+
+
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
     """Yield the rows of a result file or an archive, and what is wrong where there is none."""
+    return read_each(path, _row)
+
+
+def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T | ResultsError]:
+    """Yield something of a result file or of each run of an archive, and what is wrong where there is none.
+
+    Args:
+        path: The file.
+        extract: Takes it from an open file; is also given the path, of a run in an archive its place there.
+    """
     try:
         if path.name.endswith(ARCHIVE_SUFFIX):
             with explained(path), zipfile.ZipFile(path) as archive:
                 for name in archive.namelist():
-                    yield _member_row(archive, path, name)
+                    yield _of_member(archive, path, name, extract)
         else:
             with opened(path) as file:
-                yield _row(file, path)
+                yield extract(file, path)
     except ResultsError as error:
         yield error
 
@@ -191,27 +192,19 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
 # ---------------------------------------------------------------------------------------------------- details
 
 
-def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, from the index where it knows them."""
-    known = Index(root) if use_index else None
-    paths = list(run_files(root))
-    present = {path for path, _ in paths}
-    for path, stat in paths:
-        if path.name.endswith(PARTIAL_SUFFIX) and final_path(path) in present:
-            continue
-        entry = None if known is None else known.find(path, stat)
-        if entry is not None:
-            yield from (
-                Row(values | {"path": str(path / member)}, config) for member, values, config in entry
-            )
-            continue
-        fresh = list(read_rows(path))
-        sound = [row for row in fresh if isinstance(row, Row)]
-        if known is not None and len(sound) == len(fresh):
-            known.add(path, stat, [(row.path.relative_to(path), row.values, row.config) for row in sound])
-        yield from fresh
-    if known is not None:
+def _all_rows(root: Path, from_database: bool) -> Iterator[Row | ResultsError]:
+    """Yield the rows of all files below a folder, or of one file, from the database where it knows them."""
+    if not from_database:
+        for entries in each(_read, [path for path, _ in counting_files(root)]):
+            yield from entries
+        return
+    with up_to_date(root) as known:
         known.save()
+        yield from known.rows()
+
+
+def _read(path: Path) -> list[Row | ResultsError]:
+    return list(read_rows(path))
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:
@@ -234,12 +227,14 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
     return kept
 
 
-def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | ResultsError:
+def _of_member(
+    archive: zipfile.ZipFile, path: Path, name: str, extract: Callable[[h5py.File, Path], T]
+) -> T | ResultsError:
     try:
         with explained(path / name):
             image = archive.read(name)
         with opened_image(image, path / name) as file:
-            return _row(file, path / name)
+            return extract(file, path / name)
     except ResultsError as error:
         return error
 
@@ -264,7 +259,7 @@ def _row(file: h5py.File, path: Path) -> Row:
         "config_hash": own["config_hash"],
         "path": str(path),
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
-    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
+    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):
