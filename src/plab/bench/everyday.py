@@ -98,7 +98,7 @@ def measure(
 def _set_up(folder: Path, place: Path) -> None:
     """Give a source tree the results, and nothing else, in a folder of its own."""
     shutil.rmtree(place, ignore_errors=True)
-    shutil.copytree(folder / "results", place / "results", copy_function=os.link)
+    shutil.copytree(folder / "results", place / "results")
 
 
 def _timed(arguments: Sequence[str], folder: Path, source: Path) -> tuple[float, float]:

@@ -139,16 +139,21 @@ def _scores(options: argparse.Namespace) -> int:
     table, unreadable = scores(
         list(map(resolve, sources)), chosen, options.keys, options.sort, descending=options.descending
     )
-    for error in unreadable:
-        print(f"plab: left out: {error}", file=sys.stderr)
+    _tell_left_out(unreadable)
     _print(list(table.columns), table.astype(object).itertuples(index=False, name=None), options)
     return 0
 
 
 def _sql(options: argparse.Namespace) -> int:
-    columns, rows = query(resolve(options.source), options.query)
+    columns, rows, unreadable = query(resolve(options.source), options.query)
+    _tell_left_out(unreadable)
     _print(columns, rows, options)
     return 0
+
+
+def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
+    for error in unreadable:
+        print(f"plab: left out: {error}", file=sys.stderr)
 
 
 def _print(columns: Sequence[str], rows: Iterable[Sequence[Any]], options: argparse.Namespace) -> None:
@@ -195,8 +200,7 @@ def _pack(options: argparse.Namespace) -> int:
         keep_resume=options.resume,
         digits=options.digits,
     )
-    for error in done.unreadable:
-        print(f"plab: left out: {error}", file=sys.stderr)
+    _tell_left_out(done.unreadable)
     size = f"{done.archive_bytes / 1e3:.1f} kB, {done.archive_bytes / done.runs / 1e3:.1f} kB per run"
     before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
     print(f"{options.output}: {done.runs} run(s), {size}{before}")

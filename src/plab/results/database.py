@@ -116,7 +116,11 @@ class _Stored:
 
 
 class Database:
-    """The runs of one folder, archive or file: kept ones where files have not changed, and fresh ones."""
+    """The runs of one folder, archive or file: kept ones where files have not changed, and fresh ones.
+
+    Attributes:
+        missed: Whether a file was gone before it could be read.
+    """
 
     def __init__(self, root: Path, files: Sequence[File]) -> None:
         """Open the database of a folder.
@@ -125,7 +129,7 @@ class Database:
             root: Folder of results, archive or result file.
             files: The files that count, as they are now.
         """
-        self._root, self._files = root, files
+        self._root, self._files, self.missed = root, files, False
         self._sections: dict[int, tuple[str, dict[str, Any]]] = {}
         self._numbers: dict[tuple[str, str], int] = {}
         self._known: dict[bytes, list[_Stored]] = {}
@@ -143,19 +147,27 @@ class Database:
         """Files that have to be read."""
         return [path for path, _ in self._store.changed]
 
-    def take(self, found: Iterable[list[Row | ResultsError]]) -> None:
-        """Note what the files :attr:`changed` hold, in their order."""
+    def take(self, found: Iterable[list[Row | ResultsError] | None]) -> None:
+        """Note what the files :attr:`changed` hold, in their order; None of one that is gone by now."""
         for path, entries in zip(self.changed, found, strict=True):
             key = file_key(self._root, path)
+            if entries is None:
+                self.missed = True
+                continue
             sound = [entry for entry in entries if isinstance(entry, Row)]
             self._fresh[key] = [self._stored(path, row) for row in sound]
             self._wrong[key] = [entry for entry in entries if isinstance(entry, ResultsError)]
+
+    @property
+    def unreadable(self) -> list[ResultsError]:
+        """What is wrong with files, or members of archives, that could not be read."""
+        return [error for errors in self._wrong.values() for error in errors]
 
     def rows(self) -> Iterator[Row | ResultsError]:
         """Yield all runs, and what could not be read, in the order of the files."""
         for path, _ in self._files:
             key, folder = file_key(self._root, path), str(path)
-            for entry in self._known[key] if key in self._known else self._fresh[key]:
+            for entry in self._known[key] if key in self._known else self._fresh.get(key, ()):
                 place = os.path.join(folder, entry.member) if entry.member else folder
                 yield Row(entry.values | {"path": place}, self._config(entry.parts))
             yield from self._wrong.get(key, ())
@@ -251,8 +263,9 @@ class Database:
             tables["all_evaluations"] += [(run, *each) for each in _evaluation(entry.values)]
             tables["all_times"] += [(run, *each) for each in _times(entry.values)]
         for name, rows in tables.items():
-            places = ", ".join("?" * len(rows[0])) if rows else ""
-            connection.executemany(f"INSERT INTO {name} VALUES ({places})", rows)
+            if rows:
+                places = ", ".join("?" * len(rows[0]))
+                connection.executemany(f"INSERT INTO {name} VALUES ({places})", rows)
         known = {number for (number,) in connection.execute("SELECT section FROM sections")}
         for number in used - known:
             name, section = self._sections[number]

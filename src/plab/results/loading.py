@@ -41,9 +41,13 @@ __all__ = [
     "rows",
     "run_files",
     "up_to_date",
+    "warn_of",
 ]
 
 T = TypeVar("T")
+
+_LOOKS = 3
+"""How often a folder is looked through at most while runs end in it."""
 
 _ORIGIN = {
     "started": "start_time",
@@ -83,11 +87,16 @@ def load(
         ResultsError: If there is nothing at ``source``.
     """
     found, unreadable = rows(source, database=database)
-    if unreadable:
-        listed = "; ".join(str(error) for error in unreadable)
-        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=2)
+    warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
     return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
+
+
+def warn_of(unreadable: Sequence[ResultsError]) -> None:
+    """Name what could not be read in one warning, as if by the caller's caller."""
+    if unreadable:
+        listed = "; ".join(str(error) for error in unreadable)
+        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
 
 
 def rows(
@@ -126,9 +135,14 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
 @contextmanager
 def up_to_date(root: Path) -> Iterator[Database]:
     """Open the database of a folder, and read the files that it does not know."""
-    with closing(Database(root, counting_files(root))) as known:
-        known.take(each(_read, known.changed))
-        yield known
+    for left in reversed(range(_LOOKS)):
+        with closing(Database(root, counting_files(root))) as known:
+            known.take(each(_read, known.changed))
+            if not known.missed or not left:
+                yield known
+                return
+            # Where a partial file was, there is a final one now; the others need not be read again.
+            known.save()
 
 
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
@@ -196,15 +210,17 @@ def _all_rows(root: Path, from_database: bool) -> Iterator[Row | ResultsError]:
     """Yield the rows of all files below a folder, or of one file, from the database where it knows them."""
     if not from_database:
         for entries in each(_read, [path for path, _ in counting_files(root)]):
-            yield from entries
+            yield from entries or ()
         return
     with up_to_date(root) as known:
         known.save()
         yield from known.rows()
 
 
-def _read(path: Path) -> list[Row | ResultsError]:
-    return list(read_rows(path))
+def _read(path: Path) -> list[Row | ResultsError] | None:
+    """Return what a file holds, None if it is gone: a run that ends removes its partial file, any moment."""
+    entries = list(read_rows(path))
+    return entries if os.path.lexists(path) else None
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from plab.results.curves import add_iterations
 from plab.results.database import Row
-from plab.results.loading import readable_rows, up_to_date
+from plab.results.loading import readable_rows, up_to_date, warn_of
 from plab.results.schema import ResultsError
 from plab.selection import Selection, SelectionError, lookup
 
@@ -36,16 +36,12 @@ def connect(source: str | Path = "results", *, iterations: bool = False) -> sqli
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file that cannot be read.
     """
-    with up_to_date(Path(source)) as known:
-        connection = known.connection()
-    if iterations:
-        add_iterations(connection, source)
-    connection.execute("PRAGMA query_only = ON")
-    connection.set_authorizer(_reads)
+    connection, unreadable = _connected(Path(source), iterations)
+    warn_of(unreadable)
     return connection
 
 
-def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
+def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
     """Answer an SQL query.
 
     Args:
@@ -53,7 +49,7 @@ def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]
         sql: The query.
 
     Returns:
-        Names of the columns, and the rows.
+        Names of the columns, the rows, and what could not be read, hence is not in them.
 
     Raises:
         QueryError: If it is no query, or wrong.
@@ -61,11 +57,11 @@ def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]
     """
     try:
         try:
-            return _answer(source, sql, iterations=False)
+            return _answer(Path(source), sql, iterations=False)
         except sqlite3.OperationalError as error:
             if str(error) != _NO_ITERATIONS:
                 raise
-            return _answer(source, sql, iterations=True)
+            return _answer(Path(source), sql, iterations=True)
     except (sqlite3.Error, sqlite3.Warning) as error:
         raise QueryError(_explained(" ".join(str(error).split()))) from None
 
@@ -131,12 +127,27 @@ _READING = {
 }
 
 
-def _answer(source: str | Path, sql: str, *, iterations: bool) -> tuple[list[str], list[tuple[Any, ...]]]:
-    with closing(connect(source, iterations=iterations)) as connection:
+def _connected(root: Path, iterations: bool) -> tuple[sqlite3.Connection, list[ResultsError]]:
+    with up_to_date(root) as known:
+        if root.is_file() and known.unreadable and not any(isinstance(row, Row) for row in known.rows()):
+            raise known.unreadable[0]
+        connection = known.connection()
+    if iterations:
+        add_iterations(connection, root)
+    connection.execute("PRAGMA query_only = ON")
+    connection.set_authorizer(_reads)
+    return connection, known.unreadable
+
+
+def _answer(
+    root: Path, sql: str, *, iterations: bool
+) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
+    connection, unreadable = _connected(root, iterations)
+    with closing(connection):
         cursor = connection.execute(sql)
         if cursor.description is None:
             raise QueryError('there is no query: write a select, such as "select task, score from runs"')
-        return [column[0] for column in cursor.description], cursor.fetchall()
+        return [column[0] for column in cursor.description], cursor.fetchall(), unreadable
 
 
 def _reads(action: int, *details: str | None) -> int:
@@ -146,7 +157,7 @@ def _reads(action: int, *details: str | None) -> int:
 
 
 def _explained(message: str) -> str:
-    if message == "not authorized" or message.startswith("cannot modify"):
+    if message in ("not authorized", "authorization denied") or message.startswith("cannot modify"):
         return "the tables are only for reading: write a select"
     if message.startswith("no such table"):
         return f"{message}; there are {_TABLES}"

@@ -12,7 +12,6 @@ import contextlib
 import hashlib
 import os
 import sqlite3
-import struct
 import time
 import uuid
 import zlib
@@ -149,9 +148,10 @@ class Store:
                 return None
             with place.open("rb") as file:
                 header = file.read(_HEADER_BYTES)
-                own = struct.unpack_from(">I", header, _APPLICATION_AT)[0] == _APPLICATION
-                (checksum,) = struct.unpack_from(">I", header, _CHECKSUM_AT)
-                if own and checksum == self._checksum(file):
+                # A foreign file may be large, and is not read.
+                if _number_at(header, _APPLICATION_AT) == _APPLICATION and _number_at(
+                    header, _CHECKSUM_AT
+                ) == self._checksum(file):
                     return _immutable(place)
         return None
 
@@ -173,7 +173,7 @@ class Store:
                 with temporary.open("r+b") as file:
                     checksum = self._checksum(file)
                     file.seek(_CHECKSUM_AT)
-                    file.write(struct.pack(">I", checksum))
+                    file.write(checksum.to_bytes(4, "big"))
                 connection = _replaced(temporary, place)
             except (OSError, sqlite3.Error):
                 with contextlib.suppress(OSError):
@@ -219,6 +219,10 @@ def file_key(root: Path, path: Path) -> bytes:
     own, text = str(root), str(path)
     # Much faster than pathlib's `relative_to`; paths below "." do not begin with it.
     return os.fsencode(text if own == "." else text[len(own) :].lstrip(os.sep))
+
+
+def _number_at(header: bytes, place: int) -> int:
+    return int.from_bytes(header[place : place + 4], "big")
 
 
 def _places(root: Path, name: str) -> list[Path]:
