@@ -106,14 +106,14 @@ _INSIDE = f"{ARCHIVE_SUFFIX}{os.sep}"
 def _stored(root: Path, wanted: Container[str] | None = None) -> Iterator[tuple[Path, str, Packed]]:
     """Yield file, member and iterations of the runs of some files below a folder, of all by default."""
     files = counting_files(root)
-    keys = {file_key(root, path): path for path, _ in files if wanted is None or str(path) in wanted}
     with closing(Store(root, files, _NAME, _LAYOUT)) as store:
-        changed = {file_key(root, path): path for path, _ in store.changed}
-        fresh = {key: path for key, path in changed.items() if key in keys}
+        paths = ((key, path) for key, (path, _) in store.files.items())
+        keys = {key: path for key, path in paths if wanted is None or str(path) in wanted}
+        fresh = {key: path for key, path in store.changed.items() if key in keys}
         found = dict(zip(fresh, each(_read, list(fresh.values())), strict=True))
         if store.connection is not None:
             for key, member, types, data in store.connection.execute("SELECT * FROM curves"):
-                if key in keys and key not in changed:
+                if key in keys and key not in store.changed:
                     yield keys[key], member, (types, data)
         sound = {key: [one for one in entries if isinstance(one, tuple)] for key, entries in found.items()}
         for key, entries in sound.items():

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from plab.results.schema import ResultsError
-from plab.results.store import DAMAGED, File, Store, file_key
+from plab.results.store import DAMAGED, File, Store
 from plab.selection import lookup
 
 __all__ = ["COLUMNS", "Database", "Row", "run_number", "sql_value", "text"]
@@ -108,11 +108,19 @@ class Row:
 
 @dataclass(frozen=True)
 class _Stored:
-    """A run as it is kept: without its folder, and with references for the sections of its configuration."""
+    """A run as it is kept: without its folder, and without the sections of its configuration.
+
+    Attributes:
+        member: Its name in an archive, empty for a file of its own.
+        values: As in :class:`Row`.
+        config: Its configuration, with None for sections.
+        sections: Number of each section.
+    """
 
     member: str
     values: dict[str, Any]
-    parts: dict[str, Any]
+    config: dict[str, Any]
+    sections: dict[str, int]
 
 
 class Database:
@@ -129,7 +137,7 @@ class Database:
             root: Folder of results, archive or result file.
             files: The files that count, as they are now.
         """
-        self._root, self._files, self.missed = root, files, False
+        self._root, self.missed = root, False
         self._sections: dict[int, tuple[str, dict[str, Any]]] = {}
         self._numbers: dict[tuple[str, str], int] = {}
         self._known: dict[bytes, list[_Stored]] = {}
@@ -145,12 +153,11 @@ class Database:
     @property
     def changed(self) -> list[Path]:
         """Files that have to be read."""
-        return [path for path, _ in self._store.changed]
+        return list(self._store.changed.values())
 
     def take(self, found: Iterable[list[Row | ResultsError] | None]) -> None:
         """Note what the files :attr:`changed` hold, in their order; None of one that is gone by now."""
-        for path, entries in zip(self.changed, found, strict=True):
-            key = file_key(self._root, path)
+        for (key, path), entries in zip(self._store.changed.items(), found, strict=True):
             if entries is None:
                 self.missed = True
                 continue
@@ -165,11 +172,11 @@ class Database:
 
     def rows(self) -> Iterator[Row | ResultsError]:
         """Yield all runs, and what could not be read, in the order of the files."""
-        for path, _ in self._files:
-            key, folder = file_key(self._root, path), str(path)
+        for key, (path, _) in self._store.files.items():
+            folder = str(path)
             for entry in self._known[key] if key in self._known else self._fresh.get(key, ()):
                 place = os.path.join(folder, entry.member) if entry.member else folder
-                yield Row(entry.values | {"path": place}, self._config(entry.parts))
+                yield Row(entry.values | {"path": place}, self._config(entry))
             yield from self._wrong.get(key, ())
 
     def save(self) -> None:
@@ -192,28 +199,27 @@ class Database:
     def _restore(self) -> None:
         if self._store.connection is None:
             return
-        changed = {file_key(self._root, path) for path in self.changed}
-        present = {file_key(self._root, path) for path, _ in self._files} - changed
-        for key, text in self._store.connection.execute("SELECT path, rows FROM contents"):
-            if key in present:
-                self._known[key] = [_Stored(*entry) for entry in json.loads(text)]
-        if present - self._known.keys():
+        present = self._store.files.keys() - self._store.changed.keys()
+        contents = self._store.connection.execute("SELECT path, rows FROM contents")
+        kept = {key: rows for key, rows in contents if key in present}
+        if len(kept) < len(present):
             raise ValueError("files without contents")
+        # As one document: it is read faster, and names that occur in all of it are there once.
+        for key, entries in zip(kept, json.loads(f"[{','.join(kept.values())}]"), strict=True):
+            self._known[key] = [_Stored(*entry) for entry in entries]
         for number, name, body in self._store.connection.execute("SELECT * FROM sections"):
             self._sections[number] = name, json.loads(body)
             self._numbers[name, body] = number
-        parts = (entry.parts for entries in self._known.values() for entry in entries)
-        if not {part["section"] for own in parts for part in _references(own)} <= self._sections.keys():
+        stored = (entry for entries in self._known.values() for entry in entries)
+        if not set().union(*(entry.sections.values() for entry in stored)) <= self._sections.keys():
             raise ValueError("sections are missing")
 
     def _stored(self, path: Path, row: Row) -> _Stored:
         member = str(row.path.relative_to(path)) if row.path != path else ""
-        parts = {
-            name: {"section": self._refer(value, name)} if isinstance(value, dict) else value
-            for name, value in row.config.items()
-        }
-        # The same folder may be given by another path next time. The column keeps its place.
-        return _Stored(member, row.values | {"path": ""}, parts)
+        own = {name: value for name, value in row.config.items() if isinstance(value, dict)}
+        sections = {name: self._refer(value, name) for name, value in own.items()}
+        # The same folder may be given by another path next time. Columns and sections keep their places.
+        return _Stored(member, row.values | {"path": ""}, row.config | dict.fromkeys(own), sections)
 
     def _refer(self, section: dict[str, Any], name: str) -> int:
         """Return what stands for a section, which many runs share."""
@@ -224,11 +230,8 @@ class Database:
             self._sections[number] = name, section
         return number
 
-    def _config(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        return {
-            name: self._sections[part["section"]][1] if isinstance(part, dict) else part
-            for name, part in parts.items()
-        }
+    def _config(self, entry: _Stored) -> dict[str, Any]:
+        return entry.config | {name: self._sections[number][1] for name, number in entry.sections.items()}
 
     def _update(self, *, lasting: bool) -> None:
         texts: dict[bytes, str] = {}
@@ -236,7 +239,7 @@ class Database:
             # What no plab writes may be no JSON: it is read again each time.
             with contextlib.suppress(TypeError, ValueError):
                 if entries or not self._wrong[key]:
-                    texts[key] = json.dumps([[e.member, e.values, e.parts] for e in entries])
+                    texts[key] = json.dumps([[e.member, e.values, e.config, e.sections] for e in entries])
 
         def write(connection: sqlite3.Connection, outdated: Sequence[bytes]) -> None:
             keys = [(key,) for key in outdated]
@@ -255,8 +258,8 @@ class Database:
         used: set[int] = set()
         for key, entry in fresh:
             run = run_number(key, entry.member)
-            scalars = {name: part for name, part in entry.parts.items() if not isinstance(part, dict)}
-            numbers = {self._refer(scalars, ""), *(part["section"] for part in _references(entry.parts))}
+            scalars = {name: value for name, value in entry.config.items() if name not in entry.sections}
+            numbers = {self._refer(scalars, ""), *entry.sections.values()}
             used |= numbers
             tables["run_sections"] += [(run, number) for number in numbers]
             tables["all_runs"].append((run, key, *self._columns(key, entry)))
@@ -278,7 +281,7 @@ class Database:
 
     def _columns(self, key: bytes, entry: _Stored) -> Iterator[Any]:
         """Yield a run's row in the table of runs, but for its number and file."""
-        values, config = entry.values, self._config(entry.parts)
+        values, config = entry.values, self._config(entry)
         file = Path(os.fsdecode(key)) if key else Path(self._root.name)
         more = {
             "path": str(file / entry.member),
@@ -321,10 +324,6 @@ def text(value: str) -> str:
 def _number(name: bytes) -> int:
     """Return a number of 63 bits that is as good as a name."""
     return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") >> 1
-
-
-def _references(parts: Mapping[str, Any]) -> Iterator[dict[str, int]]:
-    return (part for part in parts.values() if isinstance(part, dict))
 
 
 def _evaluation(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

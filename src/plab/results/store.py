@@ -58,7 +58,8 @@ class Store:
 
     Attributes:
         connection: The tables; None where there are none that are sound, before :meth:`update`.
-        changed: Files of which the tables know nothing, or not the present state.
+        files: The files that count, by their :func:`file_key`.
+        changed: Those of which the tables know nothing, or not the present state.
     """
 
     def __init__(self, root: Path, files: Sequence[File], name: str, layout: str) -> None:
@@ -74,7 +75,8 @@ class Store:
         self._seed = zlib.crc32(f"{SCHEMA_VERSION} {self._layout}".encode())
         self._places = _places(root, name)
         self.connection = next(filter(None, map(self._opened, self._places)), None)
-        self._root, self._files = root, files
+        self.files = {file_key(root, path): (path, stat) for path, stat in files}
+        self.changed: dict[bytes, Path] = {}
         try:
             self._compare()
         except DAMAGED:
@@ -85,15 +87,14 @@ class Store:
         known: dict[bytes, str | None] = {}
         if self.connection is not None:
             known = dict(self.connection.execute("SELECT path, identity FROM files"))
-        current = {file_key(self._root, path): (path, stat) for path, stat in self._files}
-        fresh = [key for key, (_, stat) in current.items() if known.get(key, "") != _identity(stat)]
-        self.changed = [current[key] for key in fresh]
-        gone = known.keys() - current.keys()
-        self._outdated = [key for key in fresh if key in known] + list(gone)
+        stats = {key: stat for key, (_, stat) in self.files.items() if known.get(key, "") != _identity(stat)}
+        self.changed = {key: self.files[key][0] for key in stats}
+        gone = known.keys() - self.files.keys()
+        self._outdated = [key for key in self.changed if key in known] + list(gone)
         self._worth_keeping = any(known[key] is not None or key in gone for key in self._outdated)
         now = time.time()
-        stats = ((key, current[key][1]) for key in fresh)
-        self._settled = {key: _identity(stat) for key, stat in stats if abs(now - stat.st_mtime) >= _SETTLED}
+        settled = ((key, stat) for key, stat in stats.items() if abs(now - stat.st_mtime) >= _SETTLED)
+        self._settled = {key: _identity(stat) for key, stat in settled}
 
     def close(self) -> None:
         """Close the connection."""
