@@ -351,7 +351,7 @@ _READER = """
 import sys
 from contextlib import closing
 from plab.results import connect, load
-for _ in range(12):
+for _ in range(6):
     seeds = load(sys.argv[1])["seed"].tolist()
     assert set(seeds) >= {0, 1, 2}, seeds
     with closing(connect(sys.argv[1])) as connection:

@@ -58,7 +58,7 @@ def read_curves(source: str | Path | Sequence[str | Path], paths: Iterable[str |
     asked = set(wanted)
     for root in map(Path, sources):
         for path, member, curves in _stored(root, files):
-            place = os.path.join(path, member) if member else str(path)
+            place = str(path / member) if member else str(path)
             if place in asked:
                 found[place] = _unpacked(*curves)
     # What could not be read is read once more, to say why.
@@ -111,10 +111,14 @@ def _stored(root: Path, wanted: Container[str] | None = None) -> Iterator[tuple[
         keys = {key: path for key, path in paths if wanted is None or str(path) in wanted}
         fresh = {key: path for key, path in store.changed.items() if key in keys}
         found = dict(zip(fresh, each(_read, list(fresh.values())), strict=True))
-        if store.connection is not None:
-            for key, member, types, data in store.connection.execute("SELECT * FROM curves"):
+        try:
+            kept = () if store.connection is None else store.connection.execute("SELECT * FROM curves")
+            for key, member, types, data in kept:
                 if key in keys and key not in store.changed:
                     yield keys[key], member, (types, data)
+        except sqlite3.Error as error:
+            # On a network file system another machine may have replaced the file.
+            raise ResultsError(f"{root / _NAME} cannot be read ({error}): try again") from error
         sound = {key: [one for one in entries if isinstance(one, tuple)] for key, entries in found.items()}
         for key, entries in sound.items():
             yield from ((keys[key], member, (types, data)) for member, types, data in entries)

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5g, h5o, h5s, h5t
 
-__all__ = ["attributes", "columns"]
+__all__ = ["attributes", "columns", "length"]
 
 _TEXT = h5t.py_create(h5py.string_dtype())
 
@@ -48,6 +48,19 @@ def columns(file: h5py.File, group: str) -> dict[str, np.ndarray]:
         found[name] = np.empty(dataset.shape, dataset.dtype)
         dataset.read(h5s.ALL, h5s.ALL, found[name])
     return found
+
+
+def length(file: h5py.File, group: str) -> int:
+    """Return the number of rows of a group of columns, 0 of one without any.
+
+    Raises:
+        KeyError: If there is no such group.
+    """
+    place = h5o.open(file.id, group.encode())
+    if not place.get_num_objs():
+        return 0
+    rows: tuple[int, ...] = h5d.open(place, place.get_objname_by_idx(0)).shape
+    return rows[0]
 
 
 def _value(place: h5g.GroupID, name: bytes) -> Any:

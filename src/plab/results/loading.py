@@ -17,7 +17,7 @@ import pandas as pd
 
 from plab.results.database import COLUMNS, Database, Row
 from plab.results.files import explained, opened, opened_image, split_archive
-from plab.results.hdf5 import attributes
+from plab.results.hdf5 import attributes, length
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
@@ -258,9 +258,8 @@ def _of_member(
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, from its attributes; of its arrays it reads the last score alone."""
     own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
-    config, table = stored_config(own["config"]), file["iterations"]
+    config = stored_config(own["config"])
     evaluation, phases = attributes(file, "evaluation"), attributes(file, "wall_time")
-    columns = [str(name) for name in table.attrs["columns"]]
     known = {
         "task": config["task"]["name"],
         "variant": str(config["variant"]),
@@ -268,7 +267,7 @@ def _row(file: h5py.File, path: Path) -> Row:
         "seed": config["seed"],
         "status": own["status"],
         "message": own["message"],
-        "iterations": table[columns[0]].shape[0] if columns else 0,
+        "iterations": length(file, "iterations"),
         "best_iteration": int(best["iteration"]),
         "best_loss": float(best["loss"]),
         "seconds": float(sum(phases.values())),
@@ -279,5 +278,5 @@ def _row(file: h5py.File, path: Path) -> Row:
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):
-        values["score"] = float(table["score"][-1])
+        values["score"] = float(file["iterations/score"][-1])
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -13,8 +13,8 @@ import queue
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 __all__ = ["each", "serve"]
@@ -22,8 +22,8 @@ __all__ = ["each", "serve"]
 T = TypeVar("T")
 R = TypeVar("R")
 
-_WORTH = 300
-"""Files for each worker from which on reading them takes longer than its start."""
+_WORTH = 1200
+"""Files for each worker beside this process from which on it saves more time than its start takes."""
 
 _CHUNK = 50
 """Files given to a worker at a time."""
@@ -39,34 +39,46 @@ def each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
         function: Of a module, by whose name other processes find it.
         items: What to call it with.
     """
-    count = min(_processors(), len(items) // _WORTH)
-    if count < 2:
+    workers = [_start() for _ in range(min(_processors() - 1, len(items) // _WORTH))]
+    if not workers:
         yield from map(function, items)
         return
     chunks = [items[start : start + _CHUNK] for start in range(0, len(items), _CHUNK)]
-    workers = [_start() for _ in range(count)]
-    idle: queue.SimpleQueue[subprocess.Popen[bytes]] = queue.SimpleQueue()
-    for worker in workers:
-        idle.put(worker)
+    todo: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for number in range(len(chunks)):
+        todo.put(number)
+    results: dict[int, list[R]] = {}
 
-    def called(chunk: Sequence[T]) -> list[R]:
-        worker = idle.get()
-        try:
-            return _asked(worker, function, chunk)
-        except _LOST:
-            return list(map(function, chunk))
-        finally:
-            idle.put(worker)
+    def work(worker: subprocess.Popen[bytes] | None = None) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                number = todo.get_nowait()
+                try:
+                    found = None if worker is None else _asked(worker, function, chunks[number])
+                except _LOST:
+                    # This process does what the worker should have done.
+                    todo.put(number)
+                    return
+                results[number] = list(map(function, chunks[number])) if found is None else found
 
-    pool = ThreadPoolExecutor(count)
+    threads = [threading.Thread(target=work, args=(worker,)) for worker in workers]
     try:
-        for results in pool.map(called, chunks):
-            yield from results
+        for thread in threads:
+            thread.start()
+        work()
+        for thread in threads:
+            thread.join()
+        work()
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
         for worker in workers:
             worker.kill()
+        for thread in threads:
+            if thread.ident is not None:
+                thread.join()
+        for worker in workers:
             worker.communicate()
+    for number in range(len(chunks)):
+        yield from results.pop(number)
 
 
 def serve() -> None:
