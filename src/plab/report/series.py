@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +14,14 @@ from plab.families import known_family
 from plab.report.collect import Runs
 from plab.results import BUDGETS, read_curves, read_iterations
 
-__all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
+__all__ = ["AXES", "Band", "Rows", "band", "load_rows", "load_series", "rows_on_axes"]
 
 AXES = ("episodes", "seconds", "substeps")
 """What curves are drawn against: episodes, wall time [s], simulated substeps."""
 
+
+Rows = Mapping[str, np.ndarray]
+"""Columns of a run's rows: not a pandas table, of which thousands take long to make."""
 
 _POINTS = 400
 """Points of a curve, at most."""
@@ -42,7 +44,7 @@ class Band:
     count: int
 
 
-def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
+def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
     """Read the iterations of all runs.
 
     Args:
@@ -60,36 +62,18 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
         dict(zip(columns, map(str, own), strict=True))
         for own in runs.table[list(columns)].itertuples(index=False, name=None)
     ]
-    found = map(_on_axes, runs.configs, read_curves(runs.source, runs.table["path"]))
-    return list(zip(names, _tables(list(found)), strict=True))
+    found = map(rows_on_axes, runs.configs, read_curves(runs.source, runs.table["path"]))
+    return list(zip(names, found, strict=True))
 
 
-def _tables(series: Sequence[Mapping[str, np.ndarray]]) -> list[pd.DataFrame]:
-    """Return a table of each; thousands are made much faster as slices of one than one by one."""
-    groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
-    for place, own in enumerate(series):
-        groups[tuple(own)].append(place)
-    tables = [pd.DataFrame()] * len(series)
-    for columns, places in groups.items():
-        whole = pd.DataFrame({name: np.concatenate([series[p][name] for p in places]) for name in columns})
-        start = 0
-        for place in places:
-            end = start + len(series[place]["seconds"])
-            tables[place], start = whole.iloc[start:end], end
-    return tables
-
-
-def load_rows(path: str | Path) -> pd.DataFrame:
+def load_rows(path: str | Path) -> Rows:
     """Return the iterations of one run as :func:`load_series` does."""
     return rows_on_axes(*read_iterations(path))
 
 
-def rows_on_axes(config: Mapping[str, Any], iterations: pd.DataFrame) -> pd.DataFrame:
+def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> Rows:
     """Return the iterations of a run that has been read as :func:`load_series` does."""
-    return pd.DataFrame(_on_axes(config, {str(name): iterations[name].to_numpy() for name in iterations}))
-
-
-def _on_axes(config: Mapping[str, Any], rows: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    rows = {str(name): np.asarray(iterations[name]) for name in iterations}
     sim, known = config["sim"], known_family(config["method"]["family"])
     own = [rows[name] for name in BUDGETS if name in rows]
     simulated = np.sum(own, axis=0) if own else rows["steps"] + sim["horizon"]
@@ -109,7 +93,7 @@ def _on_axes(config: Mapping[str, Any], rows: Mapping[str, np.ndarray]) -> dict[
     }
 
 
-def band(tables: Sequence[pd.DataFrame], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
+def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
     """Return mean and spread of a column over runs, between where all have begun and the first one ends.
 
     Args:
@@ -122,7 +106,8 @@ def band(tables: Sequence[pd.DataFrame], axis: str, column: str, *, floor: float
         The band on the union of the runs' points, between which their values are interpolated; None without
         runs.
     """
-    curves = [(table[axis].to_numpy(float), table[column].to_numpy(float)) for table in tables if len(table)]
+    pairs = ((np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables)
+    curves = [(x, y) for x, y in pairs if len(x)]
     if not curves:
         return None
     low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
