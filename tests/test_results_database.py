@@ -20,6 +20,8 @@ import pytest
 
 import synthetic
 from plab.examples import example_archive
+from plab.render.__main__ import _parse as parse_render
+from plab.render.__main__ import main as render
 from plab.report.collect import collect
 from plab.results import (
     connect,
@@ -567,6 +569,23 @@ def test_folders_archives_and_example_are_taken_in_the_same_way(folder: Path, ca
     assert len(json.loads(capsys.readouterr().out)["runs"]) > 0
     assert main(["check", "targets"]) == 0
     assert capsys.readouterr().out == "150 run(s) checked, all well\n"
+
+
+def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told, capsys) -> None:
+    for seed, score in enumerate((0.5, 0.75, 0.25)):
+        age(synthetic.save(synthetic.run(folder, seed=seed, score=score)))
+    pack(folder, folder.parent / "all.plab.zip")
+    for source in (folder, folder.parent / "all.plab.zip"):
+        options = parse_render([str(source), "task=Rope"])
+        assert read(options.result).config["seed"] == 1
+        assert options.output == Path("Rope-v1-adam-seed1.png")
+    assert parse_render([str(folder), "seed=2"]).output == Path("Rope-v1-adam-seed2.png")
+    line = told([str(folder), "seed=3"], render)
+    assert line == f"plab: there is no finished run to draw in {folder}: no run fits"
+    line = told(["example", "taks=Rope"], render)
+    assert (
+        line == "plab: 'taks=Rope' selects nothing; choose from: task, variant, method, seed, or a dotted key"
+    )
 
 
 def test_status_and_reports_find_the_same_with_and_without(folder: Path, opened: list[str]) -> None:

@@ -12,8 +12,13 @@ from omegaconf import OmegaConf
 
 from plab.arguments import positive, to_write
 from plab.config import ConfigError, choices, load_config
+from plab.examples import EXAMPLES, resolve
 from plab.render.graphics import RenderError, require_graphics
+from plab.results import ResultsError
+from plab.results.loading import readable_rows
+from plab.results.schema import ARCHIVE_SUFFIX
 from plab.scene import SceneError
+from plab.selection import SelectionError, one_protocol, select
 from plab.targets import TargetError
 
 __all__ = ["main"]
@@ -23,11 +28,12 @@ EXIT_INTERRUPTED = 130
 
 _USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
+python -m plab.render FOLDER | ARCHIVE | example [task=... method=...] [--output FILE]
 python -m plab.render KEY=VALUE ... [--output FILE]
 python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
 
-Draws the best actions of a run, the best actions known for a task, or start and target of every task and
-variant.
+Draws the best actions of a run, those of the run with the highest score in a folder or an archive, the best
+actions known for a task, or start and target of every task and variant.
 
 The suffix of FILE decides what is written:
   .png         start, target and the rollout's end, side by side
@@ -35,6 +41,7 @@ The suffix of FILE decides what is written:
 
 EXAMPLES
   python -m plab.render results/Rope-v1/adam/seed0-12ab34cd.h5
+  python -m plab.render example task=Rope method=adam --output rope.gif
   python -m plab.render task=Torus variant=2 --output torus.gif
 """
 
@@ -67,7 +74,6 @@ def _run(arguments: argparse.Namespace) -> None:
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
     from plab.render.pictures import check_output
-    from plab.results import ResultsError
     from plab.sim import DeviceError, SimulationError
 
     check_output(arguments.output)
@@ -129,6 +135,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         if arguments.contact_sheet.suffix.lower() != ".png":
             raise RenderError(f"cannot write {arguments.contact_sheet}: a contact sheet is a .png")
         arguments.output = arguments.contact_sheet
+    elif len(files) == 1 and _holds_many(files[0]):
+        arguments.result, name = _best(files[0], arguments.overrides)
+        arguments.output = arguments.output or Path(f"{name}.png")
     elif len(files) > 1 or (files and arguments.overrides):
         raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
     elif files:
@@ -145,10 +154,32 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return arguments
 
 
+def _holds_many(source: str) -> bool:
+    """Return whether a word stands for a folder or an archive of results."""
+    return source in EXAMPLES or source.endswith(ARCHIVE_SUFFIX) or Path(source).is_dir()
+
+
+def _best(source: str, words: Sequence[str]) -> tuple[Path, str]:
+    """Return place and name of the finished run with the highest score, of those that the words choose."""
+    names = ("task", "variant", "method", "seed")
+    try:
+        chosen = select(words, names)
+        rows = [row for row in readable_rows(resolve(source))[0] if row.values["status"] == "finished"]
+        rows = [row for row in rows if chosen(row.values, row.config)]
+        one_protocol(row.config for row in rows)
+    except (ResultsError, SelectionError) as error:
+        raise RenderError(str(error)) from error
+    if not rows:
+        raise RenderError(f"there is no finished run to draw in {source}: no run fits")
+    best = max(rows, key=lambda row: row.values["score"])
+    task, variant, method, seed = (best.values[name] for name in names)
+    return best.path, f"{task}-v{variant}-{method}-seed{seed}"
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(usage=_USAGE, allow_abbrev=False)
     add = parser.add_argument
-    add("what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run")
+    add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run")
     add("--output", type=Path, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=Path, metavar="FILE", help="a .png")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
