@@ -6,6 +6,7 @@ as compressed columns. A single run's are read from its file: :func:`plab.result
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import sqlite3
@@ -146,7 +147,7 @@ def _read(path: Path) -> list[tuple[str, str, bytes] | ResultsError]:
 
 
 def _unpacked(types: str, data: bytes) -> Curves:
-    kinds = [(name, np.dtype(kind)) for name, kind in json.loads(types)]
+    kinds = _kinds(types)
     content = zlib.decompress(data)
     length = len(content) // max(sum(kind.itemsize for _, kind in kinds), 1)
     found, start = {}, 0
@@ -154,6 +155,11 @@ def _unpacked(types: str, data: bytes) -> Curves:
         found[name] = np.frombuffer(content, kind, length, start)
         start += length * kind.itemsize
     return found
+
+
+@functools.lru_cache
+def _kinds(types: str) -> list[tuple[str, np.dtype]]:
+    return [(name, np.dtype(kind)) for name, kind in json.loads(types)]
 
 
 def _directly(path: str) -> Curves:
