@@ -179,8 +179,9 @@ class Database:
         for key, (path, _) in self._store.files.items():
             folder = str(path)
             for entry in self._known[key] if key in self._known else self._fresh.get(key, ()):
-                place = str(path / entry.member) if entry.member else folder
-                yield Row(entry.values | {"path": place}, self._config(entry))
+                # Kept without it: the same folder may be given by another path next time.
+                entry.values["path"] = str(path / entry.member) if entry.member else folder
+                yield Row(entry.values, self._config(entry))
             yield from self._wrong.get(key, ())
 
     def save(self) -> None:
@@ -221,7 +222,7 @@ class Database:
         member = row.path.relative_to(path).as_posix() if row.path != path else ""
         own = {name: value for name, value in row.config.items() if isinstance(value, dict)}
         sections = {name: self._refer(value, name) for name, value in own.items()}
-        # The same folder may be given by another path next time. Columns and sections keep their places.
+        # Columns and sections keep their places.
         return _Stored(member, row.values | {"path": ""}, row.config | dict.fromkeys(own), sections)
 
     def _refer(self, section: dict[str, Any], name: str) -> int:
@@ -243,7 +244,7 @@ class Database:
             # What no plab writes may be no JSON: it is read again each time.
             with contextlib.suppress(TypeError, ValueError):
                 if entries or not self._wrong[key]:
-                    texts[key] = json.dumps([[e.member, e.values, e.config, e.sections] for e in entries])
+                    texts[key] = json.dumps([_listed(entry) for entry in entries])
 
         def write(connection: sqlite3.Connection, outdated: Sequence[bytes]) -> None:
             keys = [(key,) for key in outdated]
@@ -328,6 +329,10 @@ def text(value: str) -> str:
 def _number(name: bytes) -> int:
     """Return a number of 63 bits that is as good as a name."""
     return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") >> 1
+
+
+def _listed(entry: _Stored) -> list[Any]:
+    return [entry.member, entry.values | {"path": ""}, entry.config, entry.sections]
 
 
 def _evaluation(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -158,25 +158,24 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
         raise ResultsError(f"there are no results: {root} does not exist")
     for folder, subfolders, names in os.walk(root):
         subfolders.sort()
-        for name in sorted(names):
-            if name.endswith((SUFFIX, ARCHIVE_SUFFIX)):
-                path = Path(folder, name)
-                try:
-                    yield path, path.stat()
-                except FileNotFoundError:
-                    # A run that ends removes its partial file, any moment.
-                    continue
+        place = Path(folder)
+        for name in sorted(name for name in names if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
+            try:
+                # By text: pathlib takes longer than the file system.
+                stat = os.stat(os.path.join(folder, name))
+            except FileNotFoundError:
+                # A run that ends removes its partial file, any moment.
+                continue
+            yield place / name, stat
 
 
 def counting_files(root: Path) -> list[File]:
     """Return the files below a folder but for what is left of runs that have finished since."""
     files = list(run_files(root))
-    present = {str(path) for path, _ in files}
-    return [
-        (path, stat)
-        for path, stat in files
-        if not path.name.endswith(PARTIAL_SUFFIX) or str(final_path(path)) not in present
-    ]
+    partial = [path for path, _ in files if path.name.endswith(PARTIAL_SUFFIX)]
+    present = {path for path, _ in files} if partial else set()
+    ended = {path for path in partial if final_path(path) in present}
+    return [file for file in files if file[0] not in ended] if ended else files
 
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
