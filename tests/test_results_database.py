@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import json
 import os
@@ -141,16 +142,24 @@ def test_archive_is_kept_in_the_cache(folder: Path, opened: list[str]) -> None:
 
 
 def test_many_files_are_read_by_several_processes_in_order(folder: Path, monkeypatch) -> None:
+    expected, answers, started = load(folder, database=False), [], []
     monkeypatch.setattr(workers, "_WORTH", 1)
     monkeypatch.setattr(workers, "_CHUNK", 1)
     monkeypatch.setattr(workers, "_processors", lambda: 2)
-    started = []
-    start = workers._start
+    start, asked, here = workers._start, workers._asked, loading._read
     monkeypatch.setattr(workers, "_start", lambda: started.append(start()) or started[-1])
-    expected = load(folder, database=False)
-    assert len(started) == 2
+    monkeypatch.setattr(workers, "_asked", lambda *args: answers.append(asked(*args)) or answers[-1])
+
+    @functools.wraps(here)
+    def wait(path: Path):
+        while not answers:
+            time.sleep(0.01)
+        return here(path)
+
+    monkeypatch.setattr(loading, "_read", wait)
     pd.testing.assert_frame_equal(load(folder), expected)
-    assert all(worker.returncode is not None for worker in started)
+    assert len(answers) in (1, 2) and len(started) == 1
+    assert started[0].returncode is not None
 
 
 def test_a_process_that_dies_is_replaced_by_this_one(folder: Path, monkeypatch) -> None:
