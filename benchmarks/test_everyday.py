@@ -53,19 +53,19 @@ def test_compose(benchmark: BenchmarkFixture) -> None:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of result files, old enough for the index."""
+    """A folder of result files, old enough for the database."""
     folder = tmp_path_factory.mktemp("results")
     write_runs(RUNS, 5, folder)
     time.sleep(SETTLE)
     return folder
 
 
-@pytest.mark.parametrize("index", [False, True], ids=["files", "index"])
+@pytest.mark.parametrize("database", [False, True], ids=["files", "database"])
 def test_load_results(
-    benchmark: BenchmarkFixture, results: Path, index: bool, monkeypatch: pytest.MonkeyPatch
+    benchmark: BenchmarkFixture, results: Path, database: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(results.parent / "cache"))
-    table = benchmark.pedantic(load, (results,), {"index": index}, rounds=5, warmup_rounds=1)
+    table = benchmark.pedantic(load, (results,), {"database": database}, rounds=5, warmup_rounds=1)
     assert len(table) == RUNS
 
 

@@ -263,18 +263,20 @@ def test_an_everyday_thing_that_fails_is_no_time(tmp_path: Path, monkeypatch: py
         list(everyday.measure(tmp_path, [tmp_path], 1, ["fails"]))
 
 
-def test_what_needs_an_index_finds_one_in_the_first_turn(
+def test_what_needs_a_database_finds_one_in_the_first_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = []
 
-    def timed(arguments, folder, source, cache):
-        calls.append((cache.name, cache.exists(), arguments))
-        cache.mkdir(exist_ok=True)
+    (tmp_path / "results").mkdir()
+
+    def timed(arguments, folder, source):
+        calls.append((folder.name, (folder / "cache").exists(), arguments))
+        (folder / "cache").mkdir(exist_ok=True)
         return 0.1, 0.1
 
     monkeypatch.setattr(everyday, "_timed", timed)
     rows = list(everyday.measure(tmp_path, [tmp_path / "a", tmp_path / "b"], 1, ["load, again"]))
     assert len(rows) == 2 and all(tuple(row) == everyday.COLUMNS for row in rows)
     loads = everyday.THINGS["load, first time"]
-    assert calls == [(f"cache{n}", there, loads) for there in (False, True) for n in (0, 1)]
+    assert calls == [(f"source{n}", there, loads) for there in (False, True) for n in (0, 1)]

@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,9 +30,6 @@ from plab.targets import __main__ as targets
 from plab.view import __main__ as view
 from refusals import refusal
 from rights import ordinary_rights
-
-Entry = Callable[[Sequence[str]], int]
-
 
 missing = graphics.missing_graphics()
 drawing = pytest.mark.skipif(missing is not None, reason=str(missing))

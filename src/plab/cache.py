@@ -1,4 +1,4 @@
-"""The folder of what plab can make again: simulated targets, indices of results."""
+"""The folder of what plab can make again: simulated targets, databases of results."""
 
 from __future__ import annotations
 

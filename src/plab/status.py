@@ -23,6 +23,7 @@ from typing import Any, TypeAlias, cast
 
 from plab.arguments import sources_and_words
 from plab.command import command_line
+from plab.examples import EXAMPLES, resolve
 from plab.locks import held
 from plab.possible import require_possible
 from plab.results import ResultsError, Row, row_count
@@ -406,7 +407,8 @@ def _csv(found: Survey) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
-    what = "folder of results or archive (default: results), and runs: task=Rope,Move variant=1 seed=0,1,2"
+    where = f"folder of results, archive, or one of {', '.join(EXAMPLES)} (default: results)"
+    what = f"{where}, and runs: task=Rope,Move variant=1 seed=0,1,2"
     parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print everything, for scripts")
@@ -415,7 +417,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sources, words = sources_and_words(options.arguments)
     if len(sources) > 1:
         raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
-    found = survey(sources[0] if sources else "results", select(words, NAMES))
+    found = survey(resolve(sources[0] if sources else "results"), select(words, NAMES))
     if options.json:
         print(json.dumps(_json(found), indent=1))
     elif options.csv:

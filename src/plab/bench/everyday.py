@@ -49,7 +49,7 @@ THINGS: Mapping[str, Sequence[str]] = {
 COLUMNS = ("what", "source", "cpu_s", "cpu_max_s", "wall_s")
 
 _FRESH = "load, first time"
-"""What is measured without an index."""
+"""What is measured without a database."""
 
 
 def measure(
@@ -70,18 +70,19 @@ def measure(
     Raises:
         RuntimeError: If one of them ends with another exit code than 0.
     """
-    caches = [folder / f"cache{number}" for number in range(len(sources))]
-    for source, cache in zip(sources, caches, strict=True):
-        # Whichever thing is the first finds an index.
-        _timed(("-c", _LOAD), folder, source, cache)
+    places = [folder / f"source{number}" for number in range(len(sources))]
+    for source, place in zip(sources, places, strict=True):
+        _set_up(folder, place)
+        # Whichever thing is the first finds a database.
+        _timed(("-c", _LOAD), place, source)
     for what in things:
         taken: dict[Path, list[tuple[float, float]]] = {source: [] for source in sources}
         for turn in range(repeats):
-            for source, cache in zip(sources, caches, strict=True):
+            for source, place in zip(sources, places, strict=True):
                 progress(f"{what}, {turn + 1}/{repeats}")
                 if what == _FRESH:
-                    shutil.rmtree(cache, ignore_errors=True)
-                taken[source].append(_timed(THINGS[what], folder, source, cache))
+                    _set_up(folder, place)
+                taken[source].append(_timed(THINGS[what], place, source))
         for source in sources:
             cpu, wall = min(taken[source])
             longest = max(cpu for cpu, _ in taken[source])
@@ -94,10 +95,16 @@ def measure(
             }
 
 
-def _timed(arguments: Sequence[str], folder: Path, source: Path, cache: Path) -> tuple[float, float]:
+def _set_up(folder: Path, place: Path) -> None:
+    """Give a source tree the results, and nothing else, in a folder of its own."""
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(folder / "results", place / "results")
+
+
+def _timed(arguments: Sequence[str], folder: Path, source: Path) -> tuple[float, float]:
     """Run Python; return the processor's seconds, of user and system, and those of the clock."""
     # One thread: a library that keeps several busy would count all of them.
-    own = {"PYTHONPATH": str(source), "PLAB_CACHE_DIR": str(cache), "OMP_NUM_THREADS": "1"}
+    own = {"PYTHONPATH": str(source), "PLAB_CACHE_DIR": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
     before, start = _children(), time.perf_counter()
     done = subprocess.run(
         [sys.executable, *arguments],

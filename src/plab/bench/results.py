@@ -1,10 +1,11 @@
-"""Time to load thousands of result files, with and without the index, and from an archive.
+"""Time and memory that thousands of result files take, with and without the database, and from an archive.
 
-    python -m plab.bench.results --runs 5000 --rows 5
+    python -m plab.bench.results --runs 10000 --rows 5
     python -m plab.bench.results --runs 1000 --archive
 
 writes so many small result files to a folder that is removed afterwards, and loads them: for the first time,
-again, after one of them has changed. The index goes to a folder of its own.
+again, after one of them has changed. Status, tables and a query follow. Databases go to that folder, too. At
+the end it says how much memory all of this took.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import copy
 import itertools
 import os
+import resource
 import sys
 import tempfile
 import time
@@ -30,7 +32,10 @@ from plab.config import load_config
 from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
+from plab.report.__main__ import write_tables
+from plab.report.collect import collect
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
+from plab.results.query import query, scores
 from plab.results.schema import COLUMNS, loss_columns
 from plab.selection import Selection
 from plab.status import survey
@@ -39,7 +44,7 @@ from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 __all__ = ["SETTLE", "main", "synthetic_run", "template", "write_runs"]
 
 SETTLE = 2.5
-"""Seconds to wait after writing: the index leaves out files that have changed just now."""
+"""Seconds to wait after writing: what files hold that have changed just now is not kept."""
 
 
 def template(method: str, overrides: list[str] | None = None) -> dict[str, Any]:
@@ -148,7 +153,7 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
         seconds = time.perf_counter() - start
         first.setdefault("seconds", seconds)
         ratio = round(first["seconds"] / seconds, 1)
-        return {"what": what, "runs": count, "seconds": round(seconds, 3), "times_faster": ratio}
+        return {"what": what, "count": count, "seconds": round(seconds, 3), "times_faster": ratio}
 
     first: dict[str, float] = {}
     yield timed("first time", lambda: load(results))
@@ -157,8 +162,12 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
     Path(changed).touch()
     yield timed("one changed", lambda: load(results))
     yield timed("with a key", lambda: load(results, keys=["method.family"]))
-    yield timed("without index", lambda: load(results, index=False))
+    yield timed("without database", lambda: load(results, database=False))
+    yield timed("scores", lambda: scores(results, Selection(), ["method.lr"], ["score"])[0])
+    yield timed("sql", lambda: query(results, "select task, avg(score) from runs group by task")[1])
     yield timed("plab.status", lambda: survey(results, Selection()).runs)
+    yield timed("tables, first time", lambda: write_tables(collect(results, Selection()), folder / "a", ""))
+    yield timed("tables, again", lambda: write_tables(collect(results, Selection()), folder / "b", ""))
     if not packed:
         return
     archive = folder / "all.plab.zip"
@@ -184,7 +193,10 @@ def _run(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
         table = _rows(options.runs, options.rows, Path(folder), options.archive)
-        report(("what", "runs", "seconds", "times_faster"), table, options.csv)
+        report(("what", "count", "seconds", "times_faster"), table, options.csv)
+    # Linux counts in KiB, macOS in bytes.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1024.0)
+    print(f"most memory: {peak:.0f} MiB")
     return 0
 
 

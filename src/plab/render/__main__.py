@@ -20,12 +20,14 @@ __all__ = ["main"]
 
 _USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
+python -m plab.render FOLDER | ARCHIVE | example [task=... method=...] [--output FILE]
 python -m plab.render KEY=VALUE ... [--output FILE]
 python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
 python -m plab.render --film-strip FILE [KEY=VALUE ...]
 
-Draws the best actions of a run, the best actions known for a task, start and target of every task and
-variant, or a few frames of the best actions known for every task.
+Draws the best actions of a run, those of the run with the highest score in a folder or an archive, the best
+actions known for a task, start and target of every task and variant, or a few frames of the best actions
+known for every task.
 
 The suffix of FILE decides what is written:
   .png         start, target and the rollout's end, side by side
@@ -33,6 +35,7 @@ The suffix of FILE decides what is written:
 
 EXAMPLES
   python -m plab.render results/Rope-v1/adam/seed0-12ab34cd.h5
+  python -m plab.render example task=Rope method=adam --output rope.gif
   python -m plab.render task=Torus variant=2 --output torus.gif
 """
 

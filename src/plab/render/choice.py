@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -11,7 +12,9 @@ import numpy as np
 from plab.arguments import positive, sources_and_words, to_write
 from plab.checks import check_sources
 from plab.config import load_config
+from plab.examples import EXAMPLES, resolve
 from plab.render.graphics import RenderError
+from plab.selection import one_protocol, select
 from plab.words import IDLE, require_effect
 
 if TYPE_CHECKING:
@@ -32,7 +35,7 @@ def make_parser(usage: str, every: str) -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(usage=usage, allow_abbrev=False)
     parser.add_argument(
-        "what", nargs="*", metavar="RESULT_FILE | KEY=VALUE", help="keys are those of python -m plab.run"
+        "what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run"
     )
     parser.add_argument(
         "--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps"
@@ -66,6 +69,9 @@ def settle(arguments: argparse.Namespace, ending: str) -> Path:
         plab.config.ConfigError: If the configuration is wrong.
     """
     files, overrides = sources_and_words(arguments.what)
+    if len(files) == 1 and _holds_many(files[0]):
+        arguments.result, name = _best(files[0], overrides)
+        return Path(f"{name}{ending}")
     require_effect(overrides, WITHOUT_EFFECT, "a picture")
     if len(files) > 1 or (files and overrides):
         raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
@@ -82,6 +88,30 @@ def settle(arguments: argparse.Namespace, ending: str) -> Path:
     cfg = arguments.config = load_config(overrides, arguments.config_dir)
     check_sources(cfg)
     return Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
+
+
+def _holds_many(source: str) -> bool:
+    """Return whether a word stands for a folder or an archive of results."""
+    # Imported here, as below: it loads pandas, for which no mistake should have to wait.
+    from plab.results.schema import ARCHIVE_SUFFIX
+
+    return source in EXAMPLES or source.endswith(ARCHIVE_SUFFIX) or Path(source).is_dir()
+
+
+def _best(source: str, words: Sequence[str]) -> tuple[Path, str]:
+    """Return place and name of the finished run with the highest score, of those that the words choose."""
+    from plab.results.loading import readable_rows
+
+    names = ("task", "variant", "method", "seed")
+    chosen = select(words, names)
+    rows = [row for row in readable_rows(resolve(source))[0] if row.values["status"] == "finished"]
+    rows = [row for row in rows if chosen(row.values, row.config)]
+    one_protocol(row.config for row in rows)
+    if not rows:
+        raise RenderError(f"there is no finished run to show in {source}: no run fits")
+    best = max(rows, key=lambda row: row.values["score"])
+    task, variant, method, seed = (best.values[name] for name in names)
+    return best.path, f"{task}-v{variant}-{method}-seed{seed}"
 
 
 def require_writable(path: Path) -> None:

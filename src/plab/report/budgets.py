@@ -10,6 +10,7 @@ import pandas as pd
 
 from plab.report.collect import Runs
 from plab.report.methods import method
+from plab.report.series import Rows
 from plab.report.statistics import CONFIDENCE, Interval, stratified_mean, summarise
 from plab.report.table import NOTHING, Table, number
 from plab.report.tables import ordered_tasks, settings_note
@@ -28,26 +29,26 @@ NOTES = [
     "A run that has ended keeps its score. A method has no score before all of its runs have a row.",
 ]
 
-Series = Sequence[tuple[dict[str, str], pd.DataFrame]]
+Series = Sequence[tuple[dict[str, str], Rows]]
 """What :func:`plab.report.series.load_series` gives."""
 
 
-def scores_at(table: pd.DataFrame, budgets: np.ndarray, column: str = "best_score") -> np.ndarray:
+def scores_at(table: Rows, budgets: np.ndarray, column: str = "best_score") -> np.ndarray:
     """Return what a run has at some budgets [environment steps], NaN before its first row."""
-    row = np.searchsorted(table["simulated"].to_numpy(float), budgets, side="right") - 1
-    return np.where(row < 0, np.nan, table[column].to_numpy(float)[row])
+    row = np.searchsorted(np.asarray(table["simulated"], float), budgets, side="right") - 1
+    return np.where(row < 0, np.nan, np.asarray(table[column], float)[row])
 
 
-def strata_of(series: Series, task: str) -> Mapping[str, list[list[pd.DataFrame]]]:
+def strata_of(series: Series, task: str) -> Mapping[str, list[list[Rows]]]:
     """Return the rows of a task's runs by method, those of one variant in a list."""
-    found: dict[str, dict[str, list[pd.DataFrame]]] = defaultdict(lambda: defaultdict(list))
+    found: dict[str, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
     for names, table in series:
-        if names["task"] == task and len(table):
+        if names["task"] == task and len(table["simulated"]):
             found[names["method"]][names["variant"]].append(table)
     return {name: list(variants.values()) for name, variants in found.items()}
 
 
-def at_budgets(strata: Sequence[Sequence[pd.DataFrame]], budgets: np.ndarray) -> list[Interval]:
+def at_budgets(strata: Sequence[Sequence[Rows]], budgets: np.ndarray) -> list[Interval]:
     """Return the mean score of some runs at each budget, by variant in ``strata``."""
     values = [np.stack([scores_at(table, budgets) for table in runs]) for runs in strata]
     return [stratified_mean([summarise(own[:, k]) for own in values]) for k in range(len(budgets))]

@@ -80,6 +80,8 @@ class Runs:
         unusual: Settings other than plab's own: key to the values that occur.
         protocol: Name of their protocol.
         unreadable: What could not be read.
+        configs: Their configurations, in the order of ``table``.
+        source: Where they were found.
     """
 
     table: pd.DataFrame
@@ -93,6 +95,8 @@ class Runs:
     unusual: dict[str, list[Any]]
     protocol: str
     unreadable: list[str]
+    configs: list[dict[str, Any]]
+    source: str | Path | Sequence[str | Path]
 
     @property
     def digest(self) -> str:
@@ -168,6 +172,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         unusual=unusual,
         protocol=protocol,
         unreadable=[str(error) for error in unreadable],
+        configs=[row.config for row in finished],
+        source=source,
     )
 
 
@@ -259,10 +265,15 @@ def _refuse_repeated(found: Sequence[Row]) -> None:
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Return the dotted keys in which configurations differ, with the values that occur."""
     first = configs[0]
-    if all(config == first for config in configs[1:]):
-        return {}
+    # Of thousands of runs most share their sections, as the same objects.
+    unlike = {
+        name
+        for config in configs[1:]
+        for name in config.keys() | first.keys()
+        if config.get(name) is not first.get(name) and config.get(name) != first.get(name)
+    }
     seen: dict[str, dict[str, Any]] = defaultdict(dict)
-    flat = [dict(_leaves(config)) for config in configs]
+    flat = [dict(_leaves({name: config[name] for name in config if name in unlike})) for config in configs]
     for key in dict.fromkeys(key for leaves in flat for key in leaves):
         for leaves in flat:
             value = leaves.get(key)
@@ -284,7 +295,7 @@ def _prefer_usual(found: Sequence[Row]) -> tuple[list[Row], dict[str, list[Any]]
     Returns:
         These runs, and their settings that are not those of plab's own files: key to the values that occur.
     """
-    changes = [changed_settings(row.config) for row in found]
+    changes = _changes(found)
     fewest: dict[tuple[str, str], int] = {}
     for row, changed in zip(found, changes, strict=True):
         fewest[_pair(row)] = min(len(changed), fewest.get(_pair(row), len(changed)))
@@ -296,6 +307,19 @@ def _prefer_usual(found: Sequence[Row]) -> tuple[list[Row], dict[str, list[Any]]
             for key, value in changed.items():
                 unusual[key].add(json.dumps(value))
     return kept, {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
+
+
+def _changes(found: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the :func:`changed_settings` of each run; of thousands most share their sections."""
+    known: dict[tuple[Any, ...], dict[str, Any]] = {}
+    changes = []
+    for row in found:
+        sections = (id(row.config[name]) for name in ("task", "method", "protocol", "sim"))
+        which = (*sections, row.values["variant"])
+        if which not in known:
+            known[which] = changed_settings(row.config)
+        changes.append(known[which])
+    return changes
 
 
 def _pair(row: Row) -> tuple[str, str]:

@@ -172,9 +172,9 @@ def contact_models(runs: Runs, series: Series) -> Drawing | None:
     panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
     gaps: Mapping[str, list[float]] = {name: [] for name in runs.methods}
     for row, (_, rows) in zip(runs.table.to_dict("records"), series, strict=True):
-        best = rows[rows["iteration"] == row["best_iteration"]]["score"]
+        best = rows["score"][rows["iteration"] == row["best_iteration"]]
         if len(best):
-            before = min(max(float(best.iloc[0]), 0.0), 1.0)
+            before = min(max(float(best[0]), 0.0), 1.0)
             panel.plot(
                 before, row["score_best"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
             )

@@ -20,7 +20,7 @@ from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
 from plab.report.methods import RL, method
-from plab.report.series import band
+from plab.report.series import Rows, band
 from plab.report.statistics import CONFIDENCE
 from plab.report.table import number
 from plab.report.tables import ordered_tasks, settings_note
@@ -36,10 +36,10 @@ __all__ = [
     "yield_ablation",
 ]
 
-Tables = Mapping[str, list[pd.DataFrame]]
+Tables = Mapping[str, list[Rows]]
 """Rows of runs by method."""
 
-Series = Sequence[tuple[dict[str, str], pd.DataFrame]]
+Series = Sequence[tuple[dict[str, str], Rows]]
 """What :func:`plab.report.series.load_series` gives."""
 
 _CLAMPED = "Values below zero count as zero, as in the paper."
@@ -49,9 +49,9 @@ _POINTS = 60
 """Points of a curve against budgets."""
 
 
-def _pick(series: Series, **which: str) -> dict[str, list[pd.DataFrame]]:
+def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
     """Return the rows of the runs that are what is asked for, by method."""
-    found: dict[str, list[pd.DataFrame]] = defaultdict(list)
+    found: dict[str, list[Rows]] = defaultdict(list)
     for names, table in series:
         if all(names[key] == value for key, value in which.items()):
             found[names["method"]].append(table)
@@ -137,7 +137,7 @@ def budget_curves(runs: Runs, series: Series) -> Drawing:
             strata_of(series, task).items(), key=lambda one: runs.methods.index(one[0])
         ):
             tables = [table for own in strata for table in own]
-            first, last = (max(table["simulated"].iloc[k] for table in tables) for k in (0, -1))
+            first, last = (max(table["simulated"][k] for table in tables) for k in (0, -1))
             budgets = np.unique(np.geomspace(first, last, _POINTS).round())
             found, look = at_budgets(strata, budgets), method(name)
             means, low, high = np.array([(one.value, one.low, one.high) for one in found]).T
@@ -281,7 +281,7 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
     return [Drawing("agreement", figure, notes)]
 
 
-def yield_ablation(groups: Mapping[float, Sequence[pd.DataFrame]], what: str, name: str) -> list[Drawing]:
+def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str) -> list[Drawing]:
     """Return reward against episodes for several yield stresses.
 
     Args:

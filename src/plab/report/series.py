@@ -12,13 +12,16 @@ import pandas as pd
 
 from plab.families import known_family
 from plab.report.collect import Runs
-from plab.results import BUDGETS, read_iterations
+from plab.results import BUDGETS, read_curves, read_iterations
 
-__all__ = ["AXES", "Band", "band", "load_rows", "load_series", "rows_on_axes"]
+__all__ = ["AXES", "Band", "Rows", "band", "load_rows", "load_series", "rows_on_axes"]
 
 AXES = ("episodes", "seconds", "substeps")
 """What curves are drawn against: episodes, wall time [s], simulated substeps."""
 
+
+Rows = Mapping[str, np.ndarray]
+"""Columns of a run's rows: not a pandas table, of which thousands take long to make."""
 
 _POINTS = 400
 """Points of a curve, at most."""
@@ -41,7 +44,7 @@ class Band:
     count: int
 
 
-def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
+def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
     """Read the iterations of all runs.
 
     Args:
@@ -54,35 +57,43 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], pd.DataFrame]]:
         the row; ``best_score`` is the score of the best actions so far. ``episodes`` counts the row's own,
         too, so that it starts at 1.
     """
-    names = ("task", "variant", "method", "seed")
-    return [
-        ({name: str(values[name]) for name in names}, load_rows(values["path"]))
-        for values in runs.table.to_dict("records")
+    columns = ("task", "variant", "method", "seed")
+    names = [
+        dict(zip(columns, map(str, own), strict=True))
+        for own in runs.table[list(columns)].itertuples(index=False, name=None)
     ]
+    found = map(rows_on_axes, runs.configs, read_curves(runs.source, runs.table["path"]))
+    return list(zip(names, found, strict=True))
 
 
-def load_rows(path: str | Path) -> pd.DataFrame:
+def load_rows(path: str | Path) -> Rows:
     """Return the iterations of one run as :func:`load_series` does."""
     return rows_on_axes(*read_iterations(path))
 
 
-def rows_on_axes(config: Mapping[str, Any], iterations: pd.DataFrame) -> pd.DataFrame:
+def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> Rows:
     """Return the iterations of a run that has been read as :func:`load_series` does."""
-    table, sim = iterations.copy(), config["sim"]
-    table["seconds"] = table["seconds"].cumsum()
-    own = [table[name] for name in BUDGETS if name in table]
-    table["simulated"] = sum(own) if own else table["steps"] + sim["horizon"]
-    table["substeps"] = table["simulated"] * sim["substeps"]
-    known = known_family(config["method"]["family"])
+    rows = {str(name): np.asarray(iterations[name]) for name in iterations}
+    sim, known = config["sim"], known_family(config["method"]["family"])
+    own = [rows[name] for name in BUDGETS if name in rows]
+    simulated = np.sum(own, axis=0) if own else rows["steps"] + sim["horizon"]
     if known is not None and known.ranking == "score":
-        table["best_score"] = table["score"].cummax()
+        best = np.maximum.accumulate(rows["score"])
     else:
-        table["best_score"] = table["score"].where(table["loss"] == table["loss"].cummin()).ffill()
-    table["episodes"] += 1
-    return table
+        # Row of the lowest loss so far.
+        lowest = np.where(rows["loss"] == np.minimum.accumulate(rows["loss"]), np.arange(len(simulated)), 0)
+        best = rows["score"][np.maximum.accumulate(lowest)]
+    return {
+        **rows,
+        "seconds": np.cumsum(rows["seconds"]),
+        "simulated": simulated,
+        "substeps": simulated * sim["substeps"],
+        "best_score": best,
+        "episodes": rows["episodes"] + 1,
+    }
 
 
-def band(tables: Sequence[pd.DataFrame], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
+def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
     """Return mean and spread of a column over runs, between where all have begun and the first one ends.
 
     Args:
@@ -95,7 +106,8 @@ def band(tables: Sequence[pd.DataFrame], axis: str, column: str, *, floor: float
         The band on the union of the runs' points, between which their values are interpolated; None without
         runs.
     """
-    curves = [(table[axis].to_numpy(float), table[column].to_numpy(float)) for table in tables if len(table)]
+    pairs = ((np.asarray(table[axis], float), np.asarray(table[column], float)) for table in tables)
+    curves = [(x, y) for x, y in pairs if len(x)]
     if not curves:
         return None
     low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)

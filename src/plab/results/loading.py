@@ -7,19 +7,19 @@ import stat
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import h5py
 import numpy as np
 import pandas as pd
 
 from plab.reading import member_bytes
+from plab.results.database import COLUMNS, Database, Row
 from plab.results.files import explained, opened, opened_archive, opened_image, split_archive
 from plab.results.hdf5 import attributes, columns, length, numbers, take
-from plab.results.index import Index
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
@@ -30,33 +30,28 @@ from plab.results.schema import (
     stored_config,
     stored_hash,
 )
+from plab.results.store import File
+from plab.results.workers import each
 from plab.selection import lookup
 
-__all__ = ["Row", "load", "members", "read_rows", "readable_rows", "rows", "run_files"]
+__all__ = [
+    "Row",
+    "counting_files",
+    "load",
+    "members",
+    "read_each",
+    "read_rows",
+    "readable_rows",
+    "rows",
+    "run_files",
+    "up_to_date",
+    "warn_of",
+]
 
-_SUMMARY_COLUMNS = (
-    "task",
-    "variant",
-    "method",
-    "seed",
-    "status",
-    "message",
-    "score",
-    "iou",
-    "loss",
-    "iterations",
-    "best_iteration",
-    "best_loss",
-    "seconds",
-    "started",
-    "device",
-    "precision",
-    "batch",
-    "plab",
-    "git_commit",
-    "config_hash",
-    "path",
-)
+T = TypeVar("T")
+
+_LOOKS = 3
+"""How often a folder is looked through at most while runs end in it."""
 
 _ORIGIN = {
     "started": "start_time",
@@ -71,26 +66,8 @@ _ORIGIN = {
 _NAMES = frozenset(_ORIGIN.values())
 
 
-@dataclass(frozen=True)
-class Row:
-    """What a table of runs says about one of them.
-
-    Attributes:
-        values: Value of each column of :func:`load`.
-        config: The run's configuration.
-    """
-
-    values: dict[str, Any]
-    config: dict[str, Any]
-
-    @property
-    def path(self) -> Path:
-        """The run's file, or its place in an archive."""
-        return Path(self.values["path"])
-
-
 def load(
-    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
+    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, database: bool = True
 ) -> pd.DataFrame:
     """Load results, a row per run.
 
@@ -101,7 +78,7 @@ def load(
     Args:
         source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
         keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
-        index: Take rows of unchanged files from the index in the user's cache folder, and keep it up to date.
+        database: Take rows of unchanged files from the folder's database, and keep it up to date.
 
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
@@ -115,16 +92,21 @@ def load(
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
-    found, unreadable = rows(source, index=index)
+    found, unreadable = rows(source, database=database)
+    warn_of(unreadable)
+    table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
+    return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
+
+
+def warn_of(unreadable: Sequence[ResultsError]) -> None:
+    """Name what could not be read in one warning, as if by the caller's caller."""
     if unreadable:
         listed = "; ".join(str(error) for error in unreadable)
-        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=2)
-    table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
-    return pd.DataFrame(table, columns=None if table else [*_SUMMARY_COLUMNS, *keys])
+        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
 
 
 def rows(
-    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
+    source: str | Path | Sequence[str | Path] = "results", *, database: bool = True
 ) -> tuple[list[Row], list[ResultsError]]:
     """Return the rows of :func:`load` with their configurations, and what could not be read.
 
@@ -137,7 +119,7 @@ def rows(
     found: list[Row] = []
     unreadable: list[ResultsError] = []
     for root in map(Path, sources):
-        for entry in _all_rows(root, index):
+        for entry in _all_rows(root, database):
             if isinstance(entry, ResultsError):
                 unreadable.append(entry)
             else:
@@ -158,17 +140,30 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
     return found, unreadable
 
 
-def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result | None]]:
+@contextmanager
+def up_to_date(root: Path) -> Iterator[Database]:
+    """Open the database of a folder, and read the files that it does not know."""
+    for left in reversed(range(_LOOKS)):
+        with closing(Database(root, counting_files(root))) as known:
+            known.take(each(_read, known.changed))
+            if not known.missed or not left:
+                yield known
+                return
+            # Where a partial file was, there is a final one now; the others need not be read again.
+            known.save()
+
+
+def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
 
-    Beside each is what the system says of it; None where nothing can be read, such as of a link that leads in
-    a circle, or a folder that may not be searched.
+    Beside each is what the system says of it. A link that leads in a circle, a folder named like a file and
+    one that may not be searched are among them: reading says what is wrong.
 
     Raises:
         ResultsError: If there is nothing at ``root``.
     """
     try:
-        found = root.stat()
+        found = os.stat(root)
     except (FileNotFoundError, NotADirectoryError):
         raise ResultsError(f"there are no results: {root} does not exist") from None
     except OSError as error:
@@ -179,31 +174,51 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result | None]]:
     closed: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
         subfolders.sort()
+        place = Path(folder)
         wrong = {name for name in subfolders if name.endswith(SUFFIX)}
-        for name in sorted([*names, *wrong]):
-            if name.endswith((SUFFIX, ARCHIVE_SUFFIX)):
-                path = Path(folder, name)
-                try:
-                    yield path, None if name in wrong else path.stat()
-                except OSError:
-                    # A run that ends removes its partial file, any moment.
-                    if path.is_symlink() or os.path.lexists(path):
-                        yield path, None
+        for name in sorted(name for name in (*names, *wrong) if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
+            # By text: pathlib takes longer than the file system.
+            text = os.path.join(folder, name)
+            try:
+                yield place / name, os.stat(text)
+            except OSError:
+                # A run that ends removes its partial file, any moment; a link may lead in a circle.
+                with suppress(OSError):
+                    yield place / name, os.lstat(text)
     if root in closed:
         raise ResultsError(f"there are no results: {root} may not be read")
-    yield from ((path, None) for path in sorted(closed))
+    yield from ((path, os.lstat(path)) for path in sorted(closed))
+
+
+def counting_files(root: Path) -> list[File]:
+    """Return the files below a folder but for what is left of runs that have finished since."""
+    files = list(run_files(root))
+    partial = [path for path, _ in files if path.name.endswith(PARTIAL_SUFFIX)]
+    present = {path for path, _ in files} if partial else set()
+    ended = {path for path in partial if final_path(path) in present}
+    return [file for file in files if file[0] not in ended] if ended else files
 
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
     """Yield the rows of a result file or an archive, and what is wrong where there is none."""
+    return read_each(path, _row)
+
+
+def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T | ResultsError]:
+    """Yield something of a result file or of each run of an archive, and what is wrong where there is none.
+
+    Args:
+        path: The file.
+        extract: Takes it from an open file; is also given the path, of a run in an archive its place there.
+    """
     try:
         if path.name.endswith(ARCHIVE_SUFFIX):
             with opened_archive(path) as archive:
                 for name in members(archive):
-                    yield _member_row(archive, path, name)
+                    yield _of_member(archive, path, name, extract)
         else:
             with opened(path) as file:
-                yield _row(file, path)
+                yield extract(file, path)
     except ResultsError as error:
         yield error
 
@@ -216,27 +231,21 @@ def members(archive: zipfile.ZipFile) -> list[str]:
 # ---------------------------------------------------------------------------------------------------- details
 
 
-def _all_rows(root: Path, use_index: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, from the index where it knows them."""
-    paths = list(run_files(root))
-    known = Index(root) if use_index else None
-    present = {path for path, _ in paths}
-    for path, facts in paths:
-        if path.name.endswith(PARTIAL_SUFFIX) and final_path(path) in present:
-            continue
-        entry = None if known is None or facts is None else known.find(path, facts)
-        if entry is not None:
-            yield from (
-                Row(values | {"path": str(path / member)}, config) for member, values, config in entry
-            )
-            continue
-        fresh = list(read_rows(path))
-        sound = [row for row in fresh if isinstance(row, Row)]
-        if known is not None and facts is not None and len(sound) == len(fresh):
-            known.add(path, facts, [(row.path.relative_to(path), row.values, row.config) for row in sound])
-        yield from fresh
-    if known is not None:
+def _all_rows(root: Path, from_database: bool) -> Iterator[Row | ResultsError]:
+    """Yield the rows of all files below a folder, or of one file, from the database where it knows them."""
+    if not from_database:
+        for entries in each(_read, [path for path, _ in counting_files(root)]):
+            yield from entries or ()
+        return
+    with up_to_date(root) as known:
         known.save()
+        yield from known.rows()
+
+
+def _read(path: Path) -> list[Row | ResultsError] | None:
+    """Return what a file holds, None if it is gone: a run that ends removes its partial file, any moment."""
+    entries = list(read_rows(path))
+    return entries if os.path.lexists(path) else None
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:
@@ -259,12 +268,14 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
     return kept
 
 
-def _member_row(archive: zipfile.ZipFile, path: Path, name: str) -> Row | ResultsError:
+def _of_member(
+    archive: zipfile.ZipFile, path: Path, name: str, extract: Callable[[h5py.File, Path], T]
+) -> T | ResultsError:
     try:
         with explained(path / name):
             image = member_bytes(archive, name)
         with opened_image(image, path / name) as file:
-            return _row(file, path / name)
+            return extract(file, path / name)
     except ResultsError as error:
         return error
 
@@ -289,7 +300,7 @@ def _row(file: h5py.File, path: Path) -> Row:
         "config_hash": stored_hash(take(own, "config_hash", str)),
         "path": str(path),
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
-    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in _SUMMARY_COLUMNS}
+    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):

@@ -80,7 +80,7 @@ def _of_run(row: Row) -> Entry:
 
 def steps_to_best(row: Row) -> int:
     """Return after how many simulated environment steps a run found its best actions."""
-    return int(load_rows(row.path)["simulated"].iloc[row.values["best_iteration"]])
+    return int(load_rows(row.path)["simulated"][row.values["best_iteration"]])
 
 
 def from_policies(
