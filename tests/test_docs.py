@@ -16,8 +16,10 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
+from PIL import Image, ImageColor
 
 from plab.config import choices, load_config
+from plab.report import methods
 from plab.run import _parse as parse_run
 from plab.selection import select
 
@@ -171,3 +173,10 @@ def test_python_that_is_shown_parses_and_imports_what_there_is(code):
             # As the statement does: what the module has, or else a module of the package.
             if not hasattr(module, name):
                 importlib.import_module(f"{node.module}.{name}")
+
+
+def test_the_curves_that_are_shown_have_the_colours_of_the_methods():
+    with Image.open(ROOT / "docs" / "images" / "reward_per_task.png") as picture:
+        seen = {color for _, color in picture.convert("RGB").getcolors(picture.width * picture.height)}
+    wanted = [methods.method(name).colour for name in ("adam", "gd", "adam_h", "ppo")]
+    assert seen >= set(map(ImageColor.getrgb, wanted))

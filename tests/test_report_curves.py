@@ -68,7 +68,7 @@ def test_axes_of_a_run(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------------------------------------- budgets
 
 
-def test_the_best_so_far_is_that_of_the_familys_ranking() -> None:
+def test_the_best_so_far_is_that_of_the_ranking_of_a_family() -> None:
     rows = pd.DataFrame({"loss": [5.0, 3.0, 4.0, 2.0], "score": [0.4, 0.1, 0.6, 0.3]})
     rows = rows.assign(episodes=range(4), steps=range(4), seconds=1.0)
     budgets = {"steps_forward": [10, 20, 30, 40], "steps_gradient": [0, 5, 5, 10]}
