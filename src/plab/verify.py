@@ -109,7 +109,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("arguments", nargs="+", help=what)
     what = "run the policies in the files: programs of other people, so do it where they can do no harm"
     parser.add_argument("--run-policies", action="store_true", help=what)
-    parser.add_argument("--float32", action="store_true", help="leave float64 out: two thirds of the time")
+    parser.add_argument("--float32", action="store_true", help="leave float64 out")
     options = parser.parse_intermixed_args(argv)
     if all("=" in word for word in options.arguments):
         parser.error("name a submission, or a folder of them")
