@@ -152,7 +152,10 @@ def test_many_files_are_read_by_several_processes_in_order(folder: Path, monkeyp
 
     @functools.wraps(here)
     def wait(path: Path):
-        while not answers:
+        # At most a minute: then the assertions below say what is wrong.
+        for _ in range(6000):
+            if answers:
+                break
             time.sleep(0.01)
         return here(path)
 
