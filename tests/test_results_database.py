@@ -473,7 +473,7 @@ def test_targets_of_users_are_named_and_not_held(tmp_path: Path) -> None:
         ("pragma journal_mode = wal", "the tables are only for reading: write a select"),
         ("vacuum into 'copy.sqlite'", "the tables are only for reading: write a select"),
         ("create temp table mine (x)", "the tables are only for reading: write a select"),
-        ("selec task", 'near "selec": syntax error'),
+        ("select from", 'near "from": syntax error'),
         ("select lr from runs", "no such column: lr"),
         (
             "select * from scores",
