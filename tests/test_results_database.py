@@ -95,7 +95,7 @@ def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list
 
 def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
     # Numbers and texts that SQLite has not, or has otherwise.
-    for seed, message in enumerate(["", "a\nb", "\udce9 caf\u00e9", 'quo"ted']):
+    for seed, message in enumerate(["", "a\nb", "\udce9 \u00e9t\u00e9", 'in "quotes"']):
         made = synthetic.run(tmp_path, seed=seed)
         made.config["task"]["limit"], made.config["seed_scene"] = float("inf"), 2**70
         made.config["results_dir"] = f"{tmp_path}/\udce9"
