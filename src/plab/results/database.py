@@ -227,7 +227,7 @@ class Database:
 
     def _refer(self, section: dict[str, Any], name: str) -> int:
         """Return what stands for a section, which many runs share."""
-        # Tells 1 from 1.0 as JSON does, in a tenth of the time; another format of it has no references.
+        # Tells 1 from 1.0 as JSON does, in an eighth of the time; another format of it has no references.
         known = name, marshal.dumps(section, 2)
         number = self._numbers.get(known)
         if number is None:
