@@ -283,7 +283,7 @@ def test_particles_scale():
     def count(scale: float) -> int:
         return build_scene(load_config([f"sim.particles_scale={scale}"])).particle_count
 
-    assert (count(0.1), count(1), count(2.5), count(1e-9)) == (1000, 10000, 25000, 1)
+    assert (count(0.1), count(1), count(2.5), count(5e-5)) == (1000, 10000, 25000, 1)
 
 
 def test_scalar_overrides_reach_the_scene():

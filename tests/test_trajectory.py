@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.config import Config, load_config
+from plab.config import Config, ConfigError, load_config
 from plab.families import FAMILIES
 from plab.objective import scores
 from plab.problem import Problem
@@ -259,8 +259,12 @@ def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Pat
     assert_same_numbers(read(result_path(cfg)), finished)
 
 
-@pytest.mark.parametrize("error", [SimulationError, MemoryError])
-def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: type[Exception]) -> None:
+@pytest.mark.parametrize(
+    ("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)], ids=["state", "memory"]
+)
+def test_a_rollout_that_fails_ends_the_run(
+    tmp_path: Path, monkeypatch, error: type[Exception], raised: type[Exception]
+) -> None:
     cfg = make_config(tmp_path)
     intact, calls = Simulator.rollout, iter(range(1_000))
 
@@ -270,7 +274,7 @@ def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: t
         return intact(self, actions, **options)
 
     monkeypatch.setattr(Simulator, "rollout", rollout)
-    with pytest.raises(RunError) as caught:
+    with pytest.raises(raised) as caught:
         run_config(cfg)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"
     left = read(result_path(cfg).with_suffix(".partial.h5"))
