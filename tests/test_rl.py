@@ -423,7 +423,7 @@ def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
 def test_a_policy_from_outside_needs_its_module(finished: dict[str, RunResult], monkeypatch) -> None:
     monkeypatch.setattr(sys, "path", [path for path in sys.path if "own_rl" not in path])
     monkeypatch.delitem(sys.modules, "tqc")
-    with pytest.raises(ResultsError, match=r"\.policy\.npz: its method is tqc:FAMILY, .*: import tqc before"):
+    with pytest.raises(ResultsError, match=r"its method is 'tqc:FAMILY', outside plab: import 'tqc' before"):
         load_policy(finished["tqc"].path)
     monkeypatch.undo()
     load_policy(finished["tqc"].path)

@@ -353,7 +353,7 @@ def test_no_file_chooses_what_is_imported(tmp_path: Path, monkeypatch) -> None:
     text = str(arrays["header"]).replace('"family": "rl"', '"family": "zz_evil:FAMILY"')
     np.savez(path, **arrays | {"header": np.array(text)})
     assert said(lambda: load_policy(path.with_name("run.h5"))) == (
-        f"{path}: its method is zz_evil:FAMILY, outside plab: import zz_evil before"
+        f"{path}: its method is 'zz_evil:FAMILY', outside plab: import 'zz_evil' before"
     )
     run = synthetic.run(tmp_path / "results")
     run.config["method"]["family"] = "zz_evil:FAMILY"

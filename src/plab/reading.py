@@ -22,6 +22,7 @@ __all__ = [
     "LARGEST",
     "UnreadableError",
     "member_bytes",
+    "one_line",
     "opened_zip",
     "read_array",
     "read_arrays",
@@ -45,6 +46,12 @@ _HEADER = 4096
 
 class UnreadableError(ValueError):
     """A file that is not what it should be; the message is the reason alone, without the file's name."""
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says in one line of bounded length, without what a terminal would act on."""
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return " ".join(text.split())[:300] or type(error).__name__
 
 
 def regular_file(path: Path) -> os.stat_result:

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.reading import LARGEST, UnreadableError, member_bytes, opened_zip, regular_file
+from plab.reading import LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
 from plab.results.hdf5 import array, attributes, columns, groups, numbers, take, tree
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
@@ -291,14 +291,9 @@ def explained(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ResultsError(f"{path} may not be read ({error.strerror or error})") from error
     except UnreadableError as error:
-        raise ResultsError(f"{path} cannot be read: {_one_line(error)}") from error
+        raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
     except _UNREADABLE as error:
-        raise ResultsError(f"{path} is truncated or damaged ({_one_line(error)})") from error
-
-
-def _one_line(error: BaseException) -> str:
-    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
-    return " ".join(text.split())[:300] or type(error).__name__
+        raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
 
 
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:

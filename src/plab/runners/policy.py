@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import get_device
 
 from plab.config import ConfigError, RlConfig
 from plab.families import FAMILIES, family
-from plab.reading import read_arrays
+from plab.reading import one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.files import replace_file
 from plab.runners.model_state import module_arrays, restore_module
@@ -136,9 +136,8 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
     except ResultsError:
         raise
     except _BROKEN as error:
-        reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise ResultsError(
-            f"{path} is no policy of plab's ({reason}): run it again with force=true"
+            f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
         ) from error
     # What the device answers says nothing about the file.
     policy.network = policy.network.to(get_device(device))
@@ -173,7 +172,7 @@ def _method(section: Any, path: Path) -> RlConfig:
         raise ValueError("its method has no family")
     # A file does not choose what is imported.
     if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
-        raise ResultsError(f"{path}: its method is {name}, outside plab: import {module} before")
+        raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} before")
     if "${" in json.dumps(section):
         raise ValueError("its method refers to something else")
     try:
@@ -181,7 +180,7 @@ def _method(section: Any, path: Path) -> RlConfig:
         method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section))
         cast(RlConfig, method).check("method")
     except ConfigError as error:
-        raise ResultsError(f"{path}: {error}") from error
+        raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
         raise ValueError(f"its method is none: {(error.msg or str(error)).splitlines()[0]}") from error
     if not isinstance(method, RlConfig):
