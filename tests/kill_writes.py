@@ -1,16 +1,22 @@
-"""Simulated runs killed at their writes, again and again: python tests/kill_writes.py ROUNDS [CASE ...].
+"""Simulated runs killed at their writes, again and again:
+python tests/kill_writes.py DEATHS KILLS [CASE ...]
 
-Each round starts a run, or a batch of runs, in a process of its own, which kills itself by SIGKILL at a
-random one of its changes to files (:mod:`faults`), in the middle of a write too. The next round goes on with
-what is left, until a process comes through to its end. Then every file has to be, byte for byte, what an
-undisturbed process has left, times and provenance set apart, and there may be no other. Processes are forked
-from one that has imported everything and started nothing.
+Each round starts a run, or a batch of runs, which ends at a random one of its changes to files
+(:mod:`faults`), in the middle of a write too; the next round goes on with what is left, until one comes
+through. Then every file has to be, byte for byte, what an undisturbed process has left, times and provenance
+set apart, and there may be no other.
+
+KILLS are by SIGKILL, each in a process of its own, forked from one that has imported everything and started
+nothing. DEATHS are in one process, which costs a tenth: from the event on no file can be changed, everything
+else is forgotten, and only compiled simulators are kept.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
+import math
 import os
 import random
 import shutil
@@ -35,7 +41,10 @@ from faults import watched
 from plab.config import Config, load_config
 from plab.results import read, result_path
 from plab.results.files import encode
+from plab.reuse import SimulatorCache
 from plab.runners import run_batch, run_config
+
+Ended = Callable[[str, Path, int], bool]
 
 PATIENCE = 300.0
 """Time after which a process has come to a stop [s]."""
@@ -74,11 +83,11 @@ def configs(case: str, folder: Path) -> list[Config]:
     return [load_config([*COMMON, *words, f"seed={seed}", f"results_dir={folder}"]) for seed in range(runs)]
 
 
-def carry_out(cfgs: list[Config]) -> None:
+def carry_out(cfgs: list[Config], cache: SimulatorCache | None = None) -> None:
     if len(cfgs) == 1:
-        run_config(cfgs[0])
+        run_config(cfgs[0], cache)
         return
-    ended = run_batch(cfgs)
+    ended = run_batch(cfgs, cache=cache)
     assert all(one.finished for one in ended), ended
 
 
@@ -110,48 +119,49 @@ class _Killer:
 
     def __call__(self, kind: str, path: str) -> None:
         if self.kinds.total() == self._at:
-            os.kill(os.getpid(), signal.SIGKILL)
+            self.end()
         self.kinds[kind] += 1
 
+    def end(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
 
-def start(cfgs: list[Config], folder: Path, at: int, last: Callable[[Counter[str]], None]) -> int:
-    """Carry out runs in a process of their own.
 
-    Args:
-        cfgs: The runs.
-        folder: Where they are watched.
-        at: Number of the event that they are killed at; -1 for none.
-        last: Called in that process when it has come through, with how many events there were of each kind.
+class Death(BaseException):
+    """What ends a run at an event, and keeps whoever cleans up from doing so."""
 
-    Returns:
-        Its exit code, negative if it was killed.
-    """
+
+class _Death(_Killer):
+    """Ends what is under way without ending the process: nothing can be changed any more."""
+
+    def end(self) -> None:
+        raise Death
+
+
+def apart(work: Callable[[], object], patience: float = PATIENCE) -> int:
+    """Do something in a process of its own; returns its exit code, negative if it was killed."""
     child = os.fork()
     if child == 0:
         code = 99
         try:
             with open(os.devnull, "w") as nowhere:
                 os.dup2(nowhere.fileno(), 1)
-            killer = _Killer(at)
-            with watched(folder, killer):
-                carry_out(cfgs)
-            last(killer.kinds)
+            work()
             code = 0
         except BaseException:
             traceback.print_exc()
         finally:
             sys.stderr.flush()
             os._exit(code)
-    return _wait(child)
+    return _wait(child, patience)
 
 
-def _wait(child: int) -> int:
+def _wait(child: int, patience: float) -> int:
     begin = time.monotonic()
     while not (ended := os.waitpid(child, os.WNOHANG))[0]:
-        if time.monotonic() - begin > PATIENCE:
+        if time.monotonic() - begin > patience:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-            raise AssertionError(f"a process has not ended after {PATIENCE:.0f} s")
+            raise AssertionError(f"a process has not ended after {patience:.0f} s")
         time.sleep(0.005)
     return os.waitstatus_to_exitcode(ended[1])
 
@@ -159,46 +169,85 @@ def _wait(child: int) -> int:
 def undisturbed(case: str, folder: Path) -> tuple[dict[str, bytes], Counter[str]]:
     """Return what an undisturbed process leaves, and how many events of each kind it has."""
     folder.mkdir(parents=True)
+    noted = folder.with_suffix(".json")
 
-    def last(kinds: Counter[str]) -> None:
+    def work() -> None:
         import taichi
 
+        counter = _Killer(-1)
+        with watched(folder, counter):
+            carry_out(configs(case, folder))
+        noted.write_text(json.dumps(counter.kinds))
         # Keeps the compiled kernels for those that come next.
         taichi.reset()
-        folder.with_suffix(".json").write_text(json.dumps(kinds))
 
-    assert start(configs(case, folder), folder, -1, last) == 0, case
-    return contents(folder), Counter(json.loads(folder.with_suffix(".json").read_text()))
+    assert apart(work) == 0, case
+    return contents(folder), Counter(json.loads(noted.read_text()))
 
 
-def loop(rounds: int, cases: list[str], rng: random.Random) -> Counter[str]:
-    """Kill at least ``rounds`` times; returns how often what happened. Raises AssertionError if something is
-    wrong."""
+Wanted = dict[str, tuple[dict[str, bytes], Counter[str]]]
+"""What undisturbed processes leave, and how many events they have, by case."""
+
+
+def killed(case: str, folder: Path, at: int) -> bool:
+    """Carry out runs in a process of its own; returns whether it was killed, at an event of this number."""
+
+    def work() -> None:
+        with watched(folder, _Killer(at)):
+            carry_out(configs(case, folder))
+
+    code = apart(work)
+    assert code in (0, -signal.SIGKILL), f"exit code {code}"
+    return code != 0
+
+
+def died(case: str, folder: Path, at: int, cache: SimulatorCache) -> bool:
+    """Carry out runs in this process; returns whether they died, at an event of this number."""
+    try:
+        with watched(folder, _Death(at)):
+            carry_out(configs(case, folder), cache)
+    except Death:
+        return True
+    finally:
+        # Locks that nothing refers to are free, as are those of a process that is gone.
+        gc.collect()
+    return False
+
+
+def loop(wanted: Wanted, rounds: int, rng: random.Random, ended_early: Ended) -> Counter[str]:
+    """End runs at least ``rounds`` times, the cases in turns; returns how often what happened.
+
+    Args:
+        wanted: What is to come out.
+        rounds: How many ends, at least.
+        rng: Chooses the events.
+        ended_early: Carries out runs, given their folder and the number of an event; says whether they ended
+            there.
+
+    Raises:
+        AssertionError: If something is wrong.
+    """
     count: Counter[str] = Counter()
     home = Path(tempfile.mkdtemp(prefix="kill_writes_"))
-    wanted = {case: undisturbed(case, home / "undisturbed" / case) for case in cases}
-    for case, (_, kinds) in wanted.items():
-        print(f"{case}: {kinds.total()} events: {dict(kinds)}", flush=True)
-    while count["killed"] < rounds:
+    while count["ended early"] < rounds:
         for case, (want, kinds) in wanted.items():
             folder = home / "killed"
             folder.mkdir()
-            cfgs = configs(case, folder)
-            # Up to two thirds of an undisturbed run's events: most are killed several times.
-            while code := start(cfgs, folder, rng.randrange(kinds.total() * 2 // 3), lambda kinds: None):
-                assert code == -signal.SIGKILL, f"{case}: exit code {code}"
-                count["killed"] += 1
-                count[f"killed in {case}"] += 1
+            # Up to two thirds of an undisturbed run's events: most end several times.
+            while ended_early(case, folder, rng.randrange(kinds.total() * 2 // 3)):
+                count["ended early"] += 1
+                count[f"{case} ended early"] += 1
                 _assert_readable(folder)
             got = contents(folder)
             assert got.keys() == want.keys(), f"{case}: {sorted(got.keys() ^ want.keys())}"
             for name, content in want.items():
                 assert got[name] == content, f"{case}: {name} differs"
             count["completed and compared"] += 1
-            resumed = (read(result_path(cfg)).provenance["resumed"] for cfg in cfgs)
+            resumed = (read(result_path(cfg)).provenance["resumed"] for cfg in configs(case, folder))
             count["resumptions in their files"] += sum(map(int, resumed))
             shutil.rmtree(folder)
-            if count["killed"] >= rounds:
+            print(f"{case}: {count['ended early']} of {rounds}", file=sys.stderr, flush=True)
+            if count["ended early"] >= rounds:
                 break
     shutil.rmtree(home)
     return count
@@ -211,9 +260,34 @@ def _assert_readable(folder: Path) -> None:
     assert not list(folder.rglob("*.bad*"))
 
 
-if __name__ == "__main__":
-    began = time.monotonic()
-    done = loop(int(sys.argv[1]), sys.argv[2:] or list(CASES), random.Random(0))
-    for what, times in done.items():
-        print(f"{times:6d} {what}")
+def main(deaths: int, kills: int, cases: list[str]) -> None:
+    """Do both; raises AssertionError if something is wrong."""
+    home, began = Path(tempfile.mkdtemp(prefix="kill_writes_")), time.monotonic()
+    wanted = {case: undisturbed(case, home / case) for case in cases}
+    for case, (_, kinds) in wanted.items():
+        print(f"{case}: {kinds.total()} events: {dict(kinds)}", flush=True)
+    if deaths:
+        told, caches = home / "deaths.json", {case: SimulatorCache() for case in cases}
+
+        def die(case: str, folder: Path, at: int) -> bool:
+            return died(case, folder, at, caches[case])
+
+        def work() -> None:
+            told.write_text(json.dumps(loop(wanted, deaths, random.Random(0), die)))
+
+        assert apart(work, patience=math.inf) == 0
+        _show("deaths", Counter(json.loads(told.read_text())))
+    if kills:
+        _show("kills", loop(wanted, kills, random.Random(1), killed))
+    shutil.rmtree(home)
     print(f"{time.monotonic() - began:6.0f} seconds")
+
+
+def _show(title: str, count: Counter[str]) -> None:
+    print(title)
+    for what, times in count.items():
+        print(f"{times:6d} {what}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]), sys.argv[3:] or list(CASES))

@@ -17,9 +17,9 @@ pytestmark = [
 SCRIPT = Path(__file__).parent / "kill_writes.py"
 
 
-def killed(rounds: int, *cases: str) -> None:
+def rounds(deaths: int, kills: int, *cases: str) -> None:
     done = subprocess.run(
-        [sys.executable, SCRIPT, str(rounds), *cases],
+        [sys.executable, SCRIPT, str(deaths), str(kills), *cases],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
@@ -27,13 +27,15 @@ def killed(rounds: int, *cases: str) -> None:
     )
     print(done.stdout)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    assert any(line.split(maxsplit=1)[1:] == ["killed"] for line in done.stdout.splitlines())
+    lines = [line.split(maxsplit=1) for line in done.stdout.splitlines()]
+    ended = [int(line[0]) for line in lines if line[1:] == ["ended early"]]
+    assert all(have >= want for have, want in zip(ended, filter(None, (deaths, kills)), strict=True))
 
 
 def test_a_few_kills_of_a_run_with_a_replay_buffer() -> None:
-    killed(4, "sac")
+    rounds(12, 2, "sac")
 
 
 @pytest.mark.slow
 def test_kills_at_any_write_of_every_kind_of_run() -> None:
-    killed(210)
+    rounds(210, 30)
