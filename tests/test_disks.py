@@ -495,7 +495,7 @@ def test_folders_of_any_name(toy: Configs, tmp_path, monkeypatch, capsys, name: 
     assert summary(capsys.readouterr().out) == "4 runs: 0 finished, 4 finished before"
     table = load(where)
     assert [Path(path).parent for path in table["path"]] == [where / "Rope-v1" / "adam"] * 4
-    archive = tmp_path / f"{name}.plab.zip"
+    archive = tmp_path / f"{name}.plab.zip.xz"
     assert results.main(["pack", str(where), "--output", str(archive)]) == 0
     assert load(archive)["score"].tolist() == table["score"].tolist()
     assert results.main(["unpack", str(archive), "--output", str(tmp_path / f"{name} again")]) == 0

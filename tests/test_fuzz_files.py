@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
 import traceback
 import warnings
 import zipfile
@@ -69,8 +70,8 @@ def make_archive(folder: Path) -> Path:
     """An archive of two runs."""
     for seed in (0, 1):
         synthetic.save(synthetic.run(folder / "runs", seed=seed))
-    pack(folder / "runs", folder / "all.plab.zip")
-    return folder / "all.plab.zip"
+    pack(folder / "runs", folder / "all.plab.zip.xz")
+    return folder / "all.plab.zip.xz"
 
 
 def make_target(folder: Path) -> Path:
@@ -400,11 +401,14 @@ def npy(array: Any) -> bytes:
 MEMBERS = ("gone", "twice", "up", "root", "bomb", "zip", "folder", "empty", "packed", "text")
 
 
+XZ = b"\xfd7zXZ"
+"""How an archive begins."""
+
+
 def changed_zip(content: bytes, change: tuple[float, str]) -> bytes:
     """Change a member of a zip file, or what its name is."""
     share, how = change
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = [(name, archive.read(name)) for name in archive.namelist()]
+    members = members_of(content)
     at = int(share * len(members))
     name, own = members.pop(at)
     new = {
@@ -419,7 +423,8 @@ def changed_zip(content: bytes, change: tuple[float, str]) -> bytes:
         "packed": [(name, own)],
         "text": [(name, b"hello")],
     }[how]
-    return zipped([*members[:at], *new, *members[at:]], zipfile.ZIP_LZMA if how == "packed" else None)
+    changed = zipped([*members[:at], *new, *members[at:]], zipfile.ZIP_LZMA if how == "packed" else None)
+    return packed_as(content, changed)
 
 
 def zipped(members: list[tuple[str, bytes]], method: int | None = None) -> bytes:
@@ -436,11 +441,23 @@ def zipped(members: list[tuple[str, bytes]], method: int | None = None) -> bytes
 def changed_member(content: bytes, change: tuple[float, Callable[[bytes], bytes]]) -> bytes:
     """Change what a member of a zip file holds."""
     share, edit = change
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        members = [(name, archive.read(name)) for name in archive.namelist()]
+    members = members_of(content)
     at = int(share * len(members))
     members[at] = members[at][0], edit(members[at][1])
-    return zipped(members)
+    return packed_as(content, zipped(members))
+
+
+def members_of(content: bytes) -> list[tuple[str, bytes]]:
+    """Return the members of a zip file, or of an archive, which is one that xz has packed."""
+    if content.startswith(XZ):
+        content = lzma.decompress(content)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return [(name, archive.read(name)) for name in archive.namelist()]
+
+
+def packed_as(content: bytes, changed: bytes) -> bytes:
+    """Pack a changed zip file as the one before was."""
+    return lzma.compress(changed) if content.startswith(XZ) else changed
 
 
 def changed_header(content: bytes, change: tuple[float, str]) -> bytes:

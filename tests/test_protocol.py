@@ -353,7 +353,7 @@ def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
     moved[:, 0] += 0.05
     np.save(folder / "Torus3D-v1.npy", spread_mass(moved, 16, world.particle_mass, "release"))
     run_config(cfg)
-    archive = tmp_path / "a.plab.zip"
+    archive = tmp_path / "a.plab.zip.xz"
     pack(results, archive, keep_masses=True)
     for row in (*rows(results)[0], *rows(archive)[0]):
         run = read(row.path)

@@ -134,7 +134,7 @@ def test_unfinished_and_other_runs_are_counted_not_used(folder: Path) -> None:
 
 
 def test_archive_gives_the_same_digest_and_tables(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive)
     loose, packed = gather(folder), gather(archive)
     assert loose.digest == packed.digest

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import lzma
 import subprocess
 import sys
 import zipfile
@@ -32,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_archive_loads_like_the_folder(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "out" / "all.plab.zip"
+    archive = tmp_path / "out" / "all.plab.zip.xz"
     done = pack(folder, archive)
     assert done.runs == 2 and not done.unreadable
     assert done.archive_bytes == archive.stat().st_size < done.file_bytes
@@ -54,7 +56,7 @@ def test_archive_loads_like_the_folder(folder: Path, tmp_path: Path) -> None:
 
 
 def test_masses_and_state_can_be_kept(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive, wanted=lambda row: True, keep_masses=True, keep_resume=True)
     table = load(archive).set_index(["method", "seed"])
     assert read(table.loc[("adam", 0), "path"]).masses["final"][3, 4, 5] == 0.5
@@ -64,17 +66,17 @@ def test_masses_and_state_can_be_kept(folder: Path, tmp_path: Path) -> None:
 
 def test_folder_with_file_and_archive_of_the_same_run_has_it_once(folder: Path) -> None:
     before = load(folder)
-    pack(folder, folder / "a.plab.zip", wanted=lambda row: True)
-    pack(folder, folder / "b.plab.zip")
+    pack(folder, folder / "a.plab.zip.xz", wanted=lambda row: True)
+    pack(folder, folder / "b.plab.zip.xz")
     pd.testing.assert_frame_equal(load(folder), before)
     for path in folder.rglob("seed*.h5"):
         path.unlink()
     left = load(folder)
-    assert len(left) == 3 and left["path"].str.contains("a.plab.zip").all()
+    assert len(left) == 3 and left["path"].str.contains("a.plab.zip.xz").all()
 
 
 def test_finished_run_in_an_archive_hides_its_beginning(folder: Path) -> None:
-    pack(folder, folder / "a.plab.zip")
+    pack(folder, folder / "a.plab.zip.xz")
     path = Path(load(folder).query("status == 'finished'")["path"].iloc[0])
     begun = dataclasses.replace(read(path), status="running", evaluation={})
     path.unlink()
@@ -85,7 +87,7 @@ def test_finished_run_in_an_archive_hides_its_beginning(folder: Path) -> None:
 
 
 def test_packing_again_adds_what_is_new_and_is_reproducible(folder: Path) -> None:
-    archive = folder / "all.plab.zip"
+    archive = folder / "all.plab.zip.xz"
     pack(folder, archive)
     image = archive.read_bytes()
     pack(folder, archive)
@@ -98,7 +100,7 @@ def test_packing_again_adds_what_is_new_and_is_reproducible(folder: Path) -> Non
 
 
 def test_unpacked_files_are_result_files(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive, wanted=lambda row: True, keep_resume=True)
     out = tmp_path / "out"
     assert unpack(archive, out) == (3, 0)
@@ -107,14 +109,14 @@ def test_unpacked_files_are_result_files(folder: Path, tmp_path: Path) -> None:
     assert names == {path.relative_to(folder) for path in folder.rglob("*.h5")}
     again = RunFile(synthetic.config(out))
     assert again.finished
-    with zipfile.ZipFile(archive) as members:
+    with zipfile.ZipFile(io.BytesIO(lzma.decompress(archive.read_bytes()))) as members:
         assert {Path(name) for name in members.namelist()} == names
 
 
 def test_a_run_that_leads_out_of_the_folder_is_not_packed(folder: Path, tmp_path: Path) -> None:
     config = synthetic.config(folder, task="../../../away")
     synthetic.write(dataclasses.replace(synthetic.run(folder), config=config), folder / "away.h5")
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     with pytest.raises(ResultsError) as caught:
         pack(folder, archive, wanted=lambda row: "away" in row.values["task"])
     assert str(caught.value) == (
@@ -125,7 +127,7 @@ def test_a_run_that_leads_out_of_the_folder_is_not_packed(folder: Path, tmp_path
 
 
 def test_a_link_in_a_folder_does_not_lead_out_of_it(folder: Path, tmp_path: Path) -> None:
-    archive, out = tmp_path / "all.plab.zip", tmp_path / "out"
+    archive, out = tmp_path / "all.plab.zip.xz", tmp_path / "out"
     pack(folder, archive)
     (tmp_path / "elsewhere").mkdir()
     out.mkdir()
@@ -136,7 +138,7 @@ def test_a_link_in_a_folder_does_not_lead_out_of_it(folder: Path, tmp_path: Path
 
 
 def test_damaged_member_is_left_out_and_named(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive)
     image = bytearray(archive.read_bytes())
     image[400:420] = b"x" * 20
@@ -152,14 +154,14 @@ def test_damaged_member_is_left_out_and_named(folder: Path, tmp_path: Path) -> N
 
 
 def test_member_that_is_not_there_is_an_error(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     pack(folder, archive)
     with pytest.raises(ResultsError, match=r"holds no run nothing\.h5"):
         read(archive / "nothing.h5")
 
 
 def test_command_line(folder: Path, tmp_path: Path, capsys) -> None:
-    archive = str(tmp_path / "some.plab.zip")
+    archive = str(tmp_path / "some.plab.zip.xz")
     assert main(["pack", str(folder), "task=Rope", "--output", archive, "status=all", "seed=0,1"]) == 0
     assert "2 run(s)" in capsys.readouterr().out
     assert set(load(archive)["status"]) == {"finished", "stopped"}
@@ -171,7 +173,7 @@ def test_command_line(folder: Path, tmp_path: Path, capsys) -> None:
         (["pack", str(folder), "task=Nothing", "--output", archive], "task 'Nothing' does not exist"),
         (["pack", str(folder), "seed=77", "--output", archive], "nothing to pack"),
         (["pack", str(folder), "tusk=Rope", "--output", archive], "choose from: task"),
-        (["pack", str(folder), "--output", "all.zip"], "ends in .plab.zip"),
+        (["pack", str(folder), "--output", "all.zip"], "ends in .plab.zip.xz"),
         (["pack", str(tmp_path / "none"), "--output", archive], "does not exist"),
     ):
         capsys.readouterr()
@@ -186,7 +188,7 @@ def test_commands_start_without_torch_and_taichi() -> None:
 
 
 def test_iterations_can_be_rounded(folder: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "all.plab.zip"
+    archive = tmp_path / "all.plab.zip.xz"
     assert main(["pack", str(folder), "--digits", "3", "--output", str(archive)]) == 0
     loose, packed = load(folder).query("status == 'finished'"), load(archive)
     for a, b in zip(loose["path"], packed["path"], strict=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import zipfile
 from pathlib import Path
 
 import h5py
@@ -143,25 +142,22 @@ def test_command_goes_on_after_what_is_wrong(tmp_path: Path, capsys) -> None:
 
 
 def test_archives_are_checked_run_by_run(tmp_path: Path, capsys) -> None:
-    results, archive = tmp_path / "results", tmp_path / "a.plab.zip"
+    results, archive = tmp_path / "results", tmp_path / "a.plab.zip.xz"
     synthetic.save(_evaluation(synthetic.run(results), score=0.5))
     synthetic.save(synthetic.run(results, seed=1))
     pack(results, archive)
     assert main(["check", str(archive)]) == 1
-    assert "a.plab.zip/Rope-v1/adam/seed0-" in capsys.readouterr().out
+    assert "a.plab.zip.xz/Rope-v1/adam/seed0-" in capsys.readouterr().out
     archive.write_bytes(archive.read_bytes()[:100])
     assert main(["check", str(archive)]) == 1
     assert "get it again" in capsys.readouterr().out
 
 
 def test_a_damaged_stream_in_an_archive_is_told(tmp_path: Path, capsys) -> None:
-    archive = tmp_path / "a.plab.zip"
+    archive = tmp_path / "a.plab.zip.xz"
     pack(synthetic.save(synthetic.run(tmp_path / "results")), archive)
-    with zipfile.ZipFile(archive) as members:
-        (member,) = members.namelist()
     image = bytearray(archive.read_bytes())
-    # The member's data begin after 30 bytes and its name; no block of deflate begins like this.
-    image[30 + len(member)] = 0xFF
+    image[len(image) // 2] ^= 0xFF
     archive.write_bytes(image)
     assert main(["check", str(archive)]) == 1
-    assert "truncated or damaged (Error -3 while decompressing" in capsys.readouterr().out
+    assert "truncated or damaged (Corrupt input data)" in capsys.readouterr().out

@@ -130,7 +130,7 @@ def test_however_the_folder_is_given_there_is_one_database(folder: Path, opened,
 
 
 def test_archive_is_kept_in_the_cache(folder: Path, opened: list[str]) -> None:
-    archive = folder.parent / "all.plab.zip"
+    archive = folder.parent / "all.plab.zip.xz"
     pack(folder, archive)
     age(archive)
     first = load(archive, ["method.name"])
@@ -244,8 +244,8 @@ def test_unreadable_files_are_looked_at_each_time(folder: Path) -> None:
 
 def test_a_run_that_is_there_more_than_once_counts_once(folder: Path) -> None:
     for name in ("a", "b"):
-        pack(folder, folder / f"{name}.plab.zip")
-        age(folder / f"{name}.plab.zip")
+        pack(folder, folder / f"{name}.plab.zip.xz")
+        age(folder / f"{name}.plab.zip.xz")
     path = Path(load(folder)["path"].iloc[0])
     assert ask(folder, "SELECT count(*) FROM runs") == [(3,)]
     path.unlink()
@@ -398,9 +398,9 @@ def test_processes_at_once(folder: Path, tmp_path: Path) -> None:
 
 
 def test_iterations_are_those_of_the_files(folder: Path, monkeypatch) -> None:
-    pack(folder, folder.parent / "all.plab.zip")
-    age(folder.parent / "all.plab.zip")
-    for source in (folder, folder.parent / "all.plab.zip"):
+    pack(folder, folder.parent / "all.plab.zip.xz")
+    age(folder.parent / "all.plab.zip.xz")
+    for source in (folder, folder.parent / "all.plab.zip.xz"):
         paths = load(source)["path"].tolist()[1:]
         for _ in range(2):
             found = read_curves(source, paths)
@@ -565,7 +565,7 @@ def test_scores_refuse_in_a_line(folder: Path, capsys, words: list[str], line: s
 
 
 def test_folders_archives_and_example_are_taken_in_the_same_way(folder: Path, capsys) -> None:
-    archive = folder.parent / "all.plab.zip"
+    archive = folder.parent / "all.plab.zip.xz"
     pack(folder, archive)
     printed = []
     for source in (folder, archive):
@@ -586,8 +586,8 @@ def test_folders_archives_and_example_are_taken_in_the_same_way(folder: Path, ca
 def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told, capsys) -> None:
     for seed, score in enumerate((0.5, 0.75, 0.25)):
         age(synthetic.save(synthetic.run(folder, seed=seed, score=score)))
-    pack(folder, folder.parent / "all.plab.zip")
-    for source in (folder, folder.parent / "all.plab.zip"):
+    pack(folder, folder.parent / "all.plab.zip.xz")
+    for source in (folder, folder.parent / "all.plab.zip.xz"):
         options = parse_render([str(source), "task=Rope"])
         assert read(options.result).config["seed"] == 1
         assert options.output == Path("Rope-v1-adam-seed1.png")

@@ -72,19 +72,19 @@ TOOLS = [
     (results.main, ["mend"]),
     (results.main, ["check", "nowhere"]),
     (results.main, ["check", "--all"]),
-    (results.main, ["pack", "nowhere", "--output", "a.plab.zip"]),
-    (results.main, ["pack", ".", "colour=red", "--output", "a.plab.zip"]),
+    (results.main, ["pack", "nowhere", "--output", "a.plab.zip.xz"]),
+    (results.main, ["pack", ".", "colour=red", "--output", "a.plab.zip.xz"]),
     (results.main, ["pack", "."]),
     (results.main, ["pack", ".", "--output", "a.txt"]),
-    (results.main, ["unpack", "nowhere.plab.zip", "--output", "b"]),
+    (results.main, ["unpack", "nowhere.plab.zip.xz", "--output", "b"]),
     (results.main, ["unpack"]),
     (status.main, [".", "seed=range(3"]),
     (status.main, [".", "--json", "--csv"]),
     (status.main, [".", "--yaml"]),
     *((status.main, [".", word]) for word in IMPOSSIBLE),
     (status.main, [""]),
-    (results.main, ["pack", ".", "task=Ropee", "--output", "a.plab.zip"]),
-    (results.main, ["pack", ".", "status=done", "--output", "a.plab.zip"]),
+    (results.main, ["pack", ".", "task=Ropee", "--output", "a.plab.zip.xz"]),
+    (results.main, ["pack", ".", "status=done", "--output", "a.plab.zip.xz"]),
     (results.main, ["pack", ".", "--output", ""]),
     (results.main, ["check", ""]),
     (report.main, []),
@@ -199,15 +199,15 @@ TOOLS = [
 
 SAID = {
     (results.main,): "required: command",
-    (results.main, "pack", "nowhere", "--output", "a.plab.zip"): "nowhere does not exist",
-    (results.main, "pack", ".", "colour=red", "--output", "a.plab.zip"): "'colour=red' selects nothing",
+    (results.main, "pack", "nowhere", "--output", "a.plab.zip.xz"): "nowhere does not exist",
+    (results.main, "pack", ".", "colour=red", "--output", "a.plab.zip.xz"): "'colour=red' selects nothing",
     (results.main, "pack", "."): "required: --output",
-    (results.main, "unpack", "nowhere.plab.zip", "--output", "b"): "nowhere.plab.zip does not exist",
+    (results.main, "unpack", "nowhere.plab.zip.xz", "--output", "b"): "nowhere.plab.zip.xz does not exist",
     (results.main, "unpack"): "required: archive",
     (report.main,): "required: what",
     (report.main, "html", "--results", "example", "task=Nope"): "task 'Nope' does not exist",
-    (results.main, "pack", ".", "task=Ropee", "--output", "a.plab.zip"): "did you mean Rope",
-    (results.main, "pack", ".", "status=done", "--output", "a.plab.zip"): "choose from: running, finished",
+    (results.main, "pack", ".", "task=Ropee", "--output", "a.plab.zip.xz"): "did you mean Rope",
+    (results.main, "pack", ".", "status=done", "--output", "a.plab.zip.xz"): "choose from: running, finished",
     (status.main, ".", "sim.nope=1"): "unknown key 'sim.nope'",
     (report.main, "tables", "--results", "example", "sim.nope=1"): "unknown key 'sim.nope'",
     (targets.main, "--task", "Rope", "--rebuild", "targets.source=files"): "--rebuild has no effect with",
@@ -243,8 +243,8 @@ def test_bad_invocations_of_the_tools(refused, entry, argv):
 def test_results_where_none_can_be_written(refused, tmp_path):
     (tmp_path / "file").write_text("in the way\n", encoding="utf-8")
     synthetic.save(synthetic.run(tmp_path / "results"))
-    assert "cannot write file/a.plab.zip" in refused(
-        ["pack", "results", "--output", "file/a.plab.zip"], results.main
+    assert "cannot write file/a.plab.zip.xz" in refused(
+        ["pack", "results", "--output", "file/a.plab.zip.xz"], results.main
     )
     assert "cannot write file" in refused(
         ["tables", "--results", "results", "--out", "file/tables"], report.main
@@ -321,14 +321,14 @@ UNWRITABLE = [
     (run.main, ["task=Move", "results_dir=closed"]),
     (run.main, ["task=Move", "results_dir=closed/results"]),
     (run.main, ["-m", "task=Move", "variant=1,2", "hydra.sweep.dir=closed/sweep"]),
-    (results.main, ["pack", "example.plab.zip", "--output", "closed/a.plab.zip"]),
-    (results.main, ["pack", "example.plab.zip", "--output", "closed/new/a.plab.zip"]),
-    (results.main, ["unpack", "example.plab.zip", "--output", "closed"]),
-    (results.main, ["unpack", "example.plab.zip", "--output", "closed/new"]),
-    (report.main, ["tables", "--results", "example.plab.zip", "--out", "closed"]),
-    (report.main, ["tables", "--results", "example.plab.zip", "--out", "closed/new"]),
-    (report.main, ["curves", "--results", "example.plab.zip", "--out", "closed"]),
-    (report.main, ["html", "--no-pictures", "--results", "example.plab.zip", "--out", "closed"]),
+    (results.main, ["pack", "example.plab.zip.xz", "--output", "closed/a.plab.zip.xz"]),
+    (results.main, ["pack", "example.plab.zip.xz", "--output", "closed/new/a.plab.zip.xz"]),
+    (results.main, ["unpack", "example.plab.zip.xz", "--output", "closed"]),
+    (results.main, ["unpack", "example.plab.zip.xz", "--output", "closed/new"]),
+    (report.main, ["tables", "--results", "example.plab.zip.xz", "--out", "closed"]),
+    (report.main, ["tables", "--results", "example.plab.zip.xz", "--out", "closed/new"]),
+    (report.main, ["curves", "--results", "example.plab.zip.xz", "--out", "closed"]),
+    (report.main, ["html", "--no-pictures", "--results", "example.plab.zip.xz", "--out", "closed"]),
     (render.main, ["task=Rope", "--output", "closed/a.png"]),
     (render.main, ["--contact-sheet", "closed/a.png"]),
     (view.main, ["task=Rope", "--output", "closed/a.html"]),
@@ -349,7 +349,7 @@ UNWRITABLE = [
 @pytest.mark.parametrize(("entry", "argv"), UNWRITABLE, ids=name_of)
 def test_folders_that_may_not_be_written_to(told, tmp_path, closed, entry, argv):
     results.main(
-        ["pack", str(synthetic.save(synthetic.run(tmp_path / "results"))), "--output", "example.plab.zip"]
+        ["pack", str(synthetic.save(synthetic.run(tmp_path / "results"))), "--output", "example.plab.zip.xz"]
     )
     assert re.search(r"cannot write .*closed", told(argv, entry, ordinary_rights(tmp_path)))
 
@@ -372,11 +372,11 @@ UNREADABLE = [
     (run.main, ["task=Secret", "--config-dir", "mine"], "mine/task/Secret.yaml"),
     (run.main, ["task=Rope", "targets.source=files"], "files/Rope3D-v1.npy"),
     (run.main, ["task=Rope", "targets.source=files"], "files"),
-    (results.main, ["pack", "run.h5", "--output", "a.plab.zip"], "run.h5"),
-    (results.main, ["pack", "runs.plab.zip", "--output", "a.plab.zip"], "runs.plab.zip"),
-    (results.main, ["unpack", "runs.plab.zip", "--output", "new"], "runs.plab.zip"),
-    (status.main, ["runs.plab.zip"], "runs.plab.zip"),
-    (report.main, ["tables", "--results", "runs.plab.zip", "--out", "new"], "runs.plab.zip"),
+    (results.main, ["pack", "run.h5", "--output", "a.plab.zip.xz"], "run.h5"),
+    (results.main, ["pack", "runs.plab.zip.xz", "--output", "a.plab.zip.xz"], "runs.plab.zip.xz"),
+    (results.main, ["unpack", "runs.plab.zip.xz", "--output", "new"], "runs.plab.zip.xz"),
+    (status.main, ["runs.plab.zip.xz"], "runs.plab.zip.xz"),
+    (report.main, ["tables", "--results", "runs.plab.zip.xz", "--out", "new"], "runs.plab.zip.xz"),
     (report.main, ["tables", "--results", "run.h5", "--speed", "rows.csv", "--out", "new"], "rows.csv"),
     (report.main, ["curves", "--results", "run.h5", "--accuracy", "rows.csv", "--out", "new"], "rows.csv"),
     (render.main, ["run.h5", "--output", "a.png"], "run.h5"),
@@ -391,7 +391,7 @@ def test_files_that_may_not_be_read(told, tmp_path, entry, argv, hidden):
     np.save(tmp_path / "files/Rope3D-v1.npy", np.ones((64, 64, 64)))
     (tmp_path / "rows.csv").write_text("task,batch\n", encoding="utf-8")
     synthetic.save(synthetic.run(tmp_path / "results")).rename(tmp_path / "run.h5")
-    results.main(["pack", "run.h5", "--output", "runs.plab.zip"])
+    results.main(["pack", "run.h5", "--output", "runs.plab.zip.xz"])
     mode = (tmp_path / hidden).stat().st_mode
     (tmp_path / hidden).chmod(0)
     try:
@@ -411,8 +411,8 @@ def test_a_closed_folder_of_sweeps(told, tmp_path, closed, monkeypatch):
 def test_a_result_that_may_not_be_read_is_left_alone(tmp_path, capsys, packed):
     path = synthetic.save(synthetic.run(tmp_path / "results"))
     if packed:
-        assert results.main(["pack", str(path), "--output", "packed/runs.plab.zip"]) == 0
-        path = tmp_path / "packed" / "runs.plab.zip"
+        assert results.main(["pack", str(path), "--output", "packed/runs.plab.zip.xz"]) == 0
+        path = tmp_path / "packed" / "runs.plab.zip.xz"
     before = path.read_bytes()
     path.chmod(0)
     with ordinary_rights(tmp_path):

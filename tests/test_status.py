@@ -176,7 +176,7 @@ def test_rest_is_estimated_from_finished_runs_of_the_same_task_and_method(folder
 
 
 def test_archives_count(folder: Path, tmp_path_factory) -> None:
-    archive = tmp_path_factory.mktemp("packed") / "a.plab.zip"
+    archive = tmp_path_factory.mktemp("packed") / "a.plab.zip.xz"
     pack(folder, archive, wanted=lambda row: True)
     assert counts(find(archive)) == counts(find(folder))
 

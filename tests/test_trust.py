@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import lzma
 import os
 import pickle
 import re
@@ -22,7 +23,7 @@ from plab.config import load_config
 from plab.families import FAMILIES
 from plab.results import ResultsError, RunFile, check, pack, read, result_path, unpack
 from plab.results import __main__ as results
-from plab.results.loading import read_rows
+from plab.results.loading import read_rows, run_files
 from plab.runners import run_config
 from plab.runners.policy import load_policy
 from plab.targets import TargetError, load_release_target
@@ -78,14 +79,17 @@ def test_result_files_with_odd_attributes(tmp_path: Path, capsys, case: str, pac
     changes, reason = ATTRIBUTES[case]
     path = saved(tmp_path / "results", **changes)
     if packed:
-        archive = tmp_path / "a.plab.zip"
-        archive.write_bytes(fuzz.zipped([("run.h5", path.read_bytes())]))
+        archive = tmp_path / "a.plab.zip.xz"
+        archive.write_bytes(lzma.compress(fuzz.zipped([("run.h5", path.read_bytes())])))
         path = archive / "run.h5"
     line = said(lambda: read(path))
     assert line.startswith(f"{path} ") and (reason is None or line == f"{path} {reason}")
     source = str(path.parent if packed else path)
     assert [str(row) for row in read_rows(Path(source))] == [line]
-    for entry, argv in ((status.main, [source]), (results.main, ["pack", source, "--output", "b.plab.zip"])):
+    for entry, argv in (
+        (status.main, [source]),
+        (results.main, ["pack", source, "--output", "b.plab.zip.xz"]),
+    ):
         assert entry(argv) == 2
         assert capsys.readouterr().err == f"plab: {line}\n"
     assert results.main(["check", source]) == 1
@@ -99,10 +103,10 @@ def test_places_that_are_no_files(tmp_path: Path, capsys) -> None:
     (folder / "folder.h5").mkdir()
     (folder / "circle.h5").symlink_to("circle.h5")
     (folder / "nowhere.h5").symlink_to("nothing.h5")
-    (folder / "empty.plab.zip").touch()
+    (folder / "empty.plab.zip.xz").touch()
     reasons = {
         "circle.h5": "is truncated or damaged ([Errno 40] Too many levels of symbolic links",
-        "empty.plab.zip": "is truncated or damaged (File is not a zip file)",
+        "empty.plab.zip.xz": "is truncated or damaged (it is cut short)",
         "folder.h5": "cannot be read: it is a folder, no file",
         "nowhere.h5": "does not exist",
         "pipe.h5": "cannot be read: it is a pipe or a device, no file",
@@ -242,9 +246,13 @@ ARCHIVES = {
         lambda own: fuzz.zipped([(RUN, bytes(200_000_000))]),
         "bytes of the archive stand for 200000000: no file of plab's does that",
     ),
+    "packed bomb": (
+        lambda own: fuzz.zipped([(RUN, bytes(40_000_000))], zipfile.ZIP_STORED),
+        "bytes stand for more than 16777216: no file of plab's does that",
+    ),
     "zip in zip": (
-        lambda own: fuzz.zipped([("b.plab.zip", fuzz.zipped([(RUN, own)]))]),
-        "b.plab.zip is truncated or damaged",
+        lambda own: fuzz.zipped([("b.plab.zip.xz", fuzz.zipped([(RUN, own)]))]),
+        "b.plab.zip.xz is truncated or damaged",
     ),
 }
 
@@ -252,8 +260,8 @@ ARCHIVES = {
 @pytest.mark.parametrize("case", ARCHIVES)
 def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
     make, reason = ARCHIVES[case]
-    archive, out = tmp_path / "a.plab.zip", tmp_path / "out"
-    archive.write_bytes(make(saved(tmp_path / "results").read_bytes()))
+    archive, out = tmp_path / "a.plab.zip.xz", tmp_path / "out"
+    archive.write_bytes(lzma.compress(make(saved(tmp_path / "results").read_bytes())))
     (line,) = (str(row) for row in read_rows(archive))
     assert line.startswith(str(archive)) and reason in line
     assert said(lambda: unpack(archive, out)) == line
@@ -262,20 +270,47 @@ def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
     assert problem is not None and problem.reason in line
 
 
+ENDS = {
+    "cut": (lambda packed: packed[:-20], "is truncated or damaged (it is cut short)"),
+    "longer": (lambda packed: packed + b"x", "is truncated or damaged (something follows its end)"),
+    "other": (lambda packed: b"hello", "is truncated or damaged (Input format not supported by decoder)"),
+}
+
+
+@pytest.mark.parametrize("case", ENDS)
+def test_archives_that_end_elsewhere(tmp_path: Path, case: str) -> None:
+    change, reason = ENDS[case]
+    archive = tmp_path / "a.plab.zip.xz"
+    archive.write_bytes(change(lzma.compress(fuzz.zipped([(RUN, saved(tmp_path / "r").read_bytes())]))))
+    assert [str(row) for row in read_rows(archive)] == [f"{archive} {reason}"]
+
+
+def test_archives_of_older_plabs_are_told(tmp_path: Path) -> None:
+    archive = tmp_path / "a.plab.zip"
+    archive.write_bytes(fuzz.zipped([(RUN, saved(tmp_path / "r").read_bytes())]))
+    for source in (archive, tmp_path):
+        lines = [str(row) for path, _ in run_files(source) for row in read_rows(path) if path == archive]
+        assert lines == [
+            f"{archive} was packed by an older plab: unpack it with a zip program, it holds result files"
+        ]
+
+
 def test_runs_do_not_choose_where_they_are_unpacked(tmp_path: Path) -> None:
-    archive, path = tmp_path / "a.plab.zip", tmp_path / "away.h5"
+    archive, path = tmp_path / "a.plab.zip.xz", tmp_path / "away.h5"
     for name in ("../../../away", "/away", "a/../../../../away"):
         config = synthetic.config(tmp_path, task=name)
         synthetic.write(dataclasses.replace(synthetic.run(tmp_path), config=config), path)
-        archive.write_bytes(fuzz.zipped([("run.h5", path.read_bytes())]))
+        archive.write_bytes(lzma.compress(fuzz.zipped([("run.h5", path.read_bytes())])))
         assert f"task.name in config is no name: '{name}'" in said(lambda: unpack(archive, tmp_path / "out"))
         assert not (tmp_path / "out").exists()
 
 
 def test_folders_in_an_archive_are_no_runs(tmp_path: Path) -> None:
     content = saved(tmp_path / "results").read_bytes()
-    archive = tmp_path / "a.plab.zip"
-    archive.write_bytes(fuzz.zipped([("Rope-v1/", b""), ("Rope-v1/adam/", b""), (RUN, content)]))
+    archive = tmp_path / "a.plab.zip.xz"
+    archive.write_bytes(
+        lzma.compress(fuzz.zipped([("Rope-v1/", b""), ("Rope-v1/adam/", b""), (RUN, content)]))
+    )
     assert unpack(archive, tmp_path / "out") == (1, 0)
 
 
@@ -370,8 +405,8 @@ def test_what_is_packed_again_is_sound(tmp_path: Path) -> None:
     run.masses = {name: np.zeros((64, 64, 64)) for name in ("initial", "final", "target")}
     run.masses["final"][:] = 1.0
     synthetic.save(run)
-    pack(folder, tmp_path / "a.plab.zip", keep_masses=True)
-    unpack(tmp_path / "a.plab.zip", tmp_path / "out")
+    pack(folder, tmp_path / "a.plab.zip.xz", keep_masses=True)
+    unpack(tmp_path / "a.plab.zip.xz", tmp_path / "out")
     assert np.array_equal(
         read(result_path(synthetic.config(tmp_path / "out"))).masses["final"], run.masses["final"]
     )

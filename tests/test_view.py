@@ -207,8 +207,8 @@ def test_a_run_of_an_archive_is_shown_here(capsys, simulated):
     path = results.result_path(cfg)
     path.parent.mkdir(parents=True)
     results.write(found, path)
-    results.pack(path.parents[2], Path("runs.plab.zip"))
-    assert main([f"runs.plab.zip/{path.relative_to(path.parents[2])}"]) == 0
+    results.pack(path.parents[2], Path("runs.plab.zip.xz"))
+    assert main([f"runs.plab.zip.xz/{path.relative_to(path.parents[2])}"]) == 0
     assert capsys.readouterr().out == f"{path.stem}.html\n"
 
 

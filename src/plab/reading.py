@@ -5,13 +5,15 @@ Nothing here unpickles, extracts or executes anything, and no file makes more of
 
 from __future__ import annotations
 
+import functools
 import io
+import lzma
 import math
 import os
 import stat
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -39,6 +41,9 @@ _RATIO, _SMALL = 200, 1 << 24
 """Most bytes that a byte of an archive may stand for, of members above a size [B].
 
 Deflate reaches 1,032; what plab packs is compressed already."""
+
+_UNPACKING = 1 << 28
+"""Most memory that unpacking may take besides its result [B]; what plab packs needs a quarter."""
 
 _HEADER = 4096
 """Longest header of an array [B]; NumPy's own take 128."""
@@ -72,17 +77,26 @@ def regular_file(path: Path) -> os.stat_result:
 
 
 @contextmanager
-def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]:
     """Open a zip file for :func:`member_bytes`.
+
+    Args:
+        path: The file.
+        packed: Whether it is compressed as a whole, by xz. What was unpacked last is kept in memory.
 
     Raises:
         UnreadableError: If its members lead out of it, share a name or their bytes, are encrypted, or are too
-            many.
+            many; if it would take more room than a file of plab's does.
         ValueError: If it is no zip file, or damaged.
         OSError: If it cannot be opened.
     """
-    size = regular_file(path).st_size
-    with path.open("rb") as file:
+    found = regular_file(path)
+    size = found.st_size
+    with path.open("rb") as packed_file, ExitStack() as stack:
+        file: BinaryIO = packed_file
+        if packed:
+            content = _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino)
+            file, size = stack.enter_context(io.BytesIO(content)), len(content)
         try:
             archive = zipfile.ZipFile(file)
         except (OSError, MemoryError):
@@ -149,6 +163,24 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 # ---------------------------------------------------------------------------------------------------- details
+
+
+@functools.lru_cache(maxsize=1)
+def _unpacked(path: Path, size: int, *_: int) -> bytes:
+    """Return what an xz file stands for; the other arguments tell whether it is still the same."""
+    most = min(LARGEST, max(_SMALL, _RATIO * size))
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING)
+    try:
+        content = unpacker.decompress(path.read_bytes(), most)
+    except lzma.LZMAError as error:
+        raise ValueError(str(error)) from error
+    if not unpacker.eof:
+        if len(content) == most:
+            raise UnreadableError(f"{size} bytes stand for more than {most}: no file of plab's does that")
+        raise ValueError("it is cut short")
+    if unpacker.unused_data:
+        raise ValueError("something follows its end")
+    return content
 
 
 def _check_members(archive: zipfile.ZipFile, size: int) -> None:

@@ -170,7 +170,7 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
     yield timed("tables, again", lambda: write_tables(collect(results, Selection()), folder / "b", ""))
     if not packed:
         return
-    archive = folder / "all.plab.zip"
+    archive = folder / "all.plab.zip.xz"
     yield timed("pack", lambda: range(pack(results, archive).runs))
     time.sleep(SETTLE)
     yield timed("archive", lambda: load(archive))

@@ -20,7 +20,7 @@ def example_archive(name: str = EXAMPLES[0]) -> Path:
     Args:
         name: One of :data:`EXAMPLES`.
     """
-    return Path(__file__).with_name(f"{name}.plab.zip")
+    return Path(__file__).with_name(f"{name}.plab.zip.xz")
 
 
 def resolve(source: str | Path) -> Path:

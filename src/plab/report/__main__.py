@@ -1,7 +1,7 @@
 """The paper's tables and curves, notebooks and a page of all results, from result files alone.
 
 python -m plab.report tables --results results --out reports/tables
-python -m plab.report curves --results runs.plab.zip task=Rope,Move seed=0,1,2
+python -m plab.report curves --results runs.plab.zip.xz task=Rope,Move seed=0,1,2
 python -m plab.report notebooks --results example
 python -m plab.report html --results example         real runs that come with plab
 """

@@ -3,8 +3,8 @@
 python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
 python -m plab.results sql "select ..." [results]             any question to the tables of docs/results.md
 python -m plab.results check [results ...]                    check every file against the schema
-python -m plab.results pack results --output runs.plab.zip    put finished runs into one small file
-python -m plab.results unpack runs.plab.zip --output folder   make files of them again
+python -m plab.results pack results --output runs.plab.zip.xz    put finished runs into one small file
+python -m plab.results unpack runs.plab.zip.xz --output folder   make files of them again
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("source", type=_source, help=_SOURCES)
     what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
     parser.add_argument("words", nargs="*", help=what)
-    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip")
+    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
     what = "significant digits that the iterations keep, >= 1 (default: all); 4 halve an archive"
     parser.add_argument("--digits", type=positive, help=what)

@@ -1,13 +1,14 @@
 """Archives: many runs in one file, for publishing or keeping under version control.
 
-An archive is a zip file of result files, each with what tables, curves and pictures need; any zip program
-unpacks it. Its members are the same HDF5 files as those of a results folder, compressed once inside (arrays,
-with the bytes of equal significance together) and once outside (names, configurations).
+An archive is a zip file of result files, each with what tables, curves and pictures need, compressed as a
+whole by xz, which finds what runs have in common; ``unxz`` and any zip program unpack it. Its members are the
+same HDF5 files as those of a results folder.
 """
 
 from __future__ import annotations
 
 import io
+import lzma
 import math
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -61,7 +62,7 @@ def pack(
 
     Args:
         source: Folder of results, archive, result file, or several of them.
-        archive: File to create or replace; its name ends in ``.plab.zip``.
+        archive: File to create or replace; its name ends in ``.plab.zip.xz``.
         wanted: Says which runs to take; all finished ones by default.
         keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
         keep_resume: Keep the state from which unfinished runs go on.
@@ -95,10 +96,10 @@ def pack(
             )
             member = zipfile.ZipInfo(name, _EPOCH)
             member.external_attr = 0o644 << 16
-            members.writestr(member, encode(run, compress=True), zipfile.ZIP_DEFLATED, 9)
+            members.writestr(member, encode(run, compress=False), zipfile.ZIP_STORED)
     _make_folder(archive)
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    replace_file(archive, content.getvalue(), sync=True)
+    replace_file(archive, lzma.compress(content.getvalue(), preset=9), sync=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
 
 

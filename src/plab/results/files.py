@@ -25,6 +25,7 @@ from plab.results.schema import (
     ARCHIVE_SUFFIX,
     BUDGETS,
     COLUMNS,
+    OLD_ARCHIVE_SUFFIX,
     SCHEMA_VERSION,
     NewerSchemaError,
     ResultsError,
@@ -147,7 +148,7 @@ def read(path: str | Path) -> RunResult:
     """Read one run: a result file, finished or partial, or a member of an archive.
 
     Args:
-        path: The file; ``<archive>.plab.zip/<member>`` for a run in an archive, as in the column ``path`` of
+        path: The file; ``<archive>.plab.zip.xz/<member>`` for a run in an archive, as in the column ``path`` of
             :func:`plab.results.load`.
 
     Raises:
@@ -252,6 +253,10 @@ def opened(path: Path) -> Iterator[h5py.File]:
     with explained(path):
         if inside is None:
             regular_file(path)
+            if path.name.endswith(OLD_ARCHIVE_SUFFIX):
+                raise ResultsError(
+                    f"{path} was packed by an older plab: unpack it with a zip program, it holds result files"
+                )
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
@@ -268,7 +273,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 @contextmanager
 def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive, turning whatever is wrong with it into a ResultsError; see :mod:`plab.reading`."""
-    with explained(path), opened_zip(path) as members:
+    with explained(path), opened_zip(path, packed=True) as members:
         yield members
 
 

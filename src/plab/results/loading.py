@@ -22,6 +22,7 @@ from plab.results.files import explained, opened, opened_archive, opened_image, 
 from plab.results.hdf5 import attributes, columns, length, numbers, take
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
+    OLD_ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
     SUFFIX,
     ResultsError,
@@ -49,6 +50,8 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+_SUFFIXES = (SUFFIX, ARCHIVE_SUFFIX, OLD_ARCHIVE_SUFFIX)
 
 _LOOKS = 3
 """How often a folder is looked through at most while runs end in it."""
@@ -176,7 +179,7 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
         subfolders.sort()
         place = Path(folder)
         wrong = {name for name in subfolders if name.endswith(SUFFIX)}
-        for name in sorted(name for name in (*names, *wrong) if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
+        for name in sorted(name for name in (*names, *wrong) if name.endswith(_SUFFIXES)):
             # By text: pathlib takes longer than the file system.
             text = os.path.join(folder, name)
             try:

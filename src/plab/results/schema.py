@@ -22,6 +22,7 @@ __all__ = [
     "BUDGETS",
     "COLUMNS",
     "EVALUATION",
+    "OLD_ARCHIVE_SUFFIX",
     "PARTIAL_SUFFIX",
     "REPLAY_SUFFIX",
     "SCHEMA_VERSION",
@@ -53,8 +54,11 @@ STATUSES = ("running", "finished", "failed", "stopped")
 SUFFIX = ".h5"
 PARTIAL_SUFFIX = ".partial.h5"
 REPLAY_SUFFIX = ".replay"
-ARCHIVE_SUFFIX = ".plab.zip"
+ARCHIVE_SUFFIX = ".plab.zip.xz"
 """Ends of the names of result files, of those of runs under way, of their replay buffers, and of archives."""
+
+OLD_ARCHIVE_SUFFIX = ".plab.zip"
+"""End of the names of archives up to plab 0.1."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 
