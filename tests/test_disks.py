@@ -357,7 +357,7 @@ def test_a_repetition_that_is_killed_leaves_nothing_when_the_result_is_asked_for
 def test_a_file_system_without_locks_is_told(toy: Configs, monkeypatch, capsys, error: int) -> None:
     import fcntl
 
-    def flock(descriptor: int, operation: int) -> None:
+    def flock(*_: int) -> None:
         raise OSError(error, os.strerror(error))
 
     intact = fcntl.flock
