@@ -110,7 +110,7 @@ def read_results(path: Path) -> None:
     """Do with a result file or an archive all that is done with one."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        load(path, index=False)
+        load(path, database=False)
     for place, problem in check(path):
         assert problem is None or "\n" not in problem.reason + problem.advice
         answered(lambda place=place: read(place))
@@ -423,14 +423,16 @@ def changed_zip(content: bytes, change: tuple[float, str]) -> bytes:
         "packed": [(name, own)],
         "text": [(name, b"hello")],
     }[how]
-    changed = zipped([*members[:at], *new, *members[at:]], zipfile.ZIP_LZMA if how == "packed" else None)
+    changed = zipped(
+        [*members[:at], *new, *members[at:]], zipfile.ZIP_LZMA if how == "packed" else zipfile.ZIP_DEFLATED
+    )
     return packed_as(content, changed)
 
 
-def zipped(members: list[tuple[str, bytes]], method: int | None = None) -> bytes:
+def zipped(members: list[tuple[str, bytes]], method: int = zipfile.ZIP_DEFLATED) -> bytes:
     """Return members as the bytes of a zip file."""
     buffer = io.BytesIO()
-    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", method or zipfile.ZIP_DEFLATED) as archive:
+    with warnings.catch_warnings(), zipfile.ZipFile(buffer, "w", method) as archive:
         # Of names that are there twice.
         warnings.simplefilter("ignore")
         for name, own in members:

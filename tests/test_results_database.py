@@ -593,7 +593,7 @@ def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told, caps
         assert options.output == Path("Rope-v1-adam-seed1.png")
     assert parse_render([str(folder), "seed=2"]).output == Path("Rope-v1-adam-seed2.png")
     line = told([str(folder), "seed=3"], render)
-    assert line == f"plab: there is no finished run to draw in {folder}: no run fits"
+    assert line == f"plab: there is no finished run to show in {folder}: no run fits"
     line = told(["example", "family=rl"], render)
     assert (
         line == "plab: 'family=rl' selects nothing; choose from: task, variant, method, seed, or a dotted key"

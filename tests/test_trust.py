@@ -273,7 +273,10 @@ def test_archives_that_are_refused(tmp_path: Path, case: str) -> None:
 ENDS = {
     "cut": (lambda packed: packed[:-20], "is truncated or damaged (it is cut short)"),
     "longer": (lambda packed: packed + b"x", "is truncated or damaged (something follows its end)"),
-    "other": (lambda packed: b"hello", "is truncated or damaged (Input format not supported by decoder)"),
+    "other": (
+        lambda packed: b"hello, this is text",
+        "is truncated or damaged (Input format not supported by decoder)",
+    ),
 }
 
 

@@ -125,7 +125,7 @@ def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("words", nargs="*", help=what)
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
-    what = "significant digits that the iterations keep, >= 1 (default: all); 4 halve an archive"
+    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
     parser.add_argument("--digits", type=positive, help=what)
     parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
     parser.set_defaults(run=_pack)

@@ -66,8 +66,8 @@ def pack(
         wanted: Says which runs to take; all finished ones by default.
         keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
         keep_resume: Keep the state from which unfinished runs go on.
-        digits: Significant decimal digits that the iterations keep at least, >= 1; None: all. Four halve an
-            archive. Actions and the final evaluation always keep all.
+        digits: Significant decimal digits that the iterations keep at least, >= 1; None: all. Four take two
+            thirds off. Actions and the final evaluation always keep all.
 
     Raises:
         ResultsError: If there is nothing to pack, ``source`` is files or archives, none of which can be read,

@@ -148,8 +148,8 @@ def read(path: str | Path) -> RunResult:
     """Read one run: a result file, finished or partial, or a member of an archive.
 
     Args:
-        path: The file; ``<archive>.plab.zip.xz/<member>`` for a run in an archive, as in the column ``path`` of
-            :func:`plab.results.load`.
+        path: The file; ``<archive>.plab.zip.xz/<member>`` for a run in an archive, as in the column ``path``
+            of :func:`plab.results.load`.
 
     Raises:
         ResultsError: If the file is missing, truncated, of another schema version or no result file at all.
