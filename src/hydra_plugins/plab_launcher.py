@@ -80,10 +80,10 @@ class BatchSweeper(BasicSweeper):
                 raise ConfigError(f"'{one.input_line}' matches nothing: there is nothing to run")
         require_few(list(given.values()))
         assert self.config is not None
-        if not self.config.hydra.sweep.dir.strip():
+        if not self.config.hydra.sweep.dir.strip() and self.config.results_dir.strip():
             raise ConfigError("hydra.sweep.dir is empty: give a folder, or leave it out")
         # A folder that cannot be made is told before anything else.
-        made = make_folder(Path(self.config.hydra.sweep.dir))
+        made = make_folder(Path(self.config.hydra.sweep.dir or "."))
         done: list[Sequence[JobReturn]] = []
         try:
             for jobs in self.split_arguments(list(given.values()), self.max_batch_size):

@@ -298,9 +298,11 @@ class Scene:
                 f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of material and grid: "
                 f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
             )
+        # What is hardly stiff at all is stable with steps of any length.
+        shortest = SHORTEST * min(self.stable_dt, 1.0)
         _require(
-            self.dt >= SHORTEST * self.stable_dt,
-            f"dt {self.dt:g} is too short for anything to move: use dt >= {SHORTEST * self.stable_dt:.3g}, "
+            self.dt >= shortest,
+            f"dt {self.dt:g} is too short for anything to move: use dt >= {shortest:.3g}, "
             f"and at most {self.stable_dt:.3g}",
         )
         _require(

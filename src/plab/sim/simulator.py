@@ -13,7 +13,7 @@ from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
 from plab.sim.recording import Recorder, Recording
 from plab.sim.state import Rollout, State
-from plab.sim.tensors import action_array, numbers_of
+from plab.sim.tensors import action_array, clear, numbers_of
 
 if TYPE_CHECKING:
     import torch
@@ -168,8 +168,8 @@ class Simulator(ForwardSimulator):
         self._require_runtime()
         self._engine.allocate_adjoint()
         bar = self._particles.array(1)
-        for array in (bar, self._engine.pose_bar):
-            array.fill(0)
+        clear(bar)
+        self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]

@@ -9,6 +9,7 @@ import taichi as ti
 
 from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
+from plab.sim.tensors import clear
 
 __all__ = ["Tape"]
 
@@ -221,8 +222,8 @@ class Tape:
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
         # Allocated on the way forward.
         assert self.bar is not None
-        for array in (actions_bar, self.bar):
-            array.fill(0)
+        actions_bar.fill(0)
+        clear(self.bar)
         engine.clear_adjoint()
         last = (steps - 1) // self._length
         for t in reversed(range(steps)):

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Constants",
     "action_array",
+    "clear",
     "numbers_of",
     "on_device",
     "output_for",
@@ -56,6 +57,14 @@ def write_numbers(source: ti.types.ndarray(ndim=1), target: ti.types.ndarray(ndi
     """Copy numbers from the start of one array to the start of another, in its type."""
     for i in range(ti.min(source.shape[0], target.shape[0])):
         target[i] = source[i]
+
+
+@ti.kernel
+def clear(array: ti.types.ndarray(ndim=1)):
+    """Set all numbers of an array to 0, of vectors, too: for these Taichi's own ``fill`` makes a kernel for
+    each call, and keeps all of them."""
+    for i in array:
+        array[i] = ti.zero(array[i])
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
