@@ -170,7 +170,8 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         raise ConfigError(reason) from error
     finally:
         GlobalHydra.instance().hydra = surrounding
-    return finish(composed, overrides)
+    # Several configurations may share a list of overrides.
+    return finish(composed, overrides, alone=False)
 
 
 def _searchpath(config_dir: str | Path | None) -> list[str]:
