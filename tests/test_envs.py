@@ -365,7 +365,7 @@ def test_algorithms_learn_on_the_vec_env(vector: PlabVectorEnv) -> None:
         ({"overrides": "sim.device=cuda"}, "overrides are a list of texts"),
         ({"overrides": ["task=Rope"]}, "'task=Rope' in an environment of task Move"),
         ({"overrides": ["variant=9"]}, "variant 9 of task Move does not exist"),
-        ({"num_envs": 0}, "num_envs must be at least 1, not 0"),
+        ({"num_envs": 0}, "num_envs must be a whole number of at least 1, not 0"),
         ({"num_envs": 2, "overrides_per_env": [[]]}, "overrides_per_env has 1 entries, but num_envs is 2"),
         ({"config_dir": "no/such/folder"}, "config folder 'no/such/folder' does not exist"),
     ],

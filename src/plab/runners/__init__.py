@@ -112,9 +112,11 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
     try:
         for number, job in enumerate(jobs):
             try:
-                _require_usable(job.run)
                 own = family(job.cfg.method.family)
                 kind = _runner(job, in_sweep=in_sweep)
+                # What a runner that does everything itself goes on from only it knows.
+                if kind.run is Runner.run:
+                    _require_usable(job.run)
                 shares = own.batching or kind is not own.runner_type()
                 parties.setdefault((kind, None if shares else number), []).append(job)
             except Exception as error:
