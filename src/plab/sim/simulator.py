@@ -168,7 +168,7 @@ class Simulator(ForwardSimulator):
         self._require_runtime()
         self._engine.allocate_adjoint()
         bar = self._particles.array(1)
-        clear(bar)
+        clear(bar, self._engine.lanes)
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)

@@ -223,7 +223,7 @@ class Tape:
         # Allocated on the way forward.
         assert self.bar is not None
         actions_bar.fill(0)
-        clear(self.bar)
+        clear(self.bar, engine.lanes)
         engine.clear_adjoint()
         last = (steps - 1) // self._length
         for t in reversed(range(steps)):

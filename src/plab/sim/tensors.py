@@ -60,11 +60,12 @@ def write_numbers(source: ti.types.ndarray(ndim=1), target: ti.types.ndarray(ndi
 
 
 @ti.kernel
-def clear(array: ti.types.ndarray(ndim=1)):
-    """Set all numbers of an array to 0, of vectors, too: for these Taichi's own ``fill`` makes a kernel for
-    each call, and keeps all of them."""
+def clear(array: ti.types.ndarray(ndim=1), lanes: ti.template()):
+    """Set all vectors of an array to 0: Taichi's own ``fill`` makes a kernel for each call, and keeps all of
+    them; its ``zero`` multiplies, and leaves NaN."""
     for i in array:
-        array[i] = ti.zero(array[i])
+        for k in ti.static(range(lanes)):
+            array[i][k] = 0
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
