@@ -34,6 +34,9 @@ class Numbers:
     def array(self, slots: int) -> np.ndarray:
         return np.full(slots, -1)
 
+    def clear(self, array: np.ndarray) -> None:
+        array.fill(0)
+
     def allocate(self, steps: int) -> np.ndarray:
         return np.full(steps, -1)
 

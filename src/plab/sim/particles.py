@@ -10,6 +10,7 @@ import taichi as ti
 from plab.sim.order import ParticleOrder
 from plab.sim.state import State
 from plab.sim.storage import STATE
+from plab.sim.tensors import clear
 
 if TYPE_CHECKING:
     from plab.sim.engine import CpuEngine
@@ -47,6 +48,10 @@ class Particles:
         """Allocate an array of states."""
         engine = self.engine
         return ti.ndarray(engine.lane_type, shape=slots * engine.batch * engine.tiles * STATE)
+
+    def clear(self, array: ti.Ndarray) -> None:
+        """Set an array of states to 0."""
+        clear(array, self.engine.lanes)
 
     @property
     def slot_entries(self) -> int:

@@ -13,7 +13,7 @@ from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
 from plab.sim.recording import Recorder, Recording
 from plab.sim.state import Rollout, State
-from plab.sim.tensors import action_array, clear, numbers_of
+from plab.sim.tensors import action_array, numbers_of
 
 if TYPE_CHECKING:
     import torch
@@ -168,7 +168,7 @@ class Simulator(ForwardSimulator):
         self._require_runtime()
         self._engine.allocate_adjoint()
         bar = self._particles.array(1)
-        clear(bar, self._engine.lanes)
+        self._particles.clear(bar)
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)

@@ -9,7 +9,6 @@ import taichi as ti
 
 from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
 from plab.sim.particles import Particles
-from plab.sim.tensors import clear
 
 __all__ = ["Tape"]
 
@@ -223,7 +222,7 @@ class Tape:
         # Allocated on the way forward.
         assert self.bar is not None
         actions_bar.fill(0)
-        clear(self.bar, engine.lanes)
+        self._particles.clear(self.bar)
         engine.clear_adjoint()
         last = (steps - 1) // self._length
         for t in reversed(range(steps)):
