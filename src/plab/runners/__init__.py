@@ -174,11 +174,4 @@ def _runner(job: Job, *, in_sweep: bool) -> type[Runner]:
     kind = own.runner_type(population=population)
     if not issubclass(kind, Runner):
         raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
-    hooks = kind.build is not Runner.build and (
-        kind.step is not Runner.step or kind.iterate is not Runner.iterate
-    )
-    if kind.run is Runner.run and not hooks:
-        raise ConfigError(
-            f"the runner of method.family '{name}' is not finished: it needs build, and step or iterate"
-        )
     return kind

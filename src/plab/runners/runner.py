@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from plab.config import ConfigError
 from plab.families import family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress
@@ -167,11 +168,17 @@ class Runner:
         self._family = family(jobs[0].cfg.method.family)
         self._clock = _Clock(self.tracks)
 
+    def _unfinished(self) -> ConfigError:
+        name = self.tracks[0].cfg.method.family
+        return ConfigError(
+            f"the runner of method.family '{name}' is not finished: it needs build, and step or iterate"
+        )
+
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
         """Find out what is missing, then make what the runs share, :attr:`problem` at least."""
-        raise NotImplementedError(f"{type(self).__name__} has no build")
+        raise self._unfinished()
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make what a run has of its own, from a :attr:`Step.state` if there is one, else from nothing."""
@@ -203,7 +210,7 @@ class Runner:
             plab.sim.SimulationError: If a state, loss or gradient stops being finite.
             plab.runners.RunError: If it cannot go on for another reason.
         """
-        raise NotImplementedError(f"{type(self).__name__} has neither step nor iterate")
+        raise self._unfinished()
 
     def close(self) -> None:
         """Let go of what the iterations needed, even if they broke off."""
@@ -255,6 +262,9 @@ class Runner:
             plab.results.ResultsError: If the file of a lone run cannot be written.
             plab.runners.RunError: If a lone run cannot be built, or no run can go on.
         """
+        kind = type(self)
+        if kind.build is Runner.build or (kind.step is Runner.step and kind.iterate is Runner.iterate):
+            raise self._unfinished()
         with self.context(), simulation_errors():
             try:
                 self._build()
