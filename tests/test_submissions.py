@@ -147,13 +147,16 @@ def test_names_that_lead_elsewhere(path: Path, name: str) -> None:
     info.filename = name
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(info, b"")
-    assert why(path) == f"{path} has a member with the name {name!r}, which is not allowed"
+    assert why(path) in (
+        f"{path} has a member with the name {name!r}, which is not allowed",
+        f"{path} cannot be read: its member {name!r} leads out of the folder",
+    )
 
 
 def test_two_members_of_one_name(path: Path) -> None:
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
         archive.writestr("card.yaml", b"name: other")
-    assert why(path) == f"{path} has two members card.yaml"
+    assert why(path) == f"{path} cannot be read: it has two members 'card.yaml'"
 
 
 def test_links_and_encrypted_members(path: Path) -> None:
@@ -168,7 +171,7 @@ def test_links_and_encrypted_members(path: Path) -> None:
     place = content.index(b"PK\x01\x02") + 8
     content[place : place + 2] = struct.pack("<H", 1)
     path.write_bytes(content)
-    assert why(path) == "secret is encrypted"
+    assert why(path) == f"{path} cannot be read: its member 'secret' is encrypted"
 
 
 def test_more_than_is_allowed(path: Path) -> None:
