@@ -7,6 +7,7 @@ import lzma
 import os
 import pickle
 import re
+import struct
 import sys
 import zipfile
 from pathlib import Path
@@ -94,6 +95,19 @@ def test_result_files_with_odd_attributes(tmp_path: Path, capsys, case: str, pac
         assert capsys.readouterr().err == f"plab: {line}\n"
     assert results.main(["check", source]) == 1
     assert capsys.readouterr().out.startswith(f"{path}: {line.removeprefix(str(path)).strip()}: ")
+
+
+@pytest.mark.parametrize(
+    ("number", "room"), [(0, 0), (0, 5), (0, 2**64 - 8), (1, 2**64 - 16), (1, 2**64 - 17), (1, 4096)]
+)
+def test_texts_that_come_to_no_end(tmp_path: Path, number: int, room: int) -> None:
+    """HDF5 itself goes round in a heap whose objects take no room, for ever."""
+    path = saved(tmp_path / "results")
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL")
+    content[heap + 16 : heap + 32] = struct.pack("<HHIQ", number, 1, 0, room)
+    path.write_bytes(content)
+    assert said(lambda: read(path)) == f"{path} is truncated or damaged (a heap of texts is damaged)"
 
 
 def test_places_that_are_no_files(tmp_path: Path, capsys) -> None:

@@ -12,6 +12,7 @@ import math
 import os
 import stat
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path, PurePosixPath
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 __all__ = [
+    "DAMAGE",
     "LARGEST",
     "UnreadableError",
     "member_bytes",
@@ -33,6 +35,19 @@ __all__ = [
 
 LARGEST = 1 << 31
 """Most bytes that an array, a table or a member of an archive may take in memory."""
+
+DAMAGE = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    zlib.error,
+)
+"""What h5py, json, zlib and PyTorch raise at files that are cut short, damaged or something else."""
 
 _MEMBERS = 1_000_000
 """Most members of an archive."""

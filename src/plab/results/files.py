@@ -7,9 +7,9 @@ import errno
 import itertools
 import json
 import math
+import mmap
 import os
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,8 +19,8 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.reading import LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
-from plab.results.hdf5 import array, attributes, columns, groups, numbers, take, tree
+from plab.reading import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
+from plab.results.hdf5 import array, attributes, check_heaps, columns, groups, numbers, take, tree
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     BUDGETS,
@@ -58,19 +58,6 @@ _images = itertools.count()
 
 _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
-
-_UNREADABLE = (
-    OSError,
-    LookupError,
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-    AttributeError,
-    zlib.error,
-)
-"""What h5py, json and zlib raise on files that are cut short, damaged or something else."""
 
 
 def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
@@ -257,6 +244,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
                 raise ResultsError(
                     f"{path} was packed by an older plab: unpack it with a zip program, it holds result files"
                 )
+            _check_file(path)
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
@@ -280,8 +268,10 @@ def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 @contextmanager
 def opened_image(image: bytes, path: Path) -> Iterator[h5py.File]:
     """Open the bytes of a run, as :func:`opened` does a file; ``path`` is for messages."""
-    with explained(path), h5py.File(h5py.h5f.open_file_image(image)) as file:
-        yield _of_this_version(file, path)
+    with explained(path):
+        check_heaps(image)
+        with h5py.File(h5py.h5f.open_file_image(image)) as file:
+            yield _of_this_version(file, path)
 
 
 @contextmanager
@@ -297,11 +287,21 @@ def explained(path: Path) -> Iterator[None]:
         raise ResultsError(f"{path} may not be read ({error.strerror or error})") from error
     except UnreadableError as error:
         raise ResultsError(f"{path} cannot be read: {one_line(error)}") from error
-    except _UNREADABLE as error:
+    except DAMAGE as error:
         raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
 
 
+def _check_file(path: Path) -> None:
+    with path.open("rb") as file:
+        # Of nothing no memory is mapped.
+        if os.fstat(file.fileno()).st_size:
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                check_heaps(content)
+
+
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
+    if file.id.get_create_plist().get_sizes() != (8, 8):
+        raise ValueError("its addresses have another length")
     own = attributes(file, names=("format", "schema_version"))
     if own.get("format") != "plab-run" or not isinstance(own["format"], str):
         raise ResultsError(f"{path} is not a plab result file")

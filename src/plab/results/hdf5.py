@@ -8,6 +8,8 @@ no filter but those that plab writes with, no array that its bytes on the disk c
 
 from __future__ import annotations
 
+import mmap
+import struct
 from collections.abc import Container
 from typing import Any, TypeVar
 
@@ -17,7 +19,7 @@ from h5py import h5a, h5d, h5g, h5l, h5o, h5s, h5t, h5z
 
 from plab.reading import LARGEST
 
-__all__ = ["array", "attributes", "columns", "groups", "length", "numbers", "take", "tree"]
+__all__ = ["array", "attributes", "check_heaps", "columns", "groups", "length", "numbers", "take", "tree"]
 
 _TEXT = h5t.py_create(h5py.string_dtype())
 
@@ -29,7 +31,33 @@ _RATIO, _SMALL = 1_100, 1 << 16
 _ENTRIES, _DEPTH = 10_000, 16
 """Most entries of an attribute, and most levels of groups."""
 
+_HEAP = b"GCOL\x01"
+"""What a heap begins with: where HDF5 keeps texts."""
+
+_LEAST_HEAP = 4096
+
+_HEAP_HEADER = struct.Struct("<8sQ")
+"""Of a heap: what it begins with, and its size."""
+
+_OBJECT = struct.Struct("<H6xQ")
+"""Of an object in a heap: its number (0: what is free), and its size, of what is free with this header."""
+
 Kind = TypeVar("Kind")
+
+
+def check_heaps(content: bytes | mmap.mmap) -> None:
+    """See that the heaps of a file come to an end: HDF5 reads one whose objects take no room for ever.
+
+    Args:
+        content: The file.
+
+    Raises:
+        ValueError: If a heap is damaged.
+    """
+    at = content.find(_HEAP)
+    while at >= 0:
+        _check_heap(content, at)
+        at = content.find(_HEAP, at + 1)
 
 
 def attributes(file: h5py.File, group: str = "/", names: Container[str] | None = None) -> dict[str, Any]:
@@ -129,6 +157,23 @@ def tree(file: h5py.File, group: str) -> dict[str, Any]:
         ValueError: If it holds anything else.
     """
     return _tree(_group(file.id, group), 0)
+
+
+def _check_heap(content: bytes | mmap.mmap, start: int) -> None:
+    place = start + _HEAP_HEADER.size
+    if place > len(content):
+        return
+    _, size = _HEAP_HEADER.unpack_from(content, start)
+    # What is no heap, but begins as one, HDF5 refuses itself.
+    if size < _LEAST_HEAP or size > len(content) - start:
+        return
+    end = start + size
+    while end - place >= _OBJECT.size:
+        number, room = _OBJECT.unpack_from(content, place)
+        taken = _OBJECT.size + -(-room // 8) * 8 if number else room
+        if not _OBJECT.size <= taken <= end - place:
+            raise ValueError("a heap of texts is damaged")
+        place += taken
 
 
 def _tree(place: h5g.GroupID, depth: int) -> dict[str, Any]:

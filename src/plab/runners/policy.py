@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import get_device
 
 from plab.config import ConfigError, RlConfig
 from plab.families import FAMILIES, family
-from plab.reading import one_line, read_arrays
+from plab.reading import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.files import replace_file
 from plab.runners.model_state import module_arrays, restore_module
@@ -41,18 +41,6 @@ _FORMAT = "plab-policy 1"
 
 _PARAMETER = "policy/"
 """What the names of the networks' parameters begin with."""
-
-_BROKEN = (
-    OSError,
-    LookupError,
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-    AttributeError,
-)
-"""What is raised at a file that is cut off or of another kind, or whose arrays do not fit."""
 
 
 class Policy:
@@ -135,7 +123,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         ) from None
     except ResultsError:
         raise
-    except _BROKEN as error:
+    except DAMAGE as error:
         raise ResultsError(
             f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
         ) from error
