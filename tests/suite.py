@@ -1,4 +1,5 @@
-"""Small scenes for the tests: one body and all seven manipulators, one of them near it, in every environment.
+"""Small scenes, and a term of the loss: one body and all seven manipulators, one of them near it, in every
+environment.
 
 All environments of a batch share one compiled simulator, so that one compilation serves every manipulator.
 """
@@ -9,7 +10,9 @@ import math
 import os
 
 import numpy as np
+import taichi as ti
 
+from plab.losses.term import ParticleTerm
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
 
 DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
@@ -92,3 +95,17 @@ def batch() -> list[Scene]:
     scenes.append(scene(("Sphere", "Box"), yield_stress=5.0, poisson_ratio=0.05))
     scenes.append(scene(("Torus", "Chopsticks"), yield_stress=math.inf, poisson_ratio=0.4))
     return scenes
+
+
+class Kinetic(ParticleTerm):
+    """Kinetic energy, and how high it is: a term of particles."""
+
+    @ti.func
+    def measure(self, e, x, v):
+        """Square of the velocity, times the height."""
+        return 0.5 * v.dot(v) * x[1]
+
+    @ti.func
+    def gradient(self, e, x, v):
+        """By position and velocity."""
+        return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,13 @@ import reference_mpm as reference
 from plab.config import ConfigError, load_config
 from plab.envs.core import EpisodeBatch
 from plab.losses import TERMS, check_gradient, make_terms
-from plab.losses.term import DistanceTerm, ParticleTerm
+from plab.losses.term import DistanceTerm
 from plab.objective import soft_iou
 from plab.results import load, read
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim import SimulationError, Simulator
 from plab.torch import simulate
-from suite import KINDS, batch, scene
+from suite import KINDS, Kinetic, scene
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "examples" / "own_loss"
@@ -30,20 +31,6 @@ SCENES = [scene(KINDS), scene(("Sphere", "Chopsticks"))]
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 physics = pytest.mark.physics
-
-
-class Kinetic(ParticleTerm):
-    """Kinetic energy, and how high it is."""
-
-    @ti.func
-    def measure(self, e, x, v):
-        """Square of the velocity, times the height."""
-        return 0.5 * v.dot(v) * x[1]
-
-    @ti.func
-    def gradient(self, e, x, v):
-        """By position and velocity."""
-        return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
 
 
 class Close(DistanceTerm):
@@ -146,7 +133,7 @@ def test_the_summed_gradient_is_no_gradient_and_what_it_is_said_to_be(device: st
 @physics
 def test_measures_are_the_formulas(device: str) -> None:
     weights, choices = {"density": 1.0, "near": 1.0, "soft": 1.0, "energy": 1.0}, {"near": "nearest"}
-    terms = make_terms(weights, choices | {"energy": f"{__name__}:Kinetic"})
+    terms = make_terms(weights, choices | {"energy": "suite:Kinetic"})
     simulator = Simulator(SCENES, terms=terms, precision="float64", device=device)
     moved(simulator)
     measured, mass, state = simulator.measure(), simulator.mass_tensor(), simulator.state()
@@ -163,36 +150,6 @@ def test_measures_are_the_formulas(device: str) -> None:
         ]
         np.testing.assert_allclose(measured.terms[e], want, rtol=1e-9)
         assert measured.iou[e] == pytest.approx(soft_iou(mass[e], target[e]), rel=1e-9)
-
-
-@physics
-def test_the_gradient_of_a_rollout_with_a_soft_minimum(device: str) -> None:
-    terms = make_terms({"contact": 1.0}, {"contact": "soft"})
-    simulator = Simulator(SCENES, terms=terms, precision="float64", device=device)
-    rng = np.random.default_rng(3)
-    u = rng.uniform(-0.9, 0.9, (2, 2, simulator.action_dim))
-    way = rng.normal(size=u.shape)
-    slope = (simulator.rollout(u).gradient * way).sum()
-    ends = [simulator.rollout(u + s * way, gradient=False).step_terms.sum() for s in (1e-5, -1e-5)]
-    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
-
-
-@physics
-def test_terms_do_not_depend_on_threads_or_batch() -> None:
-    """Bit for bit on the CPU, with terms of all three kinds."""
-    weights = {"density": 10.0, "contact": 1.0, "energy": 2.0, "soft": 1.0}
-    choices = {"contact": "all", "energy": f"{__name__}:Kinetic"}
-    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 2, 25))
-    results = []
-    for threads, count in ((1, 2), (2, 2), (2, 1)):
-        simulator = Simulator(SCENES[:count], terms=make_terms(weights, choices), threads=threads)
-        shape = (count, *[simulator.grid_size] * 3)
-        simulator.set_target(np.zeros(shape), np.zeros(shape))
-        results.append(simulator.rollout(u[:count]))
-    for other in results[1:]:
-        for name in ("step_terms", "gradient"):
-            want, got = getattr(results[0], name), getattr(other, name)
-            np.testing.assert_array_equal(got, want[: len(got)])
 
 
 # ------------------------------------------------------------------------------------- terms that are not
@@ -290,11 +247,34 @@ def test_environments_have_terms_of_ones_own() -> None:
 # PyTorch
 
 
+@pytest.fixture(scope="module")
+def full(device: str) -> Simulator:
+    """With all gradients, and a term of the mass tensor and one of distances: compiled once."""
+    terms = make_terms({"sdf": 5.0, "contact": 1.0}, {"contact": "soft"})
+    simulator = Simulator(SCENES, terms=terms, precision="float64", device=device, full_gradient=True)
+    sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
+    simulator.set_target(np.zeros_like(sdf), sdf)
+    return simulator
+
+
+@physics
+def test_the_gradient_of_a_rollout_with_a_soft_minimum(full: Simulator) -> None:
+    full.reset()
+    full.set_weights({"sdf": 0.0, "contact": 1.0})
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-0.9, 0.9, (2, 2, full.action_dim))
+    way = rng.normal(size=u.shape)
+    slope = (full.rollout(u).gradient * way).sum()
+    ends = [full.rollout(u + s * way, gradient=False).step_terms[..., 1].sum() for s in (1e-5, -1e-5)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
+
+
 @physics
 @pytest.mark.parametrize("every_step", [True, False])
-def test_functions_of_states_are_differentiated(every_step: bool, device: str) -> None:
+def test_functions_of_states_are_differentiated(every_step: bool, full: Simulator) -> None:
     """By actions, initial positions and material, against central differences."""
-    simulator = Simulator(SCENES, precision="float64", device=device, full_gradient=True)
+    simulator = full
+    simulator.reset()
     rng = np.random.default_rng(0)
     values = {
         "u": torch.tensor(rng.uniform(-0.9, 0.9, (2, 3, simulator.action_dim)), requires_grad=True),
@@ -323,8 +303,28 @@ def test_functions_of_states_are_differentiated(every_step: bool, device: str) -
 
 
 @physics
+def test_functions_of_states_agree_with_the_terms(full: Simulator) -> None:
+    """The SDF term, once compiled in and once as a function of the mass tensor."""
+    simulator = full
+    simulator.reset()
+    simulator.set_weights({"sdf": 5.0, "contact": 0.0})
+    sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
+    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 3, simulator.action_dim))
+    want = simulator.rollout(u)
+    tensor = torch.tensor(u, requires_grad=True)
+    loss = 5.0 * (simulate(simulator, tensor).mass * torch.tensor(sdf)[:, None]).sum()
+    loss.backward()
+    assert float(loss.detach()) == pytest.approx(5.0 * want.step_terms[..., 0].sum(), rel=1e-12)
+    np.testing.assert_allclose(tensor.grad, want.gradient, atol=1e-12 * np.abs(want.gradient).max())
+    # The terms' own weights are as they were.
+    np.testing.assert_array_equal(simulator.rollout(u).gradient, want.gradient)
+
+
+@physics
 def test_the_way_back_is_refused_once_it_is_gone(device: str) -> None:
-    simulator = Simulator(SCENES, device=device)
+    simulator = Simulator(
+        [replace(made, manipulators=made.manipulators[:1]) for made in SCENES], device=device
+    )
     u = torch.zeros((2, 2, simulator.action_dim), requires_grad=True)
     states = simulate(simulator, u, every_step=False)
     assert states.x.shape == (2, 1, simulator.particle_count, 3) and states.mass.shape[:2] == (2, 1)
@@ -339,24 +339,6 @@ def test_the_way_back_is_refused_once_it_is_gone(device: str) -> None:
     recording = simulator.record(np.zeros((2, 1, simulator.action_dim)))
     with pytest.raises(ValueError, match=r"derivatives by v have shape \(2, 1\)"):
         recording.pullback(v=np.zeros((2, 1)))
-
-
-@physics
-def test_functions_of_states_agree_with_the_terms() -> None:
-    """The SDF term, once compiled in and once as a function of the mass tensor."""
-    terms = make_terms({"sdf": 5.0})
-    simulator = Simulator(batch()[:2], terms=terms, precision="float64")
-    sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
-    simulator.set_target(np.zeros_like(sdf), sdf)
-    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 3, simulator.action_dim))
-    want = simulator.rollout(u)
-    tensor = torch.tensor(u, requires_grad=True)
-    loss = 5.0 * (simulate(simulator, tensor).mass * torch.tensor(sdf)[:, None]).sum()
-    loss.backward()
-    assert float(loss.detach()) == pytest.approx(5.0 * want.step_terms.sum(), rel=1e-12)
-    np.testing.assert_allclose(tensor.grad, want.gradient, atol=1e-12 * np.abs(want.gradient).max())
-    # The terms' own weights are as they were.
-    np.testing.assert_array_equal(simulator.rollout(u).gradient, want.gradient)
 
 
 @physics

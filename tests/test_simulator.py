@@ -28,7 +28,8 @@ def ball(*, center: tuple[float, float, float] = (0.5, 0.4, 0.5), friction: floa
     return Scene("ball", (Body("sphere", center, (0.1,), 300),), tools, grid_size=16, substeps=5, dt=2e-4)
 
 
-WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}
+WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0, "soft": 0.5, "energy": 0.1}
+"""Terms of nodes, of distances and of particles."""
 
 SCENES = (ball(), ball(center=(0.4, 0.3, 0.6)), ball(friction=0.1))
 
@@ -43,7 +44,8 @@ def actions(batch: int = len(SCENES)) -> np.ndarray:
 
 def simulator(scenes: tuple[Scene, ...], device: str, **settings: float) -> Simulator:
     """A simulator whose targets are the scenes' own volume, moved."""
-    sim = Simulator(scenes, terms=make_terms(WEIGHTS), device=device, **settings)
+    terms = make_terms(WEIGHTS, {"energy": "suite:Kinetic"})
+    sim = Simulator(scenes, terms=terms, device=device, **settings)
     n = sim.grid_size
     grid = np.stack(np.meshgrid(*[np.arange(n) / n] * 3, indexing="ij"), axis=-1)
     distance = np.linalg.norm(grid - 0.6, axis=-1)
@@ -93,7 +95,7 @@ def test_gradient_descends(sim: Simulator) -> None:
     u = actions()
     sim.set_contact("soft")
     first = sim.rollout(u)
-    weights = np.array([10.0, 10.0, 1.0])
+    weights = np.array(list(WEIGHTS.values()))
     step = 1e-3 * first.gradient / np.abs(first.gradient).max()
     second = sim.rollout(u - step, gradient=False)
     before = (first.step_terms @ weights).sum(axis=1)
