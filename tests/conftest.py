@@ -29,6 +29,14 @@ def device() -> str:
     return DEVICE
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _simulators_of_one_module(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let go of what a module keeps in its ``CACHE``: beside it, others would be compiled anew."""
+    yield
+    if cache := getattr(request.module, "CACHE", None):
+        cache.clear()
+
+
 @pytest.fixture(autouse=True)
 def _own_databases(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep databases of the tests' results out of the user's cache folder."""

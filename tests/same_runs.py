@@ -14,6 +14,7 @@ import pytest
 from plab.config import Config
 from plab.results import RunResult, read, result_path
 from plab.results.running import RunFile
+from plab.reuse import SimulatorCache
 
 TIMES = ["seconds"]
 """Columns in which two runs of the same numbers differ."""
@@ -55,3 +56,14 @@ def stopped_at(call: int, where: type | Any = RunFile, name: str = "record") -> 
         patch.setattr(where, name, interrupted)
         with pytest.raises(KeyboardInterrupt):
             yield
+
+
+class KeepsAll(SimulatorCache):
+    """All simulators of a module's runs, so that none is built twice: that takes longer than a run."""
+
+    def get(self, key: Any, build: Callable[[], Any], *, check: Callable[[Any], object]) -> Any:
+        if key in self._kept:
+            check(self._kept[key])
+        else:
+            self._kept[key] = build()
+        return self._kept[key]

@@ -30,7 +30,6 @@ from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import family
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
-from plab.reuse import SimulatorCache
 from plab.runners import run_batch, run_config
 from plab.runners.common import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
@@ -41,7 +40,7 @@ from plab.runners.population.replay import Replay, Sizes
 from plab.runners.rl_models import CLIP, Spaces, model_kind
 from plab.sweep.plan import plan
 from plab.tally import Outcome
-from same_runs import finished_as, stopped_at
+from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import COARSE as SMALL_RUN
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
@@ -329,17 +328,6 @@ def assert_same_numbers(cfg: Config, want: RunResult) -> RunResult:
     # The same arrays in the same bytes.
     assert policy_path(got.path).read_bytes() == policy_path(want.path).read_bytes()
     return got
-
-
-class KeepsAll(SimulatorCache):
-    """All simulators of these tests, so that none waits for kernels twice."""
-
-    def get(self, key, build, *, check):
-        if key in self._kept:
-            check(self._kept[key])
-        else:
-            self._kept[key] = build()
-        return self._kept[key]
 
 
 CACHE = KeepsAll()

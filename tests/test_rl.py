@@ -22,7 +22,6 @@ from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
-from plab.reuse import SimulatorCache
 from plab.runners import RunError, rl, run_config
 from plab.runners.common import episode_columns, policy_episode, shared_batches
 from plab.runners.policy import load_policy, policy_path
@@ -30,9 +29,11 @@ from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
 from plab.sim import SimulationError
-from same_runs import assert_same_numbers
+from same_runs import KeepsAll, assert_same_numbers
 
 pytestmark = pytest.mark.physics
+
+CACHE = KeepsAll()
 
 HORIZON = 4
 
@@ -74,7 +75,7 @@ def make_config(folder: Path, method: str, *overrides: str) -> Config:
 
 
 def run(cfg: Config) -> RunResult:
-    score = run_config(cfg)
+    score = run_config(cfg, CACHE)
     result = read(result_path(cfg))
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
@@ -120,7 +121,7 @@ def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult],
     result = finished[method]
     policy = load_policy(result.path)
     last = result.iterations.iloc[-1]
-    batch = EpisodeBatch([make_config(result.path.parents[2], method)])
+    (batch,) = shared_batches(CACHE, make_config(result.path.parents[2], method), (1, "hard"))
     done = policy_episode(batch, policy)
     assert {name: done.measures[name] for name in COLUMNS} == {name: last[name] for name in COLUMNS}
 
@@ -193,7 +194,7 @@ def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
 
 
 def trainer_of(cfg: Config, folder: Path) -> Trainer:
-    batch, _ = shared_batches(SimulatorCache(), cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
+    batch, _ = shared_batches(CACHE, cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
     return Trainer(cfg, batch, folder / "replay", None)
 
 
@@ -243,7 +244,7 @@ def test_resumed_run_equals_an_uninterrupted_one(
     with monkeypatch.context() as patch:
         break_after(patch, evaluations, OSError("gone"))
         with pytest.raises(OSError, match="gone"):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", evaluations)
     resumed = run(cfg)
@@ -259,7 +260,7 @@ def test_networks_on_cuda_are_trained_resumed_and_kept(tmp_path, monkeypatch, me
     with monkeypatch.context() as patch:
         break_after(patch, 2, OSError("gone"))
         with pytest.raises(OSError, match="gone"):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     resumed = run(cfg)
     assert resumed.provenance["resumed"] == 1
     assert np.isfinite(resumed.iterations[1:].to_numpy()).all()
@@ -277,7 +278,7 @@ def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
     with monkeypatch.context() as patch:
         patch.setattr(rl.RlRunner, "judge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     assert not result_path(cfg).with_suffix(".replay").exists()
     assert_same_numbers(run(cfg), finished["sac"])
 
@@ -307,7 +308,7 @@ def test_a_state_that_is_not_finite_ends_the_run(tmp_path: Path, monkeypatch) ->
     cfg = make_config(tmp_path, "sac")
     break_after(monkeypatch, 2, SimulationError("environment 0, step 2: position is nan"))
     with pytest.raises(RunError, match="position is nan"):
-        run_config(cfg)
+        run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, len(left.iterations)) == ("failed", 2)
     assert left.best_actions is not None
@@ -318,10 +319,10 @@ def test_a_lost_replay_buffer_is_said(tmp_path: Path, monkeypatch) -> None:
     with monkeypatch.context() as patch:
         break_after(patch, 2, OSError("gone"))
         with pytest.raises(OSError, match="gone"):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     result_path(cfg).with_suffix(".replay").unlink()
     with pytest.raises(ResultsError, match=r"replay, the replay buffer of the run, is gone: .*force=true"):
-        run_config(cfg)
+        run_config(cfg, CACHE)
     assert result_path(cfg).with_suffix(".partial.h5").exists()
     run(replace(cfg, force=True))
 
@@ -335,7 +336,7 @@ def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> Non
     with pytest.raises(
         ResultsError, match=r"cannot reserve .* GB for the replay buffer at .*: No space left"
     ):
-        run_config(cfg)
+        run_config(cfg, CACHE)
     assert not list(tmp_path.rglob("*.replay"))
 
 
@@ -362,7 +363,7 @@ def test_tensorboard_files_are_beside_the_result(tmp_path: Path, finished) -> No
 
 
 def test_progress_counts_episodes(tmp_path: Path, capsys) -> None:
-    run_config(replace(make_config(tmp_path, "sac"), progress=True))
+    run_config(replace(make_config(tmp_path, "sac"), progress=True), CACHE)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Move-v1")]
     assert [line.split()[4].rstrip(",") for line in lines] == ["2/16", "6/16", "12/16", "16/16"]
     assert "steps/s reward" in lines[-1] and " score " in lines[-1] and " left, " in lines[-1]

@@ -16,14 +16,15 @@ from plab.families import FAMILIES
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import RunResult, read, result_path
-from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_config, trajectory
 from plab.runners.common import measures, shared_problem
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
-from same_runs import assert_same_numbers
+from same_runs import KeepsAll, assert_same_numbers
 
 pytestmark = pytest.mark.physics
+
+CACHE = KeepsAll()
 
 ITERATIONS = 4
 
@@ -49,7 +50,7 @@ def make_config(folder: Path, *overrides: str) -> Config:
 
 
 def run(cfg: Config) -> RunResult:
-    score = run_config(cfg)
+    score = run_config(cfg, CACHE)
     result = read(result_path(cfg))
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
@@ -157,7 +158,7 @@ def test_best_actions_are_kept(tmp_path: Path) -> None:
     assert result.best_iteration == best
     assert result.best_loss == result.iterations["loss"][best]
     assert np.abs(result.best_actions).max() <= 1.0
-    problem = shared_problem(SimulatorCache(), [cfg])
+    problem = shared_problem(CACHE, [cfg])
     problem.simulator.set_contact("soft", cfg.method.softness)
     again = problem.rollout(result.best_actions[None], gradient=True)
     assert again.loss.sum() == result.best_loss
@@ -182,7 +183,7 @@ def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monke
     cfg = make_config(Path(finished.config["results_dir"]))
     before = finished.path.stat().st_mtime_ns
     monkeypatch.setattr(trajectory, "shared_problem", None)
-    assert run_config(cfg) == finished.evaluation["score"]
+    assert run_config(cfg, CACHE) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out
     assert out.count("\n") == 1
@@ -222,7 +223,7 @@ def test_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, finished, monke
     with monkeypatch.context() as patch:
         break_rollout(patch, at, lambda _: _raise(OSError("gone")))
         with pytest.raises(OSError, match="gone"):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", at)
     resumed = run(cfg)
@@ -236,7 +237,7 @@ def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, 
     with monkeypatch.context() as patch:
         break_rollout(patch, 2, lambda _: _raise(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
-            run_config(cfg)
+            run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, len(left.iterations)) == ("stopped", 2)
     assert_same_numbers(run(cfg), finished)
@@ -275,7 +276,7 @@ def test_a_rollout_that_fails_ends_the_run(
 
     monkeypatch.setattr(Simulator, "rollout", rollout)
     with pytest.raises(raised) as caught:
-        run_config(cfg)
+        run_config(cfg, CACHE)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", str(caught.value), 2)
@@ -283,7 +284,7 @@ def test_a_rollout_that_fails_ends_the_run(
 
 
 def test_progress_is_plain_lines_without_a_terminal(tmp_path: Path, capsys) -> None:
-    run_config(replace(make_config(tmp_path), progress=True))
+    run_config(replace(make_config(tmp_path), progress=True), CACHE)
     # Taichi has lines of its own to say.
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Rope-v1")]
     assert len(lines) == 2

@@ -38,7 +38,11 @@ class SimulatorCache:
             pass
         # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels
         # again.
-        self._kept.clear()
-        gc.collect()
+        self.clear()
         self._kept[key] = build()
         return self._kept[key]
+
+    def clear(self) -> None:
+        """Let go of what is kept."""
+        self._kept.clear()
+        gc.collect()
