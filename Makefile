@@ -33,7 +33,7 @@ BIN := $(VENV)/bin
 
 # A file of tests per process and core at a time (tests/scheduling.py): kernels are compiled once per process.
 # A test that hangs is ended after a quarter of an hour, and told with where it hung.
-PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
 .PHONY: run dev test test-unit test-slow lint typecheck coverage benchmark docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html
