@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -99,8 +100,23 @@ def test_a_mistake_in_a_fresh_process(tmp_path):
 # ----------------------------------------------------------------------------------------------- help, --cfg
 
 
-def test_help_names_everything(capsys):
-    assert main(["--help"]) == main(["-h", "task=nonsense"]) == 0
+def test_help_is_two_screens_with_the_names_of_all_choices(capsys):
+    assert main(["--help"]) == 0
+    text, _ = capsys.readouterr()
+    assert main(["-h", "task=nonsense"]) == 0
+    assert capsys.readouterr().out == text
+    lines = text.splitlines()
+    assert len(lines) <= 48 and max(map(len, lines)) <= 100
+    words = set(re.findall(r"\w+", text))
+    for group in (*GROUPS, "experiment"):
+        assert set(choices(group)) <= words
+    for key in ("variant=1", "seed=0", "results_dir=results", "method.iterations=200", "sim.device=cpu"):
+        assert f"  {key} " in text
+    assert "--help-all" in text
+
+
+def test_help_all_names_everything(capsys):
+    assert main(["--help-all"]) == main(["--help-all", "task=nonsense"]) == 0
     text, _ = capsys.readouterr()
     for group in GROUPS:
         assert all(f"{group}={name}" in text for name in choices(group))

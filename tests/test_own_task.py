@@ -147,6 +147,8 @@ def test_every_variant_of_the_example_is_valid_and_keeps_the_volume():
 
 def test_names_of_both_folders_are_offered(capsys):
     assert main(["--help", "--config-dir", str(OWN)]) == 0
+    assert "Dumbbell" in capsys.readouterr().out
+    assert main(["--help-all", "--config-dir", str(OWN)]) == 0
     text, _ = capsys.readouterr()
     assert "task=Dumbbell   Two spheres catch a dumbbell" in text
     assert "sim=coarse     A coarse grid" in text and "sim=fast" in text and "task=Rope" in text

@@ -109,7 +109,7 @@ def _configuration() -> Iterator[str]:
     yield (
         "Every key, from the dataclasses that check them. Defaults are those of `conf/`, of a task those of "
         "Rope, of what a profile sets those of `release`. "
-        "`python -m plab.run --help` prints the same with the comments of the files.\n"
+        "`python -m plab.run --help-all` prints the same with the comments of the files.\n"
     )
     for title, prefix, kind, source in SECTIONS:
         yield f"## {title}\n"

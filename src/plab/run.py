@@ -24,7 +24,7 @@ from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
 from plab.checks import check_device, check_packages, check_sources
-from plab.cli_help import help_text
+from plab.cli_help import full_help_text, help_text
 from plab.command import EXIT_INTERRUPTED, EXIT_USER_ERROR, command_line, complain
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config_errors import COMPOSE_ERRORS, explain, pick
@@ -55,8 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     tally = Tally()
     argv, arguments = _parse(list(sys.argv[1:] if argv is None else argv))
-    if arguments.help:
-        print(help_text(arguments.config_dir))
+    if arguments.help or arguments.help_all:
+        text = full_help_text if arguments.help_all else help_text
+        print(text(arguments.config_dir))
         return 0
     try:
         with _hydra_raises(argv):
@@ -158,6 +159,7 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
             does not do.
     """
     parser = get_args_parser()
+    parser.add_argument("--help-all", action="store_true")
     flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
 
     def refuse(message: str) -> NoReturn:
@@ -175,7 +177,8 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
         rest.remove(override)
     arguments.overrides = quote_folders(arguments.overrides)
     try:
-        check_overrides([] if arguments.help else arguments.overrides, arguments.config_dir)
+        asked = arguments.help or arguments.help_all
+        check_overrides([] if asked else arguments.overrides, arguments.config_dir)
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from error
     return [*arguments.overrides, *rest], arguments
