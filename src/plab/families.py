@@ -74,6 +74,7 @@ class Family:
         population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they
             share a simulator if they have the same section ``method``. ``runner`` carries out the others.
         rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
+        contact: Contact model in which rows are measured, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
         methods: Appearance of methods by name; others appear in grey, by their names.
     """
@@ -87,6 +88,7 @@ class Family:
     batching: bool = False
     population: type | str | None = None
     rules: Mapping[str, Rule] = field(default_factory=dict)
+    contact: str | None = None
     kind: str = ""
     methods: Mapping[str, Appearance] = field(default_factory=dict)
 
@@ -161,6 +163,7 @@ FAMILIES: dict[str, Family] = {
         runner="plab.runners.planners.planner:PlannerRunner",
         ranking="score",
         batching=True,
+        contact="hard",
         rules={
             "multistart": Rule(f"{_PLANNERS}.multistart:Multistart", f"{_TYPES}:MultistartConfig"),
             "cem": Rule(f"{_PLANNERS}.cem:Cem", f"{_TYPES}:CemConfig"),
@@ -190,6 +193,7 @@ FAMILIES: dict[str, Family] = {
             "td3": Rule("plab.runners.rl_models:TD3", f"{_TYPES}:Td3Config", f"{_AGENTS}.td3:Td3Agents"),
             "ppo": Rule("plab.runners.rl_models:PPO", f"{_TYPES}:PpoConfig", f"{_AGENTS}.ppo:PpoAgents"),
         },
+        contact="hard",
         kind=RL,
         methods={
             "sac": Appearance("SAC", "#0072B2"),

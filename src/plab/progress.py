@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 
 from rich.console import Console
@@ -13,15 +13,21 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    Task,
     TextColumn,
     TimeRemainingColumn,
 )
 from rich.table import Column
+from rich.text import Text
 
-__all__ = ["Report", "forward_to", "show_progress", "show_several"]
+__all__ = ["Report", "Watcher", "forward_to", "show_progress", "show_several", "show_waiting"]
 
 Report = Callable[[int, str], None]
 """Takes the number of steps done and a short text about how it goes."""
+
+Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
+"""Takes what is to be called with the name of what is waited for, or nothing, while its block lasts; such as
+:func:`plab.sim.compiling.watch_compiling`."""
 
 Forward = Callable[[str, int, int, int, int, str], None]
 """Takes title, first step, steps to do, steps between two plain lines, steps done, and text."""
@@ -40,7 +46,13 @@ def forward_to(forward: Forward) -> None:
 
 @contextmanager
 def show_progress(
-    title: str, start: int, total: int, *, enabled: bool = True, plain_every: int = PLAIN_EVERY
+    title: str,
+    start: int,
+    total: int,
+    *,
+    enabled: bool = True,
+    plain_every: int = PLAIN_EVERY,
+    compiling: Watcher | None = None,
 ) -> Iterator[Report]:
     """Show how far a run has come while the ``with`` block lasts.
 
@@ -50,6 +62,7 @@ def show_progress(
         total: Steps to do, the ones done before included.
         enabled: Whether to show anything.
         plain_every: Steps between two lines where there is no terminal.
+        compiling: Says which kernel is being compiled, which is shown on a terminal; None: nothing does.
 
     Yields:
         Function to call after every step.
@@ -64,7 +77,58 @@ def show_progress(
     else:
         with Progress(*_columns(), console=console, expand=True) as progress:
             task = progress.add_task(title, total=total, completed=start, text="")
-            yield lambda done, text: progress.update(task, completed=done, text=text)
+            with _noted(progress, compiling):
+                yield lambda done, text: progress.update(task, completed=done, text=text)
+
+
+@contextmanager
+def show_waiting(title: str, compiling: Watcher, *, enabled: bool = True) -> Iterator[None]:
+    """Show on a terminal that something is made ready while the ``with`` block lasts, and which kernel is
+    being compiled.
+
+    Args:
+        title: What is made ready.
+        compiling: Says which kernel it is.
+        enabled: Whether to show anything.
+    """
+    console = Console()
+    if not enabled or _forward is not None or not console.is_terminal:
+        yield
+        return
+    columns = TextColumn("{task.description}"), _TextColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
+        progress.add_task(title, total=None, text="")
+        with _noted(progress, compiling):
+            yield
+
+
+@contextmanager
+def _noted(progress: Progress, compiling: Watcher | None) -> Iterator[None]:
+    """Have a bar's text say which kernel is being compiled, and for how long, while it is."""
+    if compiling is None:
+        yield
+        return
+    (task,) = progress.task_ids
+
+    def note(kernel: str) -> None:
+        # At once: the compiler may keep the thread that draws from running for seconds.
+        progress.update(task, kernel=kernel, since=time.monotonic(), refresh=bool(kernel))
+
+    with compiling(note):
+        yield
+
+
+class _TextColumn(ProgressColumn):
+    """How a run goes, or which kernel is being compiled and for how long."""
+
+    def __init__(self) -> None:
+        super().__init__(Column(no_wrap=True))
+
+    def render(self, task: Task) -> Text:
+        """Return the text."""
+        if kernel := task.fields.get("kernel"):
+            return Text(f"compiling {kernel}, {time.monotonic() - task.fields['since']:.0f} s")
+        return Text(task.fields["text"])
 
 
 @contextmanager
@@ -113,7 +177,7 @@ def _columns() -> tuple[ProgressColumn, ...]:
         BarColumn(bar_width=None, table_column=Column(ratio=1)),
         MofNCompleteColumn(table_column=whole()),
         TimeRemainingColumn(table_column=whole()),
-        TextColumn("{task.fields[text]}", table_column=whole()),
+        _TextColumn(),
     )
 
 

@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _hydra_raises(argv):
             hydra.main(config_path=str(conf_folder()), config_name="config", version_base="1.3")(
-                _job(tally)
+                _job(tally, arguments.config_dir)
             )()
     except Refusal as refusal:
         return complain(str(refusal), refusal.code)
@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return max(tally.code, tally.report())
 
 
-def _job(tally: Tally) -> TaskFunction:
+def _job(tally: Tally, config_dir: str | None) -> TaskFunction:
     """Return what Hydra calls with the configuration of a single run, or of a job of another launcher."""
 
     # Launchers other than plab's may do one job after the other in this process.
@@ -97,7 +97,7 @@ def _job(tally: Tally) -> TaskFunction:
     def job(composed: DictConfig) -> float:
         tally.started = True
         try:
-            return _run(composed, cache)
+            return _run(composed, cache, config_dir)
         except Refusal as refusal:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 # It has to get out of the job's process.
@@ -116,7 +116,7 @@ def _job(tally: Tally) -> TaskFunction:
     return job
 
 
-def _run(composed: DictConfig, cache: SimulatorCache) -> float:
+def _run(composed: DictConfig, cache: SimulatorCache, config_dir: str | None) -> float:
     """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
     # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
@@ -125,16 +125,20 @@ def _run(composed: DictConfig, cache: SimulatorCache) -> float:
         check_sources(cfg)
         check_device(cfg)
         check_packages(cfg)
+        from plab.next_steps import next_steps
         from plab.runners import run_config
         from plab.runners.jobs import USER_ERRORS, RunBusyError, RunError
     except _CONFIG_ERRORS as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
     try:
-        return run_config(cfg, cache)
+        score = run_config(cfg, cache)
     except (RunBusyError, RunError) as error:
         raise Refusal(str(error), EXIT_BROKE_OFF) from error
     except USER_ERRORS as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
+    if cfg.progress and HydraConfig.get().mode == RunMode.RUN:
+        print(*next_steps(cfg, HydraConfig.get().overrides.task, config_dir), sep="\n")
+    return score
 
 
 def _require_sweep(settings: Any) -> None:

@@ -122,7 +122,7 @@ class Config:
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
-        progress: Show a progress bar.
+        progress: Show a progress bar, and what to do next at the end.
         checkpoint_seconds: Time between two writings of the state from which a killed run goes on [s].
     """
 

@@ -48,9 +48,8 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
         _carry_out_all([job], "", cache or SimulatorCache(), in_sweep=False)
     if job.error is not None:
         raise job.error
-    score = job.run.result.score
-    print(f"{'finished before' if before else 'finished'}: score {score:.4f}, {job.run.path}")
-    return score
+    print(f"{'finished before' if before else 'finished'}: {job.told}, {job.run.path}")
+    return job.run.result.score
 
 
 def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | None = None) -> list[Outcome]:
@@ -82,7 +81,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
     for number, job in jobs.items():
         ended[number] = one = _outcome(job, "before" if number in before else "finished")
         if one.status == "finished":
-            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
+            print(f"finished: {job.told}, {one.path}", flush=True)
     return [ended[number] for number in range(len(cfgs))]
 
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from plab.config_errors import ConfigError
 from plab.errors import PlabError
+from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
+from plab.results.schema import counts_last
 from plab.scene import SceneError
 from plab.tally import Outcome
 from plab.targets import TargetError
@@ -54,6 +56,24 @@ class Job:
     cfg: Config
     run: RunFile
     error: Exception | None = None
+
+    @property
+    def contact(self) -> str:
+        """Contact model in which its rows are measured."""
+        return family(self.cfg.method.family).contact or self.cfg.method.contact
+
+    @property
+    def told(self) -> str:
+        """What is said of it when it has finished: its score, and how that differs from the score of the row
+        with the best actions, if it does."""
+        result = self.run.result
+        text = f"score {result.score:.4f}"
+        if counts_last(result.config) or self.contact == "hard":
+            return text
+        shown = float(result.iterations["score"].iloc[result.best_iteration])
+        if f"{shown:.4f}" == f"{result.score:.4f}":
+            return text
+        return f"{text} in the hard contact model ({shown:.4f} in the {self.contact} one of its iterations)"
 
     @property
     def open(self) -> bool:

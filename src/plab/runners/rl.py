@@ -158,7 +158,7 @@ class _Watch(BaseCallback):
 
     def _text(self) -> str:
         now = time.perf_counter()
-        text = f"reward {self._trainer.last_reward:.4g} score {self.score:.3f}"
+        text = f"reward {self._trainer.last_reward:.4g} hard score {self.score:.3f}"
         if self._first is None:
             # What was before compiled the kernels.
             self._first = now, self.num_timesteps

@@ -18,12 +18,13 @@ import numpy as np
 from plab.config import ConfigError
 from plab.families import family
 from plab.problem import Episodes, Problem
-from plab.progress import PLAIN_EVERY, Report, show_progress
+from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
 from plab.results import BUDGETS, ResultsError, row_count
 from plab.reuse import SimulatorCache
 from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
 from plab.sim import DeviceError, SimulationError
+from plab.sim.compiling import watch_compiling
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -237,7 +238,9 @@ class Runner:
         """Report how it goes after an iteration, of several runs on average."""
         loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
         best = np.mean([track.best_loss for track in tracks])
-        text = f"{'' if len(rows) == 1 else 'mean '}loss {loss:.5g} score {score:.3f} best {best:.5g}"
+        contact = " and ".join(dict.fromkeys(track.job.contact for track in tracks))
+        mean = "" if len(rows) == 1 else "mean "
+        text = f"{mean}loss {loss:.5g} {contact} score {score:.3f} best {best:.5g}"
         self.report(min(track.iteration for track in tracks), text)
 
     # ------------------------------------------------------------------------------------ what hooks may use
@@ -267,12 +270,21 @@ class Runner:
             raise self._unfinished()
         with self.context(), simulation_errors():
             try:
-                self._build()
+                with self._waiting("build"):
+                    self._build()
                 self._optimise()
             finally:
                 self._clock.stop()
                 self.close()
-            self._conclude()
+            with self._waiting("final evaluation"):
+                self._conclude()
+
+    def _heading(self) -> str:
+        return self._note + batch_title([track.cfg for track in self.tracks])
+
+    def _waiting(self, what: str) -> AbstractContextManager[None]:
+        enabled = self.tracks[0].cfg.progress
+        return show_waiting(f"{self._heading()} {what}", watch_compiling, enabled=enabled)
 
     def _build(self) -> None:
         self.enter("build")
@@ -312,11 +324,16 @@ class Runner:
     def _optimise(self) -> None:
         """Do the iterations that the files do not hold yet."""
         done, total, every = self.extent()
-        first = self.tracks[0].cfg
-        heading = self._note + batch_title([track.cfg for track in self.tracks])
         # The first rollout of a process compiles the kernels.
         phase = "compile"
-        with show_progress(heading, done, total, enabled=first.progress, plain_every=every) as self.report:
+        with show_progress(
+            self._heading(),
+            done,
+            total,
+            enabled=self.tracks[0].cfg.progress,
+            plain_every=every,
+            compiling=watch_compiling,
+        ) as self.report:
             while active := [track for track in self.tracks if track.job.open and self.has_more(track)]:
                 self._clock.enter(phase, active)
                 with simulation_errors(f"iteration {active[0].iteration}: "):

@@ -136,7 +136,7 @@ class PopulationRunner(Runner):
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Report how the agents that were evaluated do on average, and the transitions of all per second."""
         reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
-        text = f"mean reward {reward:.4g} score {score:.3f}"
+        text = f"mean reward {reward:.4g} hard score {score:.3f}"
         self.report(self._least(tracks), f"{self._rate:.0f} steps/s {text}" if self._rate else text)
 
     def close(self) -> None:
