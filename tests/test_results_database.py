@@ -40,8 +40,8 @@ from plab.results import (
 from plab.results.__main__ import main
 from plab.results.store import Store
 from plab.selection import Selection
-from plab.status import main as status
 from plab.status import survey
+from plab.status.__main__ import main as status
 
 DATABASE = ".plab.sqlite"
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab import run, status
+from plab import run
 from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
 from plab.command import command_line
@@ -26,6 +26,7 @@ from plab.report import __main__ as report
 from plab.results import ResultsError
 from plab.results import __main__ as results
 from plab.sim import Simulator
+from plab.status import __main__ as status
 from plab.targets import __main__ as targets
 from plab.view import __main__ as view
 from refusals import refusal

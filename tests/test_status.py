@@ -7,17 +7,22 @@ import dataclasses
 import io
 import json
 import os
+import re
 import time
 from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import synthetic
+from plab.errors import ArgumentError
 from plab.locks import acquire
 from plab.results import pack
 from plab.selection import SelectionError, select
-from plab.status import NAMES, STATES, duration, main, survey
+from plab.status import NAMES, STATES, survey, view
+from plab.status.__main__ import main
+from plab.status.view import duration, watch
 
 
 def begin(folder: Path, rows: int, *, status: str = "running", message: str = "", **which) -> Path:
@@ -37,8 +42,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def find(folder: Path, *words: str):
-    return survey(folder, select(words, NAMES))
+def find(folder: Path, *words: str, missing: bool = False):
+    return survey(folder, select(words, NAMES), missing=missing)
 
 
 def counts(found) -> dict[str, int]:
@@ -46,7 +51,7 @@ def counts(found) -> dict[str, int]:
 
 
 def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder: Path) -> None:
-    found = find(folder)
+    found = find(folder, missing=True)
     assert len(found.runs) == 10 * 5 * 1 * 3
     assert counts(found) == {"done": 2, "running": 0, "interrupted": 2, "failed": 1, "missing": 145}
     assert len(found.groups) == 10 and found.eta is None
@@ -54,8 +59,35 @@ def test_suite_grid_is_expected_with_the_methods_and_seeds_that_are_there(folder
 
 
 def test_empty_folder_expects_the_papers_methods_and_three_seeds(tmp_path: Path) -> None:
-    found = find(tmp_path)
+    found = find(tmp_path, missing=True)
     assert counts(found)["missing"] == len(found.runs) == 10 * 5 * 6 * 3
+
+
+def test_what_nobody_asks_for_is_not_missing(tmp_path: Path, capsys) -> None:
+    synthetic.save(synthetic.run(tmp_path))
+    assert counts(find(tmp_path)) == dict.fromkeys(STATES, 0) | {"done": 1}
+    assert main([str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "1 runs: 1 done\n" in text and "Move" not in text and "missing" not in text.splitlines()[-1]
+    assert main([str(tmp_path), "--missing"]) == 0
+    assert capsys.readouterr().out.endswith("50 runs: 1 done, 49 missing\n")
+
+
+def test_words_ask_for_all_combinations_with_what_there_is(folder: Path) -> None:
+    # Variants 1 and 2 have runs, of adam alone.
+    found = find(folder, "seed=0,5")
+    assert [(run.variant, run.seed, run.state) for run in found.runs] == [
+        ("1", "0", "done"),
+        ("1", "5", "missing"),
+        ("2", "0", "interrupted"),
+        ("2", "5", "missing"),
+    ]
+
+
+def test_an_empty_folder_says_how_to_begin(tmp_path: Path, capsys) -> None:
+    assert main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "no runs: python -m plab.run task=Move makes one"
+    assert counts(find(tmp_path, "task=Rope", "method=adam"))["missing"] == 5 * 3
 
 
 def test_words_choose_what_is_expected(folder: Path) -> None:
@@ -94,7 +126,15 @@ def test_protocols_are_not_mixed(folder: Path) -> None:
 
 def test_runs_outside_of_the_grid_are_counted_apart(folder: Path) -> None:
     synthetic.save(synthetic.run(folder, variant="random7"))
-    assert find(folder).others == 1
+    assert find(folder, missing=True).others == 1
+    assert find(folder).others == 0 and find(folder).runs[-1].variant == "random7"
+
+
+def test_several_folders_and_archives_are_one_choice(folder: Path, tmp_path_factory) -> None:
+    other = tmp_path_factory.mktemp("other")
+    synthetic.save(synthetic.run(other, task="Move"))
+    found = survey([folder, other], select([], NAMES))
+    assert counts(found)["done"] == 3 and [run.task for run in found.runs] == ["Move"] + ["Rope"] * 5
 
 
 def test_running_is_a_held_lock(folder: Path) -> None:
@@ -206,7 +246,7 @@ def test_forms_of_output(folder: Path, capsys) -> None:
     [
         (["tusk=Rope"], "choose from: task"),
         (["task=,"], "cannot read"),
-        (["a", "b"], "one folder at a time"),
+        (["a", "b"], "does not exist"),
         (["/nowhere/at/all"], "does not exist"),
     ],
 )
@@ -233,3 +273,69 @@ def test_words_are_read_as_in_a_sweep() -> None:
 )
 def test_durations(seconds: float | None, text: str) -> None:
     assert duration(seconds) == text
+
+
+# ------------------------------------------------------------------------------------------------------ live
+
+
+@pytest.fixture
+def screen(monkeypatch) -> io.StringIO:
+    """A terminal of 14 lines."""
+    text = io.StringIO()
+    terminal = Console(file=text, force_terminal=True, width=100, height=14, color_system=None)
+    monkeypatch.setattr(view, "Console", lambda: terminal)
+    return text
+
+
+def test_all_runs_of_a_sweep_are_shown_until_they_have_ended(folder: Path, screen: io.StringIO) -> None:
+    lock = acquire(begin(folder, 3, variant="3", seed=1))
+    seen: list[str] = []
+
+    def meanwhile(_seconds: float) -> None:
+        seen.append(screen.getvalue())
+        screen.seek(0)
+        screen.truncate()
+        synthetic.save(synthetic.run(folder, variant="3", seed=len(seen)))
+        if len(seen) == 1:
+            lock.release()
+
+    words = "variant=1,3", "seed=1,2"
+    watch(lambda: find(folder, *words), meanwhile)
+    assert len(seen) == 2
+    for line in (
+        r"Rope-v1 adam seed 1 +done +4/4 *",
+        r"Rope-v1 adam seed 2 +failed: iteration 2: loss is nan +2/4 *",
+        r"Rope-v3 adam seed 1 +running +3/4 +[\d.]+/s +\d+ s *",
+        r"Rope-v3 adam seed 2 +missing *",
+        r"4 runs: 1 done, 1 running, 1 failed, 1 missing *",
+    ):
+        assert any(re.fullmatch(line, one) for one in seen[0].splitlines()), (line, seen[0])
+    assert "4 runs: 2 done, 1 failed, 1 missing" in seen[1]
+    assert "4 runs: 3 done, 1 failed\n" in screen.getvalue()
+
+
+def test_on_a_small_screen_what_is_under_way_comes_first(tmp_path: Path, screen: io.StringIO) -> None:
+    for seed in range(20):
+        synthetic.save(synthetic.run(tmp_path, seed=seed))
+    lock = acquire(begin(tmp_path, 3, variant="3", seed=1))
+
+    seen: list[str] = []
+
+    def once(_seconds: float) -> None:
+        seen.append(screen.getvalue())
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        watch(lambda: find(tmp_path), once)
+    lines = seen[0].splitlines()
+    # A heading, eight runs, and the sums.
+    (first,) = [number for number, line in enumerate(lines) if line.startswith("Rope-v3 adam seed 1 ")]
+    assert lines[first + 8].startswith("... and 13 more") and len(lines) <= 14
+    lock.release()
+
+
+def test_watching_needs_a_terminal(folder: Path, capsys) -> None:
+    assert main([str(folder), "--watch"]) == 2
+    assert capsys.readouterr().err == "plab: --watch needs a terminal: leave it out, or use --json\n"
+    with pytest.raises(ArgumentError):
+        watch(lambda: find(folder))

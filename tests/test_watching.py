@@ -201,7 +201,7 @@ def test_the_last_lines_of_a_real_run(tmp_path, capsys, monkeypatch) -> None:
     assert capsys.readouterr().out == f"finished before: {score.partition(': ')[2]}\n"
 
 
-# ------------------------------------------------------------------------------------------- what a kill keeps
+# ------------------------------------------------------------------------------------------ what a kill keeps
 
 
 @pytest.mark.physics

@@ -1,4 +1,4 @@
-"""The texts of ``--help`` and ``--help-all``, made from the YAML files, so that they cannot disagree with them."""
+"""The texts of ``--help`` and ``--help-all``, made from the YAML files, which they cannot disagree with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tells when kernels are compiled: at their first launch, which takes seconds where others take milliseconds."""
+"""Tells when kernels are compiled: at their first launch, which takes seconds, not milliseconds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from taichi.lang import kernel_impl
 __all__ = ["watch_compiling"]
 
 _ENTRY = "_get_tree_and_ctx"
-"""What Taichi calls once per kernel and function that it compiles, and never at a launch of one that it has."""
+"""What Taichi calls for each kernel and function that it compiles, and at no launch of one that it has."""
 
 
 @contextmanager

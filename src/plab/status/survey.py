@@ -1,29 +1,17 @@
-"""What is done, running, failed and missing: ``python -m plab.status [results] [task=... seed=...]``.
-
-The runs that are asked for are all combinations of task, variant, method and seed. The words choose them as
-those of a sweep do; what they leave open is the suite's tasks and variants, and the methods and seeds that
-the results have.
-"""
+"""Which runs there are and should be, what has become of each, and how long the rest takes."""
 
 from __future__ import annotations
 
-import argparse
-import csv
 import itertools
-import json
 import math
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-from plab.arguments import sources_and_words
-from plab.command import command_line
-from plab.examples import EXAMPLES, resolve
 from plab.locks import held
 from plab.possible import require_possible
 from plab.results import ResultsError, Row, row_count
@@ -31,16 +19,17 @@ from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes, columns, numbers
 from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
-from plab.selection import Selection, SelectionError, one_protocol, select
+from plab.selection import Selection, SelectionError, one_protocol
 from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.tally import MOST_RUNS
 
-__all__ = ["STATES", "Group", "Run", "Survey", "main", "survey"]
+__all__ = ["NAMES", "STATES", "Group", "Run", "Survey", "survey"]
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """What a run can be, best first; ``interrupted`` goes on when its command is given again."""
 
 NAMES = ("task", "variant", "method", "seed")
+"""What tells runs apart."""
 
 Key: TypeAlias = tuple[str, str, str, str]
 """Task, variant, method and seed of a run."""
@@ -147,24 +136,28 @@ class Survey:
         return max(left / self.workers, longest)
 
 
-def survey(source: str | Path, chosen: Selection) -> Survey:
+def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, missing: bool = False) -> Survey:
     """Find out what has become of the runs that are asked for.
 
     Args:
-        source: Folder of results, or archive.
-        chosen: Which runs; tasks and variants that it leaves open are the suite's, methods and seeds those of
-            the results, or the paper's if there are none.
+        source: Folder of results, archive, or several.
+        chosen: Which runs: all combinations of what it names with what the results have of the rest.
+        missing: Ask for the suite's tasks and variants, too, where ``chosen`` leaves them open, with the
+            methods and seeds that the results have, or the paper's if there are none.
 
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
         SelectionError: If there are runs of several protocols, or more are asked for than a sweep has.
         plab.config.ConfigError: If no run can be of the choice.
     """
-    found, unreadable = readable_rows(source)
+    sources = [source] if isinstance(source, str | Path) else source
+    found, unreadable = readable_rows(sources)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
-    runs = {key: Run(*key) for key in _expected(fitting, chosen)}
+    begun = [key for each in sources for key in _begun(Path(each))]
+    keys = _expected(fitting, begun, chosen, missing)
+    runs = {key: Run(*key) for key in keys}
     others = 0
     for row in fitting:
         run = runs.get(_key(row))
@@ -172,8 +165,9 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
         others += run is None or run.state != "missing"
         if run is not None:
             _take(run, row)
-    for run in _starting(Path(source), runs):
-        run.state = "running"
+    for key in begun:
+        if key in runs and runs[key].state not in ("done", "running"):
+            runs[key].state = "running"
     means = _mean_seconds(runs.values())
     for run in runs.values():
         _estimate(run, means.get((run.task, run.method)))
@@ -186,21 +180,62 @@ def survey(source: str | Path, chosen: Selection) -> Survey:
 # --------------------------------------------------------------------------------------------------- counting
 
 
-def _expected(found: Sequence[Row], chosen: Selection) -> Iterable[Key]:
-    present = {name: {str(row.values[name]) for row in found} for name in ("method", "seed")}
-    methods = [m for m in PAPER_METHODS if m in present["method"]] + sorted(
-        present["method"] - {*PAPER_METHODS}
-    )
+def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> Iterable[Key]:
+    present = list(dict.fromkeys(_key(row) for row in found))
+    if not chosen.keys:
+        # Of a run without a file only its name is known.
+        present += [key for key in dict.fromkeys(begun) if key not in present and chosen(_values(key), {})]
+    if missing or (not present and chosen.choices):
+        return _suite(present, chosen)
+    # What the words name takes the place of what a run has.
+    asked = {
+        tuple(tuple(chosen.choices.get(name, [own])) for name, own in zip(NAMES, key, strict=True))
+        for key in present
+    }
+    _require_few(sum(math.prod(map(len, names)) for names in asked))
+    keys = {key for names in asked for key in cast(Iterable[Key], itertools.product(*names))}
+    return sorted(keys, key=_rank)
+
+
+def _suite(present: Sequence[Key], chosen: Selection) -> Iterable[Key]:
+    """Return all combinations of what is chosen, of the suite's tasks and variants, and of the methods and
+    seeds that there are."""
+    methods, seeds = ({key[number] for key in present} for number in (2, 3))
     open_choices = {
         "task": suite_tasks(),
         "variant": list(SUITE_VARIANTS),
-        "method": methods or list(PAPER_METHODS),
-        "seed": sorted(present["seed"], key=int) or list(PAPER_SEEDS),
+        "method": _in_order(methods, PAPER_METHODS) or list(PAPER_METHODS),
+        "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
     }
     asked = [chosen.choices.get(name, open_choices[name]) for name in NAMES]
-    if (count := math.prod(map(len, asked))) > MOST_RUNS:
-        raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
+    _require_few(math.prod(map(len, asked)))
     return cast(Iterable[Key], itertools.product(*asked))
+
+
+def _require_few(count: int) -> None:
+    if count > MOST_RUNS:
+        raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
+
+
+def _in_order(names: Iterable[str], known: Sequence[str]) -> list[str]:
+    """Return names in the order of those that are known, the others after them."""
+    return sorted(names, key=lambda name: _place(name, known))
+
+
+def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
+    return (known.index(name), "") if name in known else (len(known), name)
+
+
+def _rank(key: Key) -> tuple[Any, ...]:
+    """Return where a run is in tables: by task, method, variant and seed."""
+    task, variant, method, seed = key
+    number = int(seed) if seed.isdecimal() else -1
+    orders = (task, suite_tasks()), (method, PAPER_METHODS), (variant, SUITE_VARIANTS)
+    return *(_place(name, list(known)) for name, known in orders), number, seed
+
+
+def _values(key: Key) -> dict[str, str]:
+    return dict(zip(NAMES, key, strict=True))
 
 
 def _key(row: Row) -> Key:
@@ -235,15 +270,14 @@ def _take(run: Run, row: Row) -> None:
         _measure(run)
 
 
-def _starting(source: Path, runs: dict[Key, Run]) -> Iterable[Run]:
-    """Yield missing runs that somebody has begun: there is a lock, but no file yet."""
+def _begun(source: Path) -> Iterable[Key]:
+    """Yield runs that somebody computes, also those that have no file yet."""
     if not source.is_dir():
         return
     for lock in source.rglob("*.lock"):
         names = parse_member(lock)
-        run = None if names is None else runs.get(_names(names))
-        if run is not None and run.state not in ("done", "running") and held(lock.with_suffix(".h5")):
-            yield run
+        if names is not None and held(lock.with_suffix(".h5")):
+            yield _names(names)
 
 
 # -------------------------------------------------------------------------------------------------- estimates
@@ -331,101 +365,3 @@ def _sum(values: Iterable[float | None]) -> float | None:
             return None
         total += value
     return total
-
-
-# ----------------------------------------------------------------------------------------------------- output
-
-
-def duration(seconds: float | None) -> str:
-    """Write a time for people: ``45 s``, ``12 min``, ``3 h 20 min``, ``2 d 4 h``."""
-    if seconds is None or not math.isfinite(seconds):
-        return "?"
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = round(seconds / 60)
-    if minutes < 100:
-        return f"{minutes} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d {hours % 24} h"
-
-
-def _show(found: Survey) -> None:
-    # Imported here: scripts that read --json need no tables.
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    # Not narrower than the table where the output is no terminal.
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    table = Table("task", "method")
-    for title in ("done", *STATES[1:], "mean time", "rate", "time left"):
-        table.add_column(title, justify="right")
-    for group in found.groups:
-        counts = [str(group.counts[state] or "") for state in STATES[1:]]
-        rate = "" if group.rate is None else f"{group.rate:.3g}/s"
-        mean = "" if group.mean_seconds is None else duration(group.mean_seconds)
-        left = "" if group.left == 0 else duration(group.left)
-        done = f"{group.counts['done']}/{group.expected}"
-        table.add_row(escape(group.task), escape(group.method), done, *counts, mean, rate, left)
-    console.print(table)
-    if found.protocol != "plab":
-        console.print(f"protocol: {found.protocol}", highlight=False)
-    for run in found.runs:
-        name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
-        if run.state == "running":
-            left = None if run.left is None else run.left * run.together
-            progress = f"{run.done}/{run.total}, {duration(left)} left" if run.total else "starting"
-            console.print(f"running: {name}: {progress}", highlight=False, markup=False)
-        if run.state == "failed":
-            console.print(f"[red]failed[/]: {escape(f'{name}: {run.message}')}", highlight=False)
-    totals = Counter(run.state for run in found.runs)
-    counts = ", ".join(f"{totals[state]} {state}" for state in STATES if totals[state])
-    console.print(f"{len(found.runs)} runs: {counts}", highlight=False)
-    if found.eta is not None:
-        console.print(f"all done in {duration(found.eta)}, with {found.workers} at work", highlight=False)
-    if found.others:
-        text = "further run(s) in the results, of other names or other settings"
-        console.print(f"{found.others} {text}", highlight=False)
-    for error in found.unreadable:
-        console.print(f"left out: {error}", highlight=False, markup=False)
-
-
-def _json(found: Survey) -> dict[str, Any]:
-    return asdict(found) | {"workers": found.workers, "eta": found.eta}
-
-
-def _csv(found: Survey) -> None:
-    columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
-    writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
-    writer.writeheader()
-    for group in found.groups:
-        values = asdict(group)
-        writer.writerow(values.pop("counts") | values)
-
-
-@command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
-    where = f"folder of results, archive, or one of {', '.join(EXAMPLES)} (default: results)"
-    what = f"{where}, and runs: task=Rope,Move variant=1 seed=0,1,2"
-    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="print everything, for scripts")
-    form.add_argument("--csv", action="store_true", help="print the table, for scripts")
-    options = parser.parse_intermixed_args(argv)
-    sources, words = sources_and_words(options.arguments)
-    if len(sources) > 1:
-        raise SelectionError(f"one folder at a time, not {' and '.join(sources)}")
-    found = survey(resolve(sources[0] if sources else "results"), select(words, NAMES))
-    if options.json:
-        print(json.dumps(_json(found), indent=1))
-    elif options.csv:
-        _csv(found)
-    else:
-        _show(found)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
