@@ -616,9 +616,6 @@ def test_runs_that_learn_alike_make_a_population() -> None:
     assert [len(batch) for batch in plan(cfgs, 5)] == [5]
     other = [load_config([*words, "method.tau=0.1"]), load_config(["task=Move", "method=td3"])]
     assert [len(batch) for batch in plan(cfgs + other, 50)] == [5, 1, 1]
-    # What is logged is what Stable-Baselines3 does.
-    logged = [replace(load_config([*words, "method.tensorboard=true"]), seed=s) for s in (0, 1)]
-    assert [len(batch) for batch in plan(logged, 50)] == [1, 1]
     # Each of several processes is to have a part, if there are runs enough.
     assert [len(batch) for batch in plan(cfgs, 50, processes=2)] == [2, 3]
     assert [len(batch) for batch in plan(cfgs + other, 50, processes=8)] == [1, 2, 2, 1, 1]

@@ -344,22 +344,10 @@ def test_what_is_not_installed_is_said_before_anything_is_built(tmp_path: Path, 
     monkeypatch.setattr(rl, "shared_batches", None)
     monkeypatch.setattr("plab.checks.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"TensorBoard: pip install 'plab\[tensorboard\]'"):
-        run_config(make_config(tmp_path, "ppo", "method.tensorboard=true"))
+        run_config(make_config(tmp_path, "ppo", "logger=tensorboard"))
     monkeypatch.setattr(rl.torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"choose method\.torch_device=cpu"):
         run_config(make_config(tmp_path, "ppo", "method.torch_device=cuda"))
-
-
-def test_tensorboard_is_no_part_of_the_hash(tmp_path: Path) -> None:
-    plain, logged = (make_config(tmp_path, "ppo", f"method.tensorboard={v}") for v in ("false", "true"))
-    assert result_path(plain) == result_path(logged)
-
-
-def test_tensorboard_files_are_beside_the_result(tmp_path: Path, finished) -> None:
-    pytest.importorskip("tensorboard")
-    result = run(make_config(tmp_path, "ppo", "method.tensorboard=true"))
-    assert list(result.path.with_suffix(".tensorboard").glob("events.*"))
-    assert_same_numbers(result, finished["ppo"])
 
 
 def test_progress_counts_episodes(tmp_path: Path, capsys) -> None:

@@ -459,12 +459,10 @@ EXTRAS = [
     pytest.param(
         "imageio_ffmpeg", "render", "plab.render", ["task=Rope", "--output", "a.mp4"], marks=drawing
     ),
-    ("tensorboard", "tensorboard", "plab.run", ["task=Move", "method=sac", "method.tensorboard=true"]),
-    (
-        "tensorboard",
-        "tensorboard",
-        "plab.run",
-        ["-m", "task=Move", "method=sac", "method.tensorboard=true", "seed=0,1"],
+    *(
+        (package, package, "plab.run", [*flags, "task=Move", f"method={method}", f"logger={package}"])
+        for package in ("tensorboard", "wandb")
+        for method, flags in (("adam", []), ("sac", ["-m"]))
     ),
     *(
         (package, "report", "plab.report", ["notebooks", "--results", "example"])

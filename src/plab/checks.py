@@ -43,8 +43,9 @@ def check_packages(cfg: Config) -> None:
     Raises:
         plab.config.ConfigError: If not.
     """
-    if getattr(cfg.method, "tensorboard", False) and find_spec("tensorboard") is None:
-        raise ConfigError("method.tensorboard=true needs TensorBoard: pip install 'plab[tensorboard]'")
+    if cfg.logger != "none" and find_spec(cfg.logger) is None:
+        name = {"tensorboard": "TensorBoard", "wandb": "Weights & Biases"}[cfg.logger]
+        raise ConfigError(f"logger={cfg.logger} needs {name}: pip install 'plab[{cfg.logger}]'")
 
 
 def cuda_is_usable() -> bool:

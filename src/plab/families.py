@@ -113,8 +113,7 @@ class Family:
     def joins_populations(self, method: Any) -> bool:
         """Whether a sweep's runs with this section ``method`` are agents of a population."""
         rule = self.rules.get(getattr(method, "algorithm", ""))
-        # TensorBoard's events are what Stable-Baselines3 logs.
-        return rule is not None and rule.agents is not None and not method.tensorboard
+        return rule is not None and rule.agents is not None
 
     def config_type(self, rule: str | None = None) -> type:
         """Return the type of the section ``method``, of a rule that has one of its own that.

@@ -38,7 +38,7 @@ __all__ = [
 FOLDERS = ("results_dir", "targets.source")
 """Keys whose values are names of folders, with any letters."""
 
-IDLE = ("results_dir", "force", "progress", "checkpoint_seconds")
+IDLE = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
 """Keys that only plab.run looks at."""
 
 _SHOWN = 60

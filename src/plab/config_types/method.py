@@ -150,7 +150,6 @@ class RlConfig(MethodConfig):
         episodes: Episodes of training.
         num_envs: Environments simulated together.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
-        tensorboard: Write TensorBoard's event files next to the result.
         torch_device: Where the networks are, ``cpu`` or ``cuda``.
         torch_threads: CPU threads of torch.
         lr: Learning rate.
@@ -164,7 +163,6 @@ class RlConfig(MethodConfig):
     episodes: int
     num_envs: int
     evaluate_every: int
-    tensorboard: bool
     torch_device: str
     torch_threads: int
     lr: float

@@ -17,6 +17,8 @@ __all__ = ["PRECISIONS", "Config", "ProtocolConfig", "SimConfig", "TargetsConfig
 MOST_MEMORY_MB = 1e9
 """A petabyte: more is a slip of the unit."""
 
+LOGGERS = ("none", "tensorboard", "wandb")
+
 PRECISIONS = ("float32", "float64")
 
 Method = TypeVar("Method", bound=MethodConfig)
@@ -123,6 +125,7 @@ class Config:
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
         progress: Show a progress bar, and what to do next at the end.
+        logger: Where the rows go beside the result file: ``none``, ``tensorboard`` or ``wandb``.
         checkpoint_seconds: Time between two writings of the state from which a killed run goes on [s].
     """
 
@@ -137,6 +140,7 @@ class Config:
     results_dir: str
     force: bool
     progress: bool
+    logger: str
     checkpoint_seconds: float
 
     def check(self) -> None:
@@ -145,6 +149,7 @@ class Config:
             raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
         at_least("seed", self.seed, 0)
         at_least("seed_scene", self.seed_scene or 0, 0)
+        one_of("logger", self.logger, LOGGERS)
         at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")

@@ -43,6 +43,7 @@ _HARMLESS = (
     "results_dir",
     "force",
     "progress",
+    "logger",
     "checkpoint_seconds",
     "protocol.name",
     "sim.device",

@@ -73,7 +73,7 @@ COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation, beside those of :func:`loss_columns`."""
 
-_NO_EFFECT = ("results_dir", "progress", "force", "checkpoint_seconds")
+_NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
 
@@ -224,6 +224,7 @@ def config_hash(cfg: Any) -> str:
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
     # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
+    # Where older files say what `logger` says now.
     plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
     # Name and score change nothing in a result, and the contact term acts where the method says so. Runs of
     # plab's own protocol keep the hashes that they had before there was another.

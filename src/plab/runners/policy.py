@@ -165,7 +165,9 @@ def _method(section: Any, path: Path) -> RlConfig:
         raise ValueError("its method refers to something else")
     try:
         kind = family(name).config_type(section["algorithm"])
-        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section))
+        # Of files older than `logger`.
+        known = {key: value for key, value in section.items() if key != "tensorboard"}
+        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), known))
         cast(RlConfig, method).check("method")
     except ConfigError as error:
         raise ResultsError(f"{path}: {one_line(error)}") from error

@@ -14,17 +14,17 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, cast
 
+import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import BasePolicy
 
-from plab.checks import check_packages
 from plab.config import ConfigError, RlConfig
 from plab.progress import Report
-from plab.results import RunFile
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
+from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
 from plab.runners.policy import save_policy
 from plab.runners.rl_models import Spaces, model_kind, total_steps
@@ -47,7 +47,6 @@ class RlRunner(Runner):
     def build(self) -> None:
         """Make the environments of the training, and the one in the hard contact model that judges."""
         cfg = self.tracks[0].cfg
-        check_packages(cfg)
         check_torch_device(self._method)
         kinds = (self._method.num_envs, self._method.contact), (1, "hard")
         self._training, self._evaluation = shared_batches(self.cache, cfg, *kinds)
@@ -58,7 +57,8 @@ class RlRunner(Runner):
         self._replay_path = track.job.run.path.with_suffix(REPLAY_SUFFIX)
         if state is None or int(state["steps"]) < total_steps(self._method, track.cfg.sim.horizon):
             self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
-            self._trainer.set_logger(_logger(self._method, track.job.run))
+            outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
+            self._trainer.set_logger(Logger(folder=None, output_formats=outputs))
         else:
             # Now, where what does not fit is answered.
             self._policy(state)
@@ -76,7 +76,6 @@ class RlRunner(Runner):
             self._train(trainer, track)
             self.enter("evaluate")
         done = self.episode(trainer)
-        trainer.log({f"evaluation/{name}": done.measures[name] for name in ("reward", "score")})
         measured = done.measures | trainer.take_statistics()
         simulated = trainer.steps - before + len(done.actions)
         # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
@@ -167,10 +166,25 @@ class _Watch(BaseCallback):
         return f"{(self.num_timesteps - before) / (now - begin):.0f} steps/s {text}"
 
 
-def _logger(method: RlConfig, run: RunFile) -> Logger:
-    if not method.tensorboard:
-        return Logger(folder=None, output_formats=[])
-    return configure(str(run.path.with_suffix(".tensorboard")), ["tensorboard"])
+class _Diagnostics(KVWriter):
+    """Passes on what Stable-Baselines3 logs of the training."""
+
+    def __init__(self, log: RunLog) -> None:
+        self._log = log
+
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
+        """Pass on the numbers, at some transitions of training."""
+        numbers = {
+            name: float(value)
+            for name, value in key_values.items()
+            if isinstance(value, int | float | np.number) and "tensorboard" not in key_excluded[name]
+        }
+        self._log.write(numbers, step)
+
+    def close(self) -> None:
+        """Leave the log to the run."""
 
 
 def check_torch_device(method: RlConfig) -> None:

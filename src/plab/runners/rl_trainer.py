@@ -89,12 +89,6 @@ class Trainer:
         """Choose where the model's diagnostics go."""
         self.model.set_logger(logger)
 
-    def log(self, values: Mapping[str, float]) -> None:
-        """Add numbers to the model's diagnostics."""
-        for name, value in values.items():
-            self.model.logger.record(name, value)
-        self.model.logger.dump(self.steps)
-
     def advance(self, callback: BaseCallback) -> None:
         """Train for one cycle: an update of PPO, a batch of episodes of the others."""
         schedule = self.model.learning_rate

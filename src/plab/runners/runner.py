@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from plab.checks import check_packages
 from plab.config import ConfigError
 from plab.families import family
 from plab.problem import Episodes, Problem
@@ -23,6 +24,7 @@ from plab.results import BUDGETS, ResultsError, row_count
 from plab.reuse import SimulatorCache
 from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
+from plab.runners.loggers import RunLog
 from plab.sim import DeviceError, SimulationError
 from plab.sim.compiling import watch_compiling
 
@@ -75,11 +77,13 @@ class Track:
         best_loss: Loss of the best actions so far, NaN before the first iteration.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
+        log: Takes what ``logger`` is to show beside the rows, which it is given.
     """
 
     def __init__(self, job: Job, number: int) -> None:
         """Take up a run where its file stands."""
         self.job, self.number = job, number
+        self.log = RunLog(job.cfg, job.run)
         result = job.run.result
         rows = result.iterations
         self.iteration, self.best_loss = len(rows), result.best_loss
@@ -132,6 +136,7 @@ class Track:
             "best_loss": row["loss"],
         }
         self.job.run.record(row, step.state, keep=step.keep, **(best if better else {}))
+        self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
         self.iteration += 1
         if better:
             self.best_loss, self.best_actions = row["loss"], step.actions
@@ -268,7 +273,9 @@ class Runner:
         kind = type(self)
         if kind.build is Runner.build or (kind.step is Runner.step and kind.iterate is Runner.iterate):
             raise self._unfinished()
-        with self.context(), simulation_errors():
+        with self.context(), simulation_errors(), ExitStack() as logs:
+            for track in self.tracks:
+                logs.callback(track.log.close)
             try:
                 with self._waiting("build"):
                     self._build()
@@ -289,6 +296,8 @@ class Runner:
     def _build(self) -> None:
         self.enter("build")
         try:
+            for track in self.tracks:
+                check_packages(track.cfg)
             with simulation_errors():
                 self.build()
         except Exception as error:
@@ -386,10 +395,12 @@ class Runner:
             "final": cast(np.ndarray, episodes.final_mass),
             "target": self.problem.target_mass,
         }
+        judged = measures(episodes, number)
         try:
-            track.job.run.finish(
-                measures(episodes, number), {name: mass[number] for name, mass in masses.items()}
-            )
+            # After the last row, whose steps are those before it.
+            steps = int(track.job.run.result.iterations["steps"].iloc[-1]) + track.cfg.sim.horizon
+            track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
+            track.job.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
         except ResultsError as error:
             track.job.fail(error)
 

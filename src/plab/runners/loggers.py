@@ -1,0 +1,147 @@
+"""Where a run's rows go beside its result file while it lasts: ``logger=tensorboard``, ``logger=wandb``.
+
+Each row is logged at the environment steps that its actions have cost, under the names of the results'
+columns, and the final evaluation under ``final/``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from plab.results import ResultsError, RunFile
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["Logger", "RunLog"]
+
+PROJECT = "plab"
+"""Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
+
+_LONGEST_ID = 128
+"""Letters of a run's id there, at most."""
+
+
+class Logger(ABC):
+    """Takes numbers of one run."""
+
+    @abstractmethod
+    def write(self, values: Mapping[str, float], steps: int) -> None:
+        """Log numbers that are finite, at some number of environment steps."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what has not been written yet."""
+
+
+class RunLog:
+    """What a run logs, if anything. Nothing is opened before the first numbers come."""
+
+    def __init__(self, cfg: Config, run: RunFile) -> None:
+        """Keep the run.
+
+        Args:
+            cfg: Its configuration, whose ``logger`` says where the numbers go.
+            run: Its file.
+        """
+        self._cfg, self._run = cfg, run
+        self._logger: Logger | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether numbers go anywhere."""
+        return self._cfg.logger != "none"
+
+    def write(self, values: Mapping[str, float], steps: int) -> None:
+        """Log numbers; those that are not finite are left out.
+
+        Args:
+            values: Numbers by name.
+            steps: Environment steps done.
+
+        Raises:
+            ResultsError: If that fails.
+        """
+        if not self.wanted:
+            return
+        finite = {name: float(value) for name, value in values.items() if math.isfinite(value)}
+        try:
+            if self._logger is None:
+                self._logger = _KINDS[self._cfg.logger](self._cfg, self._run, steps)
+            self._logger.write(finite, steps)
+        except (OSError, RuntimeError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ResultsError(f"logger={self._cfg.logger} fails: {reason}; logger=none goes on") from error
+
+    def close(self) -> None:
+        """End the log."""
+        if self._logger is not None:
+            # All rows have been written; what they belong to is in the result file.
+            with suppress(OSError, RuntimeError):
+                self._logger.close()
+            self._logger = None
+
+
+class TensorBoard(Logger):
+    """TensorBoard's event files, in the folder ``<name>.tensorboard`` beside the result."""
+
+    def __init__(self, cfg: Config, run: RunFile, steps: int) -> None:
+        """Begin a file; what an earlier process has logged from ``steps`` on is not shown any more."""
+        # Imported here: it is optional.
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        self._writer = SummaryWriter(str(run.path.with_suffix(".tensorboard")), purge_step=steps)
+
+    def write(self, values: Mapping[str, float], steps: int) -> None:
+        """Log numbers, to be seen at once."""
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, steps)
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._writer.close()
+
+
+class WeightsAndBiases(Logger):
+    """A run at Weights & Biases, which goes on where one of the same configuration was; its own files are in
+    the folder ``wandb`` of ``results_dir``."""
+
+    def __init__(self, cfg: Config, run: RunFile, steps: int) -> None:
+        """Begin the run, or go on with it; how, ``WANDB_MODE`` and wandb's other variables say."""
+        # Imported here: it is optional.
+        import wandb
+
+        name = f"{cfg.task.name}-v{cfg.variant}-{cfg.method.name}-{run.path.stem}"
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT") or PROJECT,
+                name=name,
+                id=re.sub(r"[^\w.-]", "_", name)[:_LONGEST_ID],
+                dir=cfg.results_dir,
+                config=run.result.config,
+                resume="allow",
+                # The runs of a batch are logged side by side.
+                reinit="create_new",
+                settings=wandb.Settings(silent=True, console="off"),
+            )
+        except wandb.Error as error:
+            raise RuntimeError(f"{error} (WANDB_MODE=offline needs no account)") from error
+        self._run.define_metric("*", step_metric="steps")
+
+    def write(self, values: Mapping[str, float], steps: int) -> None:
+        """Log numbers."""
+        self._run.log({**values, "steps": steps})
+
+    def close(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+_KINDS: dict[str, type] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
