@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from plab import capacity, sizes, status
+from plab import capacity, sizes
 from plab.config import load_config
 from plab.envs.sb3 import make_sb3
 from plab.errors import PlabError
@@ -21,6 +21,7 @@ from plab.problem import Problem
 from plab.results import load
 from plab.run import main
 from plab.sim import Simulator
+from plab.status import __main__ as status
 from plab.words import quoted
 from suite import scene
 

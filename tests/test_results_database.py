@@ -583,6 +583,25 @@ def test_folders_archives_and_example_are_taken_in_the_same_way(folder: Path, ca
     assert capsys.readouterr().out == "150 run(s) checked, all well\n"
 
 
+def test_several_sources_are_taken_in_the_same_way(tmp_path: Path, capsys) -> None:
+    one, archive = tmp_path / "one", tmp_path / "two.plab.zip.xz"
+    age(synthetic.save(synthetic.run(one, seed=0, score=0.5)))
+    age(synthetic.save(synthetic.run(tmp_path / "two", seed=1, score=0.75)))
+    pack(tmp_path / "two", archive)
+    sources = [str(one), str(archive), "example"]
+    words = ["task=Rope", "variant=1", "method=adam", "sim.precision=float32"]
+    assert main(["scores", *sources, *words, "--csv"]) == 0
+    scored = {
+        row["seed"]: float(row["score"]) for row in csv.DictReader(io.StringIO(capsys.readouterr().out))
+    }
+    assert {"0", "1"} <= set(scored)
+    assert status([*sources, *words, "--json"]) == 0
+    known = json.loads(capsys.readouterr().out)["runs"]
+    assert {run["seed"] for run in known if run["state"] == "done"} == set(scored)
+    best = parse_render([str(one), str(archive), *words])
+    assert read(best.result).config["seed"] == 1 and best.output == Path("Rope-v1-adam-seed1.png")
+
+
 def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told, capsys) -> None:
     for seed, score in enumerate((0.5, 0.75, 0.25)):
         age(synthetic.save(synthetic.run(folder, seed=seed, score=score)))

@@ -20,12 +20,12 @@ __all__ = ["main"]
 
 _USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
-python -m plab.render FOLDER | ARCHIVE | example [task=... method=...] [--output FILE]
+python -m plab.render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
 python -m plab.render KEY=VALUE ... [--output FILE]
 python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
 python -m plab.render --film-strip FILE [KEY=VALUE ...]
 
-Draws the best actions of a run, those of the run with the highest score in a folder or an archive, the best
+Draws the best actions of a run, those of the run with the highest score in folders and archives, the best
 actions known for a task, start and target of every task and variant, or a few frames of the best actions
 known for every task.
 

@@ -69,8 +69,8 @@ def settle(arguments: argparse.Namespace, ending: str) -> Path:
         plab.config.ConfigError: If the configuration is wrong.
     """
     files, overrides = sources_and_words(arguments.what)
-    if len(files) == 1 and _holds_many(files[0]):
-        arguments.result, name = _best(files[0], overrides)
+    if files and all(map(_holds_many, files)):
+        arguments.result, name = _best(files, overrides)
         return Path(f"{name}{ending}")
     require_effect(overrides, WITHOUT_EFFECT, "a picture")
     if len(files) > 1 or (files and overrides):
@@ -98,17 +98,18 @@ def _holds_many(source: str) -> bool:
     return source in EXAMPLES or source.endswith(ARCHIVE_SUFFIX) or Path(source).is_dir()
 
 
-def _best(source: str, words: Sequence[str]) -> tuple[Path, str]:
+def _best(sources: Sequence[str], words: Sequence[str]) -> tuple[Path, str]:
     """Return place and name of the finished run with the highest score, of those that the words choose."""
     from plab.results.loading import readable_rows
 
     names = ("task", "variant", "method", "seed")
     chosen = select(words, names)
-    rows = [row for row in readable_rows(resolve(source))[0] if row.values["status"] == "finished"]
+    found, _ = readable_rows([resolve(source) for source in sources])
+    rows = [row for row in found if row.values["status"] == "finished"]
     rows = [row for row in rows if chosen(row.values, row.config)]
     one_protocol(row.config for row in rows)
     if not rows:
-        raise RenderError(f"there is no finished run to show in {source}: no run fits")
+        raise RenderError(f"there is no finished run to show in {', '.join(sources)}: no run fits")
     best = max(rows, key=lambda row: row.values["score"])
     task, variant, method, seed = (best.values[name] for name in names)
     return best.path, f"{task}-v{variant}-{method}-seed{seed}"
