@@ -68,7 +68,8 @@ class Job:
         with the best actions, if it does."""
         result = self.run.result
         text = f"score {result.score:.4f}"
-        if counts_last(result.config) or self.contact == "hard":
+        # Runners that do everything themselves may have rows without a score.
+        if counts_last(result.config) or self.contact == "hard" or "score" not in result.iterations:
             return text
         shown = float(result.iterations["score"].iloc[result.best_iteration])
         if f"{shown:.4f}" == f"{result.score:.4f}":
