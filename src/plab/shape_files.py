@@ -212,15 +212,18 @@ def _unreadable(path: Path, error: Exception) -> ShapeError:
 @contextmanager
 def _quietly() -> Iterator[None]:
     """Keep a library from saying on the terminal what its error says as well."""
-    logger = logging.getLogger("trimesh")
-    before = logger.disabled
-    logger.disabled = True
+    # Loggers of its modules are below this one, and would otherwise reach those of the whole process.
+    logger, silence = logging.getLogger("trimesh"), logging.NullHandler()
+    before = logger.propagate
+    logger.addHandler(silence)
+    logger.propagate = False
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.disabled = before
+        logger.propagate = before
+        logger.removeHandler(silence)
 
 
 # --------------------------------------------------------------------------------------------------- contents
