@@ -297,6 +297,7 @@ def test_places_of_files(write, tmp_path, monkeypatch):
         ("it", None),
         ("", None),
         ("a\0b", None),
+        ("a\nb", None),
         ("x" * 5000, None),
     ):
         with pytest.raises(ShapeError):
@@ -515,6 +516,13 @@ def test_a_file_that_changes_after_composing_is_refused(tmp_path):
         build_scene(cfg)
     with pytest.raises(TargetError, match=r"target\.bodies\.star: .*star\.obj is another file than"):
         build_target(scene_of(Body("box", (0.5, 0.5, 0.5), (0.2, 0.2, 0.2), 100)), cfg.task.target)
+
+
+@pytest.mark.parametrize("name", ["a b.obj", "it's {a} [file], x=1.obj", "größe.obj", "~x.obj"])
+def test_names_of_files_on_the_command_line(seen, tmp_path, name):
+    shutil.copy(EXAMPLE / "star.obj", tmp_path / name)
+    assert main(["--config-dir", str(CONF), "task=Star", f"task.bodies.star.file={name}"]) == 0
+    assert seen[0].task.bodies["star"].file == str(tmp_path / name)
 
 
 def test_a_file_can_be_demanded():

@@ -137,16 +137,17 @@ def read_tensor(file: str, sha256: str | None = None) -> np.ndarray:
 
 def _find(file: str, known: bool) -> Path:
     """Return the path of a file; ``known``: whether its content is, so that its name suffices."""
-    if not file.strip() or "\0" in file:
-        raise ShapeError(f"{file!r} names no file")
-    path = Path(file).expanduser()
+    if not file.strip() or not file.isprintable():
+        raise ShapeError(f"{file!r} names no file: give it a name that can be printed")
+    path = Path(file)
     folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
     places = [path] if path.is_absolute() else [folder / path for folder in folders]
     if path.is_absolute() and known:
         places += [folder / path.name for folder in folders]
     for place in places:
         if _is_there(place):
-            return place.resolve()
+            # Not resolved: what a link leads to may be named otherwise, without the ending.
+            return place.absolute()
     if path.is_absolute():
         advice = f"put {path.name} there" + (" or into the working directory" if known else "")
         raise ShapeError(f"{path} does not exist: {advice}")
