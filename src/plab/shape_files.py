@@ -127,8 +127,10 @@ def read_tensor(file: str, sha256: str | None = None) -> np.ndarray:
     if mass.size and mass.min() < 0:
         raise ShapeError(f"{path} has negative masses: the least is {mass.min():.3g}")
     # A sum of finite numbers may not be.
-    if not 0 < mass.sum() < np.inf:
-        raise ShapeError(f"{path} holds a total mass of {mass.sum():g}")
+    with np.errstate(over="ignore"):
+        total = mass.sum()
+    if not 0 < total < np.inf:
+        raise ShapeError(f"{path} holds a total mass of {total:g}")
     return mass
 
 
