@@ -17,6 +17,8 @@ import pytest
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.mesh import Mesh, load_mesh
 from plab.objective import spread_mass, target_sdf
+from plab.render.graphics import RenderError
+from plab.render.recording import stored
 from plab.results import config_dict, config_hash, load
 from plab.run import main
 from plab.scene import Body, Scene, SceneError, make_body, sample_particles
@@ -137,6 +139,14 @@ def test_a_run_of_each_kind_is_recorded_and_read_without_the_files(files, tmp_pa
     table = load("results")
     assert sorted(table["variant"]) == ["1", "2", "3", "3"]
     assert set(table["status"]) == {"finished"} and table["score"].notna().all()
+    # Pictures need them, wherever they are now.
+    path = table[table["variant"] == "1"]["path"].iloc[0]
+    with pytest.raises(RenderError, match=r"replayed: task\.bodies\.star: .*star\.obj does not exist"):
+        stored(Path(path))
+    (tmp_path / "later").mkdir()
+    shutil.copy(EXAMPLE / "star.obj", tmp_path / "later")
+    monkeypatch.chdir(tmp_path / "later")
+    assert stored(tmp_path / path)[1].shape == (2, 3)
 
 
 CONSOLE = re.findall(r"^\$ (.*)\n(plab: .*)$", "\n".join(blocks("console")), re.MULTILINE)
