@@ -72,9 +72,21 @@ class Parsed(Exception):
     """Ends a command line once its options have been read."""
 
 
+@pytest.fixture(scope="module")
+def star_files(tmp_path_factory):
+    """A folder with what the script of docs/own_shapes.md writes into the working directory."""
+    folder = tmp_path_factory.mktemp("star")
+    code = (ROOT / "examples" / "own_shapes" / "star.py").read_text(encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(code, {})
+    return folder
+
+
 @pytest.mark.parametrize("command", PLAB)
-def test_a_command_that_is_shown_makes_sense(command, monkeypatch):
+def test_a_command_that_is_shown_makes_sense(command, monkeypatch, star_files):
     monkeypatch.chdir(ROOT)
+    monkeypatch.syspath_prepend(str(star_files))
     module, *argv = shlex.split(command)[2:]
     if module == "plab.run":
         check_run(argv)

@@ -12,7 +12,6 @@ from plab.config import load_config
 from plab.export.__main__ import main
 from plab.render import graphics
 from plab.render.recording import Recording, record_with_motion
-from plab.render.surface import body_volume
 
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.files")
@@ -65,7 +64,7 @@ def test_surfaces_enclose_the_bodies_and_the_target(recording):
         "target.vtp",
     ]
     start, target = pv.read("plasticine_0000.vtp"), pv.read("target.vtp")
-    volume = sum(body_volume(body) for body in recording.scene.bodies)
+    volume = sum(body.volume for body in recording.scene.bodies)
     assert start.volume == pytest.approx(volume, rel=0.2)
     nodes = np.argwhere(recording.target_mass > recording.target_mass.max() / 4) * recording.scene.dx
     assert target.center_of_mass() == pytest.approx(nodes.mean(axis=0), abs=0.03)

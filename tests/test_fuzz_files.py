@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import lzma
+import struct
 import traceback
 import warnings
 import zipfile
@@ -27,6 +28,7 @@ from hypothesis import strategies as st
 
 import synthetic
 from plab.config import Config, ConfigError, build_scene, load_config
+from plab.mesh import load_mesh
 from plab.report.collect import MixedRunsError, collect, collect_ablation
 from plab.report.series import load_series
 from plab.results import ResultsError, check, load, pack, read
@@ -34,13 +36,14 @@ from plab.runners.policy import load_policy, policy_path, save_policy
 from plab.runners.rl_models import Spaces, model_kind
 from plab.scene import SceneError
 from plab.selection import Selection, SelectionError
+from plab.shape_files import ShapeError
 from plab.status import __main__ as status
 from plab.targets import TargetError, load_release_target
 
-OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError)
+OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError, ShapeError)
 
 CASES = {"few": 34, "many": 334}
-"""Cases of each of the six kinds of files, in CI and in the slow tests: 204 and 2,004."""
+"""Cases of each of the seven kinds of files, in CI and in the slow tests: 238 and 2,338."""
 
 QUICK = ("sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2", "sim.particles_scale=0.03")
 
@@ -106,6 +109,21 @@ def make_task(folder: Path) -> Path:
 # ----------------------------------------------------------------------------------------------- reading them
 
 
+def make_mesh(folder: Path) -> Path:
+    """An octahedron in binary PLY."""
+    faces = [(x, 2 + y, 4 + z)[:: 1 if (x + y + z) % 2 == 0 else -1] for x, y, z in np.ndindex(2, 2, 2)]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 6"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += ["element face 8", "property list uchar int vertex_indices", "end_header"]
+    corners = np.kron(np.eye(3), [[1], [-1]]).astype("<f4").tobytes()
+    folder.mkdir(parents=True)
+    content = (
+        "\n".join(header).encode() + b"\n" + corners + b"".join(struct.pack("<B3i", 3, *f) for f in faces)
+    )
+    (folder / "it.ply").write_bytes(content)
+    return folder / "it.ply"
+
+
 def read_results(path: Path) -> None:
     """Do with a result file or an archive all that is done with one."""
     with warnings.catch_warnings():
@@ -138,6 +156,12 @@ def read_task(path: Path) -> None:
     assert isinstance(load_config(["task=Own"], path.parents[1]), Config)
 
 
+def read_mesh(path: Path) -> None:
+    """Load the mesh, and draw points inside."""
+    mesh = load_mesh(str(path))
+    assert mesh.fill(10, np.random.default_rng(0).random).shape == (10, 3) and mesh.thickness > 0
+
+
 _scenes: list[Any] = []
 
 
@@ -154,6 +178,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]] = {
     "target": (make_target, read_target),
     "policy": (make_policy, read_policy),
     "task": (make_task, read_task),
+    "mesh": (make_mesh, read_mesh),
 }
 
 
@@ -527,6 +552,7 @@ def edits(kind: str) -> st.SearchStrategy[Callable[[bytes], bytes]]:
             of(changed_member, st.tuples(PLACE, st.one_of(by_bytes, arrays))),
         ],
         "task": [of(changed_words, st.tuples(PLACE, st.sampled_from(WORDS)))],
+        "mesh": [],
     }[kind]
     return st.one_of(by_bytes, *own, *own)
 

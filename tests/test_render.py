@@ -21,7 +21,7 @@ from plab.render.__main__ import main
 from plab.render.camera import VIEWS, Camera, View, fit_camera, scene_camera
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
-from plab.render.surface import BodySurface, body_volume, target_field
+from plab.render.surface import BodySurface, target_field
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
 from suite import SCALES, SIZES
 
@@ -115,7 +115,7 @@ def test_the_surface_encloses_the_volume_of_the_body(body):
     x = sample_particles(scene(bodies=(body,)))
     mesh = surface_mesh(BodySurface(body, x).field(x))
     assert mesh.is_manifold
-    assert mesh.volume == pytest.approx(body_volume(body), rel=0.1)
+    assert mesh.volume == pytest.approx(body.volume, rel=0.1)
     assert mesh.center_of_mass() == pytest.approx(body.center, abs=0.004)
     # Rounded at the edges, but not swollen.
     half = body.half_extent()

@@ -154,7 +154,7 @@ def test_every_recipe_is_a_dataclass_with_documented_fields():
         ({"recipe": "bodies", "bodies": {"a": BALL | {"size": [0.6]}}}, r"bodies\[0\]: reaches x"),
         (
             {"recipe": "bodies", "bodies": {"a": BALL | {"shape": "ball"}}},
-            "shape 'ball' is not one of sphere, box",
+            "shape 'ball' is not one of sphere, box, mesh",
         ),
         ({"recipe": "bodies", "bodies": {"a": CUBE | {"size": [0.2]}}}, "a box needs 3 size"),
     ],

@@ -264,6 +264,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool =
         raise ConfigError(explain(error)) from None
     cfg = Config(**parts)
     cfg.check()
+    cfg.task.pin_files()
     return cfg
 
 
@@ -306,7 +307,7 @@ def build_scene(cfg: Config) -> Scene:
         raise ConfigError(f"sim.particles_scale={sim.particles_scale:g} leaves no particle: {least}")
     scene = Scene(
         name=task.name,
-        bodies=tuple(body.build(sim.particles_scale) for body in task.bodies.values()),
+        bodies=task.build_bodies(sim.particles_scale),
         manipulators=tuple(manipulator.build() for manipulator in task.manipulators.values()),
         youngs_modulus=task.youngs_modulus,
         poisson_ratio=task.poisson_ratio,

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config_errors import ConfigError, explain, pick
 from plab.config_types import RandomConfig, RangeConfig, TaskConfig
-from plab.scene import Body, Scene, SceneError, vector3
+from plab.scene import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 from plab.variants import variant_changes
 
@@ -147,10 +147,9 @@ def _require_list(base: DictConfig, key: str, path: str) -> None:
 def _check(task: TaskConfig, random: RandomConfig) -> None:
     """Raise what is wrong with a drawn task, short of simulating it."""
     task.check("task")
-    bodies = tuple(body.build() for body in task.bodies.values())
     manipulators = tuple(manipulator.build() for manipulator in task.manipulators.values())
     # The suite's grid and material, not the run's: they must not decide what is drawn.
-    scene = Scene(task.name, bodies, manipulators)
+    scene = Scene(task.name, task.build_bodies(), manipulators)
     scene.validate()
     check_target(scene, task.target)
     recipe = make_recipe(task.target)
@@ -165,14 +164,10 @@ def _check_apart(bodies: dict[str, TargetBody], drawn: set[str]) -> None:
     """Raise if the bounding box of a drawn body of a target overlaps another one's; they may touch."""
     for (first, a), (second, b) in itertools.combinations(bodies.items(), 2):
         distance = np.abs(np.subtract(a.center, b.center))
-        overlap = np.all(distance < _half_extent(a) + _half_extent(b) - 1e-9)
+        overlap = np.all(distance < a.build(1).half_extent() + b.build(1).half_extent() - 1e-9)
         # Those that are not drawn stick together by intention.
         if overlap and drawn & {first, second}:
             raise TargetError(f"target.bodies.{first} overlaps target.bodies.{second}")
-
-
-def _half_extent(body: TargetBody) -> np.ndarray:
-    return Body(body.shape, vector3(body.center), tuple(body.size), 1).half_extent()
 
 
 def _check_reach(task: TaskConfig, goals: dict[str, TargetBody], reach: float) -> None:

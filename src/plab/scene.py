@@ -8,12 +8,11 @@ from it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from plab.errors import PlabError
+from plab.bodies import BODY_SHAPES, Body, MeshBody, SceneError, Vec3, make_body, vector3
 
 __all__ = [
     "CHOICES",
@@ -22,8 +21,10 @@ __all__ = [
     "Body",
     "Manipulator",
     "ManipulatorShape",
+    "MeshBody",
     "Scene",
     "SceneError",
+    "make_body",
     "sample_particles",
     "vector3",
 ]
@@ -37,27 +38,12 @@ STIFFEST = 1e-12
 SHORTEST = 1e-6
 """Shortest time step, as a share of the longest that is stable: what moves less is lost in rounding."""
 
-Vec3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
 ROLL_RADIUS = 0.03
 """Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
 release."""
-
-
-def vector3(values: Sequence[float]) -> Vec3:
-    """Return three numbers as a tuple.
-
-    Raises:
-        ValueError: If they are not three.
-    """
-    x, y, z = values
-    return x, y, z
-
-
-class SceneError(PlabError, ValueError):
-    """A scene that cannot be simulated; the message says why and which value would do."""
 
 
 @dataclass(frozen=True)
@@ -106,27 +92,6 @@ MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
 """The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
 (two parallel capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y),
 Box."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """One body of plasticine, filled with particles at t = 0.
-
-    Attributes:
-        shape: ``sphere`` or ``box``.
-        center: Centre [domain units].
-        size: Sphere: ``(radius,)``. Box: full edge lengths ``(x, y, z)``.
-        particles: Number of particles drawn uniformly inside.
-    """
-
-    shape: str
-    center: Vec3
-    size: tuple[float, ...]
-    particles: int
-
-    def half_extent(self) -> np.ndarray:
-        """Half of the bounding box's edges, shape [3]."""
-        return np.full(3, self.size[0]) if self.shape == "sphere" else np.asarray(self.size, dtype=float) / 2
 
 
 @dataclass(frozen=True)
@@ -328,8 +293,11 @@ class Scene:
 
     def _validate_body(self, number: int, body: Body) -> None:
         label = f"bodies[{number}]"
-        _require(body.shape in ("sphere", "box"), f"{label}: shape '{body.shape}' is not one of sphere, box")
-        entries = 1 if body.shape == "sphere" else 3
+        _require(
+            body.shape in BODY_SHAPES, f"{label}: shape '{body.shape}' is not one of {', '.join(BODY_SHAPES)}"
+        )
+        _require((body.shape == "mesh") == isinstance(body, MeshBody), f"{label}: a mesh is a MeshBody")
+        entries = 3 if body.shape == "box" else 1
         _require(
             len(body.size) == entries,
             f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}",
@@ -351,6 +319,14 @@ class Scene:
                 f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain "
                 f"0 .. {top:.4g}: "
                 f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
+            )
+        if isinstance(body, MeshBody):
+            thickness = body.size[0] * body.mesh.thickness
+            _require(
+                thickness >= self.dx,
+                f"{label}: half of it is thinner than {thickness:.2g}, less than a cell of the grid, "
+                f"{self.dx:.2g}: use a size of {1.01 * body.size[0] * self.dx / thickness:.2g} or more, or a "
+                "finer grid",
             )
 
     def _validate_manipulator(self, number: int, manipulator: Manipulator) -> None:
@@ -424,7 +400,9 @@ def sample_particles(scene: Scene) -> np.ndarray:
     rng = np.random.default_rng(scene.particle_seed)
     parts = []
     for body in scene.bodies:
-        if body.shape == "box":
+        if isinstance(body, MeshBody):
+            parts.append(np.asarray(body.center) + body.size[0] * body.mesh.fill(body.particles, rng.random))
+        elif body.shape == "box":
             unit = rng.random((body.particles, 3)) - 0.5
             parts.append(np.asarray(body.center) + unit * np.asarray(body.size))
         else:
@@ -442,7 +420,9 @@ def _legacy_particles(scene: Scene) -> np.ndarray:
     parts = []
     for body in scene.bodies:
         center = np.asarray(body.center)
-        if body.shape == "box":
+        if isinstance(body, MeshBody):
+            parts.append(center + body.size[0] * body.mesh.fill(body.particles, rng.random_sample))
+        elif body.shape == "box":
             unit = rng.random_sample((body.particles, 3)) * 2 - 1
             parts.append(center + unit * np.asarray(body.size) / 2)
         else:

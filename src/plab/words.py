@@ -157,7 +157,7 @@ def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None
 
 
 def quote_folders(words: Sequence[str]) -> list[str]:
-    """Return overrides in which names of folders may have any letters, without quotes within quotes.
+    """Return overrides in which names of folders and files have any letters, without quotes within quotes.
 
     Lists of values for a sweep, what is quoted already, ``null`` and references to other keys stay.
     """
@@ -166,7 +166,9 @@ def quote_folders(words: Sequence[str]) -> list[str]:
 
 def _quote_folder(word: str) -> str:
     key, equals, text = word.partition("=")
-    if not equals or key.lstrip("+") not in FOLDERS or not text.strip() or "${" in text:
+    own = key.lstrip("+")
+    named = own in FOLDERS or (own.startswith("task.") and own.endswith(".file"))
+    if not equals or not named or not text.strip() or "${" in text:
         return word
     try:
         (override,) = OverridesParser.create().parse_overrides([word])

@@ -7,7 +7,8 @@ from typing import Any
 
 from plab.config_errors import ConfigError
 from plab.config_types.ranges import at_least, folder_name, positive, vector
-from plab.scene import Body, Manipulator, vector3
+from plab.scene import Body, Manipulator, SceneError, make_body
+from plab.shape_files import ShapeError, pinned
 from plab.targets import TargetError, make_recipe
 
 __all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "RangeConfig", "TaskConfig"]
@@ -18,16 +19,22 @@ class BodyConfig:
     """A body of plasticine.
 
     Attributes:
-        shape: ``sphere`` or ``box``.
-        center: Centre (x, y, z) [domain units].
-        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``.
+        shape: ``sphere``, ``box`` or ``mesh``.
+        center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
+        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
+            its bounding box; it keeps its proportions.
         particles: Number of particles before ``sim.particles_scale``.
+        file: Mesh only: OBJ, STL or PLY file, y up. A relative one is looked for in the working directory, in
+            the config folder and in the folder above it.
+        sha256: Mesh only: SHA-256 of the file. Found out where it is not given; refused if it is another one.
     """
 
     shape: str
     center: list[float]
     size: list[float]
     particles: int
+    file: str | None = None
+    sha256: str | None = None
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
@@ -35,9 +42,14 @@ class BodyConfig:
         at_least(f"{path}.particles", self.particles, 1)
 
     def build(self, particles_scale: float = 1.0) -> Body:
-        """Return the scene's body, with ``particles_scale`` times the particles, but at least one."""
+        """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
+
+        Raises:
+            plab.scene.SceneError: If a mesh has no file, or something else has one.
+            plab.shape_files.ShapeError: If the file does not do.
+        """
         particles = max(1, round(self.particles * particles_scale))
-        return Body(self.shape, vector3(self.center), tuple(self.size), particles)
+        return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 
 @dataclass
@@ -204,3 +216,43 @@ class TaskConfig:
             make_recipe(self.target)
         except TargetError as error:
             raise ConfigError(f"{path}.{error}") from None
+
+    def build_bodies(self, particles_scale: float = 1.0) -> tuple[Body, ...]:
+        """Return the scene's bodies, see :meth:`BodyConfig.build`.
+
+        Raises:
+            ConfigError: If one cannot be made; names its key.
+        """
+        bodies = []
+        for name, body in self.bodies.items():
+            try:
+                bodies.append(body.build(particles_scale))
+            except (SceneError, ShapeError) as error:
+                raise ConfigError(f"task.bodies.{name}: {error}") from None
+        return tuple(bodies)
+
+    def pin_files(self) -> None:
+        """Replace the name of each file by where it is, and the SHA-256 of what it holds.
+
+        Raises:
+            ConfigError: If a file is missing, cannot be read, or holds something else; names its key.
+        """
+        for name, body in self.bodies.items():
+            _pin(vars(body), f"task.bodies.{name}")
+        _pin(self.target, "task.target")
+        # A variant's file has a hash of its own, whatever it is merged over.
+        for name, changes in self.variants.items():
+            _pin(changes, f"task.variants.{name}")
+
+
+def _pin(node: Any, path: str) -> None:
+    """Do so in a part of a task, and in all that is in it."""
+    if not isinstance(node, dict):
+        return
+    for key, value in node.items():
+        _pin(value, f"{path}.{key}")
+    if isinstance(node.get("file"), str):
+        try:
+            node["file"], node["sha256"] = pinned(node["file"], node.get("sha256"))
+        except ShapeError as error:
+            raise ConfigError(f"{path}: {error}") from None

@@ -12,7 +12,7 @@ from plab.errors import ArgumentError
 from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
 from plab.render.camera import Camera, scene_camera
 from plab.render.shadows import AmbientLight, Cloud, floor_light
-from plab.render.surface import body_slices, body_surfaces, body_volume
+from plab.render.surface import body_slices, body_surfaces
 from plab.scene import Scene, sample_particles
 
 __all__ = ["BODY_COLORS", "INK", "PAPER", "Renderer"]
@@ -63,7 +63,7 @@ class Renderer:
         self.camera = camera or scene_camera(scene, target_mass, size)
         self._scene = scene
         self._slices, self._surfaces = body_slices(scene), body_surfaces(scene)
-        self._particle_area = (sum(map(body_volume, scene.bodies)) / scene.particle_count) ** (2 / 3)
+        self._particle_area = (sum(body.volume for body in scene.bodies) / scene.particle_count) ** (2 / 3)
         plotter = self._open_window()
         self._plotter: pv.Plotter | None = plotter
         self._light = _add_lights(plotter, self.camera)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 
-from plab.scene import Body, Scene, sample_particles
+from plab.scene import Body, MeshBody, Scene, sample_particles
 
-__all__ = ["BodySurface", "Field", "body_slices", "body_surfaces", "body_volume", "target_field"]
+__all__ = ["BodySurface", "Field", "body_slices", "body_surfaces", "target_field"]
 
 KERNEL_WIDTH = 1.2
 """Standard deviation of the smoothing kernel [mean particle spacings]."""
@@ -68,17 +69,16 @@ class BodySurface:
             body: The body.
             rest: Positions of its particles at t = 0 [domain units], shape [particle, 3].
         """
-        self._spacing = (body_volume(body) / body.particles) ** (1 / 3)
+        self._spacing = (body.volume / body.particles) ** (1 / 3)
         self._weights = np.full(len(rest), CELL**-3)
         grid = _Grid(rest, self._spacing)
-        inside = np.clip(0.5 - _signed_distance(body, grid.nodes()) / grid.spacing, 0.0, 1.0)
-        wanted = grid.smooth(inside)
+        wanted = grid.smooth(_occupied(body, grid.nodes(), grid.spacing))
         for _ in range(WEIGHT_ITERATIONS):
             ratio = wanted / np.maximum(grid.density(rest, self._weights), 1e-3)
             self._weights *= map_coordinates(ratio, grid.coordinates(rest).T, order=1)
         # Half of the density inside would enclose too little: the kernel rounds off what is convex.
         fine = zoom(wanted, 2, order=1, grid_mode=True, mode="nearest")
-        nodes = round(8 * body_volume(body) / grid.spacing**3)
+        nodes = round(8 * body.volume / grid.spacing**3)
         self._level = float(np.partition(fine, -nodes, axis=None)[-nodes])
 
     def field(self, x: np.ndarray) -> Field:
@@ -101,11 +101,6 @@ def body_surfaces(scene: Scene) -> list[BodySurface]:
     """Return the surfaces of all bodies of a scene."""
     rest = sample_particles(scene)
     return [BodySurface(body, rest[at]) for body, at in zip(scene.bodies, body_slices(scene), strict=True)]
-
-
-def body_volume(body: Body) -> float:
-    """Return the volume of a body at t = 0 [domain units^3]."""
-    return math.prod(body.size) if body.shape == "box" else 4 / 3 * math.pi * body.size[0] ** 3
 
 
 def target_field(scene: Scene, mass: np.ndarray) -> Field:
@@ -173,6 +168,16 @@ class _Grid:
             weight = weights * share[i][:, 0] * share[j][:, 1] * share[k][:, 2]
             total += np.bincount(node, weight, minlength=total.size)
         return self.smooth(total.reshape(self.shape))
+
+
+def _occupied(body: Body, points: np.ndarray, spacing: float) -> np.ndarray:
+    """Share of the cells of a grid that a body fills at t = 0, by their centres, shape [..., 3]."""
+    if not isinstance(body, MeshBody):
+        return np.clip(0.5 - _signed_distance(body, points) / spacing, 0.0, 1.0)
+    unit = (points.reshape(-1, 3) - np.asarray(body.center)) / body.size[0]
+    quarter = spacing / body.size[0] / 4
+    parts = [body.mesh.inside(unit + quarter * np.array(way)) for way in product((-1, 1), repeat=3)]
+    return np.mean(parts, axis=0).reshape(points.shape[:-1])
 
 
 def _signed_distance(body: Body, points: np.ndarray) -> np.ndarray:

@@ -164,9 +164,17 @@ class RunResult:
 
 
 def config_dict(cfg: Any) -> dict[str, Any]:
-    """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists."""
-    plain = dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)
-    return json.loads(json.dumps(plain))
+    """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists.
+
+    Bodies without a file have no keys of one, as before there were any.
+    """
+    plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
+    bodies = lookup(plain, "task.bodies")
+    for body in bodies.values() if isinstance(bodies, dict) else ():
+        for key in ("file", "sha256"):
+            if isinstance(body, dict) and body.get(key, "") is None:
+                del body[key]
+    return plain
 
 
 def stored_config(text: str) -> dict[str, Any]:
@@ -234,10 +242,20 @@ def config_hash(cfg: Any) -> str:
         plain["protocol"] = chosen
     # Always empty.
     plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
+    # What a file holds counts, not where it is.
+    plain["task"] = _without_places(plain["task"])
     if isinstance(lookup(plain, "targets.source"), str):
         # The target comes from a file, whatever the task's recipe is.
         plain["task"] = _without_recipe(plain["task"])
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def _without_places(node: Any) -> Any:
+    """Return a part of a configuration without the places of its files."""
+    if not isinstance(node, dict):
+        return node
+    kept = {key: value for key, value in node.items() if key != "file" or isinstance(value, dict)}
+    return {key: _without_places(value) for key, value in kept.items()}
 
 
 def _without_recipe(task: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +142,7 @@ class Digests:
             target = json.dumps(variant_task(cfg).target, sort_keys=True).encode()
         else:
             target = load_release_target(cfg.targets.source, scene, cfg.variant).astype("<f8").tobytes()
-        facts = json.dumps(asdict(scene), sort_keys=True).encode()
+        facts = json.dumps(asdict(scene), sort_keys=True, default=attrgetter("sha256")).encode()
         return cls(hashlib.sha256(facts).hexdigest(), hashlib.sha256(target).hexdigest())
 
 

@@ -14,8 +14,15 @@ from plab.targets.build import (
     demonstration,
     make_recipe,
 )
+from plab.targets.files import MassTarget, PointsTarget
 from plab.targets.geometric import BodiesTarget, RingTarget, TargetBody
-from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError
+from plab.targets.recipe import (
+    EPISODE_STEPS,
+    GeometricRecipe,
+    ScriptedRecipe,
+    TargetError,
+    TensorRecipe,
+)
 from plab.targets.store import load_release_target
 
 __all__ = [
@@ -24,10 +31,13 @@ __all__ = [
     "TARGET_SEED",
     "BodiesTarget",
     "GeometricRecipe",
+    "MassTarget",
+    "PointsTarget",
     "RingTarget",
     "ScriptedRecipe",
     "TargetBody",
     "TargetError",
+    "TensorRecipe",
     "build_target",
     "build_targets",
     "check_target",

@@ -12,8 +12,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.objective import spread_mass
 from plab.scene import Scene
-from plab.targets import geometric, scripted
-from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError
+from plab.targets import files, geometric, scripted
+from plab.targets.recipe import (
+    EPISODE_STEPS,
+    GeometricRecipe,
+    ScriptedRecipe,
+    TargetError,
+    TensorRecipe,
+)
 from plab.targets.store import TargetStore
 
 if TYPE_CHECKING:
@@ -33,11 +39,13 @@ TARGET_SEED = 1
 """Seed of a geometric target's samples; not the scene's, or a target could be a shifted copy of the
 bodies."""
 
-Recipe: TypeAlias = GeometricRecipe | ScriptedRecipe
+Recipe: TypeAlias = GeometricRecipe | ScriptedRecipe | TensorRecipe
 
 RECIPES: dict[str, type[Recipe]] = {
     "bodies": geometric.BodiesTarget,
     "ring": geometric.RingTarget,
+    "points": files.PointsTarget,
+    "mass": files.MassTarget,
     "carry": scripted.CarryTarget,
     "dent": scripted.DentTarget,
     "draw": scripted.DrawTarget,
@@ -83,7 +91,7 @@ def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
         target: ``recipe`` and the recipe's parameters, as a task's YAML has them.
 
     Returns:
-        Actions in [-1, 1], shape [EPISODE_STEPS, A]; None for a geometric target.
+        Actions in [-1, 1], shape [EPISODE_STEPS, A]; None for a target that need not be simulated.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
@@ -100,7 +108,7 @@ def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
 
 
 def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
-    """Build a geometric target's mass tensor.
+    """Build the mass tensor of a target that need not be simulated.
 
     Args:
         scene: The scene that the target belongs to: grid, particle count and mass, manipulators.
@@ -114,6 +122,8 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             domain, or the target has to be simulated.
     """
     recipe = make_recipe(target)
+    if isinstance(recipe, TensorRecipe):
+        return recipe.mass(scene)
     if not isinstance(recipe, GeometricRecipe):
         raise TargetError(
             f"target.recipe {target['recipe']} is simulated: build it with plab.problem.Problem"
@@ -125,7 +135,8 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             f"the target reaches outside the domain 0 .. {top:.4g}: it covers {points.min(0).round(3)} to "
             f"{points.max(0).round(3)}"
         )
-    return spread_mass(points, scene.grid_size, scene.particle_mass, scene.floor)
+    share = scene.particle_count / len(points)
+    return spread_mass(points, scene.grid_size, share * scene.particle_mass, scene.floor)
 
 
 def build_targets(

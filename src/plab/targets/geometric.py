@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plab.scene import Body, Scene, SceneError, sample_particles, vector3
+from plab.scene import Body, Scene, SceneError, make_body, sample_particles
+from plab.shape_files import ShapeError
 from plab.targets.recipe import TargetError
 
 __all__ = ["BodiesTarget", "RingTarget", "TargetBody"]
@@ -21,14 +22,23 @@ class TargetBody:
     """One solid body of a target.
 
     Attributes:
-        shape: ``sphere`` or ``box``.
-        center: Centre (x, y, z) [domain units].
-        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``.
+        shape: ``sphere``, ``box`` or ``mesh``.
+        center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
+        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
+            its bounding box.
+        file: Mesh only: OBJ, STL or PLY file, as of :class:`plab.config_types.BodyConfig`.
+        sha256: Mesh only: SHA-256 of the file, likewise.
     """
 
     shape: str
     center: list[float]
     size: list[float]
+    file: str | None = None
+    sha256: str | None = None
+
+    def build(self, particles: int) -> Body:
+        """Return the body with so many particles; see :func:`plab.scene.make_body` for errors."""
+        return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 
 @dataclass
@@ -48,17 +58,20 @@ class BodiesTarget:
         for name, body in self.bodies.items():
             if len(body.center) != 3:
                 raise TargetError(f"target.bodies.{name}.center must be 3 numbers, not {body.center}")
-        volumes = np.array([_volume(body) for body in self.bodies.values()])
+        solids = []
+        for name, body in self.bodies.items():
+            try:
+                solids.append(body.build(1))
+            except (SceneError, ShapeError) as error:
+                raise TargetError(f"target.bodies.{name}: {error}") from None
+        volumes = np.array([solid.volume for solid in solids])
         if not np.all(volumes > 0):
             raise TargetError("target.bodies: sizes must be positive")
         # Rounding the running total shares out every particle and errs by less than one per body.
         ends = np.rint(np.cumsum(volumes) / volumes.sum() * scene.particle_count).astype(int)
         counts = np.diff(ends, prepend=0)
-        solids = tuple(
-            Body(body.shape, vector3(body.center), tuple(body.size), int(count))
-            for body, count in zip(self.bodies.values(), counts, strict=True)
-        )
-        filled = replace(scene, bodies=solids, particle_seed=int(rng.integers(2**31)))
+        bodies = tuple(replace(solid, particles=int(n)) for solid, n in zip(solids, counts, strict=True))
+        filled = replace(scene, bodies=bodies, particle_seed=int(rng.integers(2**31)))
         try:
             filled.validate()
         except SceneError as error:
@@ -101,8 +114,3 @@ class RingTarget:
         x, _, z = scene.manipulators[self.around].position
         height = self.floor + unit[:, 2] * self.section
         return np.stack([x + distance * np.cos(angle), height, z + distance * np.sin(angle)], axis=1)
-
-
-def _volume(body: TargetBody) -> float:
-    """Volume [domain units^3]; a body of the wrong shape or size is left to ``Scene.validate``."""
-    return 4 / 3 * math.pi * math.prod(body.size * 3) if body.shape == "sphere" else math.prod(body.size)

@@ -9,7 +9,7 @@ import numpy as np
 from plab.errors import PlabError
 from plab.scene import Scene
 
-__all__ = ["EPISODE_STEPS", "GeometricRecipe", "ScriptedRecipe", "TargetError"]
+__all__ = ["EPISODE_STEPS", "GeometricRecipe", "ScriptedRecipe", "TargetError", "TensorRecipe"]
 
 EPISODE_STEPS = 50
 """Environment steps of the suite's episodes, hence of its scripted demonstrations."""
@@ -24,14 +24,30 @@ class GeometricRecipe(Protocol):
     """A target that is a shape."""
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """Draw as many points as the scene has particles.
+        """Draw points that the mass of the scene's particles is shared out among.
 
         Args:
             scene: The scene that the target belongs to.
             rng: Source of randomness.
 
         Returns:
-            Positions [domain units], shape [particle, 3].
+            Positions [domain units], shape [point, 3].
+        """
+        ...
+
+
+@runtime_checkable
+class TensorRecipe(Protocol):
+    """A target that is given on the grid."""
+
+    def mass(self, scene: Scene) -> np.ndarray:
+        """Return the mass tensor.
+
+        Args:
+            scene: The scene that the target belongs to.
+
+        Returns:
+            Mass tensor, shape [n, n, n], with the mass of the scene's particles.
         """
         ...
 

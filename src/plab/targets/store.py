@@ -7,6 +7,7 @@ import os
 import tempfile
 from dataclasses import asdict, replace
 from json import dumps
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,9 +54,10 @@ class TargetStore:
             scene: The scene.
             actions: The demonstration, shape [T, A].
         """
-        # The length of later episodes has no part in it.
+        # The length of later episodes has no part in it; a mesh is what its file holds.
         facts = asdict(replace(scene, horizon=0)) | {"by": self._made_by, "physics": PHYSICS_VERSION}
-        digest = hashlib.sha256(dumps(facts, sort_keys=True).encode() + actions.astype("<f8").tobytes())
+        text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
+        digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
         return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
 
     def load(self, scene: Scene, actions: np.ndarray) -> np.ndarray | None:

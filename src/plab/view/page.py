@@ -20,7 +20,7 @@ from plab.render.camera import scene_camera
 from plab.render.recording import Recording
 from plab.render.renderer import BODY_COLORS, INK, PAPER
 from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.render.surface import body_slices, body_volume
+from plab.render.surface import body_slices
 
 __all__ = ["page"]
 
@@ -87,7 +87,7 @@ def _bodies(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
     scene = recording.scene
     stride = -(-len(steps) * scene.particle_count // _POSITIONS)
     for number, (body, at) in enumerate(zip(scene.bodies, body_slices(scene), strict=True)):
-        spacing = (stride * body_volume(body) / body.particles) ** (1 / 3)
+        spacing = (stride * body.volume / body.particles) ** (1 / 3)
         x = np.round(recording.x[steps, at][:, ::stride] * _LEVELS) / _LEVELS
         yield k3d.points(
             {str(step): frame for step, frame in zip(steps, x.astype(np.float32), strict=True)},
