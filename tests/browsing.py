@@ -38,4 +38,7 @@ def until(browser, script: str) -> None:
 
 
 def press(browser, selector: str) -> None:
-    browser.find_element("css selector", selector).click()
+    button = browser.find_element("css selector", selector)
+    # Not only into view, where the bar at the top may cover it.
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", button)
+    button.click()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +33,7 @@ SUFFIXES = (".png", ".gif", ".mp4")
 
 _HOLD = 1.0  # how long a film shows its last frame [s]
 _FILM_COLORS = 96  # of a GIF
+_SET_EVERY = 2  # environment steps from one frame to the next, of a set
 _SHEET_COLORS = 256
 _STRIP_FRAMES = 4  # of a task in the film strip
 _STRIP_COLUMNS = 2  # of tasks
@@ -69,16 +70,19 @@ def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1
         _WRITERS[path.suffix.lower()](recording, renderer, every, path)
 
 
-def save_set(recordings: Mapping[str, Recording], folder: Path, size: tuple[int, int]) -> None:
+def save_set(
+    recordings: Mapping[str, Recording], folder: Path, size: tuple[int, int], filmed: Collection[str]
+) -> None:
     """Write what several rollouts of one configuration look like, all seen by the same camera.
 
-    Writes ``start.webp`` and ``target.webp``, and for each rollout its last state as ``<name>.webp`` and,
-    where imageio-ffmpeg is installed, a film ``<name>.mp4``.
+    Writes ``start.webp`` and ``target.webp``, for each rollout its last state as ``<name>.webp``, and of
+    some, where imageio-ffmpeg is installed, a film ``<name>.mp4``.
 
     Args:
         recordings: The rollouts by name.
         folder: Folder to write to.
         size: Width and height of a frame [pixels]; even numbers.
+        filmed: Names of those that have a film.
 
     Raises:
         RenderError: If a file cannot be written.
@@ -95,12 +99,12 @@ def save_set(recordings: Mapping[str, Recording], folder: Path, size: tuple[int,
                 _save_webp(renderer.frame(first.x[0], first.poses[0]), folder / "start.webp")
                 _save_webp(renderer.target(first.poses[0]), folder / "target.webp")
             _save_webp(renderer.frame(recording.x[-1], recording.poses[-1]), folder / f"{name}.webp")
-            if films:
-                _save_mp4(recording, renderer, 1, folder / f"{name}.mp4")
+            if films and name in filmed:
+                _save_mp4(recording, renderer, _SET_EVERY, folder / f"{name}.mp4")
 
 
 def _save_webp(picture: np.ndarray, path: Path) -> None:
-    Image.fromarray(picture).save(path, quality=86, method=6)
+    Image.fromarray(picture).save(path, quality=86)
 
 
 def save_contact_sheet(rows: Mapping[str, Sequence[Recording]], path: Path, size: tuple[int, int]) -> None:

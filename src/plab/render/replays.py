@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -26,16 +26,21 @@ from plab.targets import TargetError
 __all__ = ["draw_runs", "draw_strip"]
 
 _SIZE = (480, 360)
+_UNFINISHED = ".unfinished-"
 _TROUBLE = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
 
 
-def draw_runs(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
+Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
+"""Result files and whether each is to have a film, by the name of its pictures, by folder."""
+
+
+def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
     """Draw runs of many configurations, see :func:`plab.render.pictures.save_set`.
 
     Args:
         wanted: For each configuration the folder of its pictures, which must not be there yet and appears
-            when it is complete; and the result files of its runs, by the name that their pictures are to
-            have.
+            when it is complete; and what is to be drawn.
+        drawn: Is called when a folder is complete.
 
     Raises:
         RenderError: If this computer cannot draw, a file cannot be written, or runs cannot be replayed; the
@@ -43,6 +48,8 @@ def draw_runs(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
     """
     require_graphics()
     troubles: list[str] = []
+    for place in {folder.parent for folder in wanted}:
+        _remove_unfinished(place)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
         done = 0
         for folders in _by_task(wanted).values():
@@ -53,9 +60,11 @@ def draw_runs(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
                 continue
             for folder in folders:
                 with _complete_or_not(folder) as fresh:
-                    save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _SIZE)
+                    films = {name for name, (_, film) in wanted[folder].items() if film}
+                    save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _SIZE, films)
                 done += 1
                 report(done, folder.name)
+                drawn()
     if troubles:
         raise RenderError("; ".join(troubles))
 
@@ -77,19 +86,20 @@ def draw_strip(path: Path, picture: Path) -> None:
         raise RenderError(str(error)) from error
 
 
-def _by_task(wanted: Mapping[Path, Mapping[str, Path]]) -> dict[str, list[Path]]:
-    """Return the folders by task: configurations of one task share a simulator, and its compilation."""
+def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
+    """Return the folders by task, those with films first: configurations of one task share a simulator, and
+    its compilation."""
     groups: dict[str, list[Path]] = defaultdict(list)
-    for folder in wanted:
+    for folder in sorted(wanted, key=lambda folder: -sum(film for _, film in wanted[folder].values())):
         groups[folder.name.rpartition("-v")[0]].append(folder)
     return groups
 
 
-def _replayed(group: Mapping[Path, Mapping[str, Path]]) -> dict[tuple[Path, str], recording.Recording]:
+def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.Recording]:
     """Replay all runs of one task; those of the same settings share a simulator."""
     alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
     for folder, files in group.items():
-        for name, path in files.items():
+        for name, (path, _) in files.items():
             cfg, actions = recording.result(path)
             sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
             kind = json.dumps([*sections, actions.shape])
@@ -102,12 +112,18 @@ def _replayed(group: Mapping[Path, Mapping[str, Path]]) -> dict[tuple[Path, str]
     return made
 
 
+def _remove_unfinished(place: Path) -> None:
+    """Remove what a process that was killed has left of pictures."""
+    for folder in place.glob(f"{_UNFINISHED}*"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 @contextmanager
 def _complete_or_not(folder: Path) -> Iterator[Path]:
     """Give a folder to write to, which takes its place only if nothing goes wrong."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=".", dir=folder.parent))
+        fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder.parent))
     except OSError as error:
         raise RenderError(f"cannot write {folder}: {error.strerror or error}") from error
     try:

@@ -12,7 +12,8 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,7 @@ from plab.report.hyperparameters import hyperparameters
 from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_packages
-from plab.report.page import write_overview, write_page
+from plab.report.page import Page
 from plab.report.series import load_rows, load_series
 from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
@@ -46,6 +47,12 @@ __all__ = ["main", "write_curves", "write_tables"]
 
 YIELD_STRESS = "task.yield_stress"
 
+_PAUSE = 5.0
+"""How often ``--follow`` looks at the runs [s]."""
+
+_QUIET = 2
+"""Looks in a row at which no run is under way, until it ends: a sweep's next run may be about to begin."""
+
 
 @command_line
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,10 +61,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parse(arguments)
     command = shlex.join(["python", "-m", "plab.report", *arguments])
     out = options.out or Path("reports") / options.what
-    runs = collect(options.results, select(options.words, NAMES))
-    made = _MAKERS[options.what](runs, options, out, command)
-    _tell(runs, made, out)
-    return 0
+    before, quiet = None, 0
+    while True:
+        runs = collect(options.results, select(options.words, NAMES))
+        quiet = 0 if runs.under_way else quiet + 1
+        now = (runs.digest, quiet == 0)
+        if now != before and not (options.follow and runs.table.empty and not quiet):
+            made = _MAKERS[options.what](runs, options, out, command)
+            _tell(runs, made, out)
+            before = now
+        if not options.follow or quiet == _QUIET:
+            return 0
+        time.sleep(_PAUSE)
 
 
 def _make_tables(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
@@ -82,25 +97,27 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
 
 def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
     _require_runs(runs, options.results)
-    origin = _origin(runs, command, deep=False)
+    page = Page(runs, out, _origin(runs, command, deep=False), every_film=options.every_film)
+    wanted = lacking(page.shown, out) if options.pictures else {}
     # It is complete but for pictures before the first of them is drawn.
-    write_page(runs, out, origin)
-    if options.pictures and (wanted := lacking(runs, out)):
+    page.write(drawing=bool(wanted))
+    if wanted:
         try:
-            _draw(wanted)
+            _draw(wanted, lambda: page.write(drawing=True))
         except RenderError as error:
             print(f"plab: without pictures: {error}", file=sys.stderr)
-        remove_earlier(runs, out)
-        write_overview(runs, out, origin)
+        finally:
+            remove_earlier(page.shown, out)
+            page.write()
     return "index.html"
 
 
-def _draw(wanted: Mapping[Path, Mapping[str, Path]]) -> None:
+def _draw(wanted: Mapping[Path, Mapping[str, tuple[Path, bool]]], drawn: Callable[[], None]) -> None:
     require_graphics()
     # Imported here: all else needs neither PyVista nor Taichi.
     from plab.render.replays import draw_runs
 
-    draw_runs(wanted)
+    draw_runs(wanted, drawn)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
@@ -136,6 +153,10 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--bench", type=folder, default=Path("reports/bench"), help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
+    what = "make it again whenever runs have ended, until none is under way"
+    parser.add_argument("--follow", action="store_true", help=what)
+    what = "html: a film of every run that is shown, not only of the best of each task"
+    parser.add_argument("--every-film", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
     sources, words = sources_and_words(options.results)

@@ -7,14 +7,25 @@ a bootstrap sample draws as many runs of each as there are.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
+from plab.report.collect import Runs
+from plab.report.methods import method
 from plab.report.statistics import CONFIDENCE, Interval
 
-__all__ = ["RESAMPLES", "common_strata", "improvement", "interquartile_mean", "performance_profile"]
+__all__ = [
+    "RESAMPLES",
+    "Shared",
+    "common_strata",
+    "improvement",
+    "interquartile_mean",
+    "performance_profile",
+    "shared_strata",
+]
 
 RESAMPLES = 2000
 """Bootstrap samples."""
@@ -29,7 +40,10 @@ def interquartile_mean(strata: Strata) -> Interval:
     """Return the mean of the middle half of all scores, with its percentile interval."""
 
     def middle(samples: np.ndarray) -> np.ndarray:
-        return stats.trim_mean(samples, 0.25, axis=1)
+        # As SciPy's trim_mean, whose module would take longer to import than all tables to make.
+        count = samples.shape[1]
+        cut = count // 4
+        return np.sort(samples, axis=1)[:, cut : count - cut].mean(axis=1)
 
     return _interval(middle(np.concatenate(strata)[None])[0], middle(_resampled(strata)))
 
@@ -92,13 +106,52 @@ def _interval(value: float, samples: np.ndarray) -> Interval:
     return Interval(float(value), float(low), float(high))
 
 
+@dataclass(frozen=True)
+class Shared:
+    """The scores that methods are compared by, all together.
+
+    Attributes:
+        keys: Task and variant of the configurations of which every method shown has runs.
+        strata: Scores of each of them, by method.
+        notes: Sentences on what is shown and what is not.
+    """
+
+    keys: list[tuple[str, str]]
+    strata: dict[str, list[np.ndarray]]
+    notes: list[str]
+
+
+def shared_strata(runs: Runs) -> Shared:
+    """Return the scores of the runs, of methods and configurations as :func:`common_strata` chooses them."""
+    scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
+    for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
+        scores[name][task, variant] = own["score"].to_numpy(float)
+    keys, strata = common_strata({name: scores[name] for name in runs.methods if name in scores})
+    counts = [f"{method(name).label} {sum(map(len, own))}" for name, own in strata.items()]
+    apart = [
+        f"{method(name).label} ({sum(key in scores[name] for key in keys)} of {len(keys)})"
+        for name in runs.methods
+        if name in scores and name not in strata
+    ]
+    notes = [
+        f"Over the {len(keys)} configurations of which every method shown has runs; runs per method: "
+        f"{', '.join(counts)}.",
+        *([f"Not shown, for they lack runs of these configurations: {', '.join(apart)}."] if apart else []),
+        f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
+    ]
+    if any(len(scores) < 2 for own in strata.values() for scores in own):
+        notes.append("Configurations with a single run count as if others would give the same.")
+    return Shared(keys, strata, notes)
+
+
 def common_strata(
     scores: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
 ) -> tuple[list[tuple[str, str]], dict[str, list[np.ndarray]]]:
     """Return configurations of which several methods have runs, and the scores of these methods.
 
-    Where no configuration has runs of all methods, the method is left out without which most are shared, of
-    several the one with the fewest, and so on.
+    Methods are left out one by one, each time the one without which most configurations are shared, of
+    several the one with the fewest. Of what is left each time, the methods and configurations are taken that
+    make the most pairs: two methods at least, if any two share a configuration.
 
     Args:
         scores: By method and configuration, shape [run] each.
@@ -107,9 +160,13 @@ def common_strata(
         The configurations; and by method the scores of each of them.
     """
     left = {name: set(own) for name, own in scores.items()}
-    while left and not set.intersection(*left.values()):
+    best: tuple[int, dict[str, set[tuple[str, str]]]] = (0, {})
+    while left and not (len(left) < 2 and best[0]):
+        size = len(left) * len(set.intersection(*left.values()))
+        if size > best[0]:
+            best = size, dict(left)
         others = {name: [own for other, own in left.items() if other != name] for name in left}
         shared = {name: len(set.intersection(*own)) if own else 0 for name, own in others.items()}
         del left[max(left, key=lambda name: (shared[name], -len(left[name])))]
-    keys = sorted(set.intersection(*left.values())) if left else []
-    return keys, {name: [scores[name][key] for key in keys] for name in left}
+    keys = sorted(set.intersection(*best[1].values())) if best[1] else []
+    return keys, {name: [scores[name][key] for key in keys] for name in best[1]}

@@ -15,6 +15,7 @@ import pandas as pd
 import yaml
 
 from plab.errors import PlabError
+from plab.locks import held
 from plab.possible import require_possible
 from plab.report.methods import ordered
 from plab.results import Row, lookup, rows
@@ -75,6 +76,7 @@ class Runs:
         methods: Methods asked for, in the order of tables.
         seeds: Seeds asked for.
         unfinished: Number of runs of theirs that are not finished, hence not in ``table``.
+        under_way: How many of them are being computed at this moment.
         others: Number of finished runs that belong to nothing asked for.
         set_aside: Number of finished runs with more changes to plab's own settings than others of the same
             task and method have.
@@ -91,6 +93,7 @@ class Runs:
     methods: list[str]
     seeds: list[str]
     unfinished: int
+    under_way: int
     others: int
     set_aside: int
     unusual: dict[str, list[Any]]
@@ -168,6 +171,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         methods=asked["method"],
         seeds=asked["seed"],
         unfinished=len(inside) - len(complete),
+        under_way=sum(held(row.path) for row in inside if row.values["status"] != "finished"),
         others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
         set_aside=len(complete) - len(finished),
         unusual=unusual,

@@ -14,14 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 
-from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.aggregate import improvement, interquartile_mean, performance_profile, shared_strata
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
 from plab.report.methods import RL, method
 from plab.report.series import Rows, band
-from plab.report.statistics import CONFIDENCE
 from plab.report.table import number
 from plab.report.tables import ordered_tasks, settings_note
 
@@ -315,28 +314,11 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
 
 def aggregates(runs: Runs) -> list[Drawing]:
     """Return interquartile means, performance profiles and probabilities of improvement."""
-    scores: dict[str, dict[tuple[str, str], np.ndarray]] = defaultdict(dict)
-    for (name, task, variant), own in runs.table.groupby(["method", "task", "variant"]):
-        scores[name][task, variant] = own["score"].to_numpy(float)
-    methods = [name for name in runs.methods if name in scores]
-    keys, strata = common_strata({name: scores[name] for name in methods})
-    if not keys:
+    shared = shared_strata(runs)
+    if not shared.keys:
         return []
-    apart = [method(name).label for name in methods if name not in strata]
-    methods = list(strata)
-    counts = {name: sum(map(len, strata[name])) for name in methods}
-    notes = [
-        f"Over the {len(keys)} configurations of which every method shown has runs; runs per method: "
-        + ", ".join(f"{method(name).label} {count}" for name, count in counts.items())
-        + ".",
-        *(
-            [f"Not shown, for they share no configuration with the others: {', '.join(apart)}."]
-            if apart
-            else []
-        ),
-        f"{CONFIDENCE:.0%} percentile intervals of a bootstrap stratified over configurations.",
-        *settings_note(runs),
-    ]
+    methods, strata = list(shared.strata), shared.strata
+    notes = [*shared.notes, *settings_note(runs)]
     draw: tuple[Callable[..., Drawing], ...] = (_interquartile_means, _profiles, _improvements)
     return [call(methods, strata, notes) for call in draw]
 

@@ -9,14 +9,14 @@ import hashlib
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from plab.report.collect import Runs
 
-__all__ = ["FOLDER", "Shown", "best_runs", "lacking", "present", "remove_earlier"]
+__all__ = ["FOLDER", "Shown", "best_of_tasks", "best_runs", "lacking", "present", "remove_earlier"]
 
 FOLDER = "media"
 """Folder of pictures, below that of the page."""
@@ -30,11 +30,13 @@ class Shown:
         task: Name of the task.
         variant: Name of the variant.
         runs: The best run of each method: its row of the table of runs.
+        films: Methods whose run has a film.
     """
 
     task: str
     variant: str
     runs: Mapping[str, Mapping[str, Any]]
+    films: frozenset[str] = frozenset()
 
     @property
     def name(self) -> str:
@@ -43,24 +45,47 @@ class Shown:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its pictures: other runs, other folder."""
-        hashes = json.dumps({method: run["config_hash"] for method, run in sorted(self.runs.items())})
+        """Name of the folder of its pictures: other runs or films, other folder."""
         # Runs done afresh have the same configuration, but other actions.
-        scores = json.dumps([run["best_loss"] for _, run in sorted(self.runs.items())])
-        return f"{self.name}-{hashlib.sha256((hashes + scores).encode()).hexdigest()[:8]}"
+        own = [[name, run["config_hash"], run["best_loss"]] for name, run in sorted(self.runs.items())]
+        text = json.dumps([own, sorted(self.films)])
+        return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def best_runs(runs: Runs) -> list[Shown]:
-    """Return the run with the highest score of each configuration and method."""
+def best_runs(runs: Runs, *, every_film: bool = False) -> list[Shown]:
+    """Return the run with the highest score of each configuration and method.
+
+    Args:
+        runs: Our runs.
+        every_film: Whether each of them has a film, not only the best of each task.
+    """
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
     # Of equal ones the first, whatever order the files were found in.
     table = runs.table.sort_values(["score", "config_hash"], ascending=[False, True])
     for row in table.to_dict("records"):
         found[row["task"], row["variant"]].setdefault(row["method"], row)
-    return [
+    shown = [
         Shown(task, variant, {name: own[name] for name in runs.methods if name in own})
         for (task, variant), own in sorted(found.items())
     ]
+    best = best_of_tasks(shown)
+    return [
+        replace(
+            one, films=frozenset(name for name in one.runs if every_film or best[one.task] == (one, name))
+        )
+        for one in shown
+    ]
+
+
+def best_of_tasks(shown: Sequence[Shown]) -> dict[str, tuple[Shown, str]]:
+    """Return the configuration and method of the run with the highest score of each task."""
+    best: dict[str, tuple[Shown, str]] = {}
+    for one in shown:
+        for name, run in one.runs.items():
+            known = best.get(one.task)
+            if known is None or run["score"] > known[0].runs[known[1]]["score"]:
+                best[one.task] = one, name
+    return best
 
 
 def present(shown: Shown, out: Path) -> dict[str, str]:
@@ -77,40 +102,41 @@ def present(shown: Shown, out: Path) -> dict[str, str]:
     if not folder.is_dir():
         return {}
     names = {"start": "start.webp", "target": "target.webp"}
-    names |= {method: f"{method}.webp" for method in shown.runs}
-    names |= {f"{method} film": f"{method}.mp4" for method in shown.runs}
+    names |= {method: f"{_stem(run)}.webp" for method, run in shown.runs.items()}
+    names |= {f"{method} film": f"{_stem(shown.runs[method])}.mp4" for method in shown.films}
     there = {what: folder / name for what, name in names.items()}
     return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
 
 
-def lacking(runs: Runs, out: Path) -> dict[Path, dict[str, Path]]:
+def lacking(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
     """Return what is to be drawn: the folder of each configuration's pictures, and the runs that they show.
 
     Args:
-        runs: Our runs.
+        shown: The configurations.
         out: Folder of the page.
 
     Returns:
-        Result files by method, by folder; those whose folder is not there.
+        Result files and whether each has a film, by the names of the pictures, by folder; those whose folder
+        is not there.
     """
-    folders = {out / FOLDER / shown.folder: shown for shown in best_runs(runs)}
+    folders = {out / FOLDER / one.folder: one for one in shown}
     return {
-        folder: {method: Path(run["path"]) for method, run in shown.runs.items()}
-        for folder, shown in folders.items()
+        folder: {_stem(run): (Path(run["path"]), name in one.films) for name, run in one.runs.items()}
+        for folder, one in folders.items()
         if not folder.is_dir()
     }
 
 
-def remove_earlier(runs: Runs, out: Path) -> None:
-    """Remove pictures of runs that are no longer the best, where there are those of the best.
+def _stem(run: Mapping[str, Any]) -> str:
+    """Return the name of a run's pictures, whatever its method is called."""
+    return str(run["config_hash"])[:12]
 
-    Args:
-        runs: Our runs.
-        out: Folder of the page.
-    """
-    for shown in best_runs(runs):
-        current = out / FOLDER / shown.folder
+
+def remove_earlier(shown: Sequence[Shown], out: Path) -> None:
+    """Remove pictures of runs that are no longer the best, where there are those of the best."""
+    for one in shown:
+        current = out / FOLDER / one.folder
         if current.is_dir():
-            for folder in (out / FOLDER).glob(f"{shown.name}-{'[0-9a-f]' * 8}"):
+            for folder in (out / FOLDER).glob(f"{one.name}-{'[0-9a-f]' * 8}"):
                 if folder != current:
                     shutil.rmtree(folder)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
+from plab.report.templates import asset, render
 from plab.results import ResultsError
 
 __all__ = ["NOTEBOOKS", "execute", "notebook_folder", "require_packages"]
@@ -115,10 +113,5 @@ def _page(notebook: Any, name: str, names: Sequence[str]) -> str:
 
     exporter = HTMLExporter(template_name="basic", exclude_input_prompt=True, exclude_output_prompt=True)
     body, _ = exporter.from_notebook_node(notebook)
-    folder = files("plab.report") / "web"
-    text = {
-        file: (folder / file).read_text(encoding="utf-8")
-        for file in ("notebook.html", "page.css", "notebook.css")
-    }
-    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["notebook.html"])
-    return template.render(style=text["page.css"] + text["notebook.css"], body=body, name=name, names=names)
+    style = asset("page.css") + asset("notebook.css")
+    return render("notebook.html", style=style, script=asset("theme.js"), body=body, name=name, names=names)

@@ -2,32 +2,34 @@
 
 The page needs no server and no network. ``index.html`` holds style, script and the overview. The curves of a
 configuration are in a script of its own below ``data/``, which the page loads when they are asked for:
-browsers let a page from the file system load scripts, but no data.
+browsers let a page from the file system load scripts, but no data. ``data/state.js`` says which page is
+there, so that one that is open finds out that it has been written again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-import math
 import shlex
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, StrictUndefined
 
 from plab.report.collect import Runs, changed_settings
 from plab.report.media import Shown, best_runs, present
 from plab.report.methods import Method, method
 from plab.report.series import AXES, Band, band, rows_on_axes
 from plab.report.statistics import stratified_difference
-from plab.report.tables import Cell, Cells, ordered_tasks, settings_note
+from plab.report.summary import aggregates, compared, finite, gallery, incomplete, per_task, sentence
+from plab.report.tables import Cells, ordered_tasks, settings_note
+from plab.report.templates import asset, render
 from plab.results import read_iterations
+from plab.results.files import replace_file
 
-__all__ = ["write_overview", "write_page"]
+__all__ = ["Page"]
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
 """What curves show, and below what values count as this, as in the paper's figures."""
@@ -38,62 +40,103 @@ _POINTS = 160
 _DIGITS = 4
 """Significant digits of the curves' numbers."""
 
+_LOOK_EVERY = 3000
+"""How often a page that may be made again looks whether it has been [ms]."""
 
-def write_page(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
-    """Write the page, with the pictures that are there.
+_SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "configuration.js", "page.js")
 
-    Args:
-        runs: Our runs.
-        out: Folder to write to.
-        origin: What is said about where the page comes from: ``command``, ``digest``, ``plab``.
+
+class Page:
+    """The page of some runs: what it says is worked out once, pictures join as they are drawn.
+
+    Attributes:
+        shown: Configurations and the runs of them that pictures show.
     """
-    (out / "data").mkdir(parents=True, exist_ok=True)
-    for shown in best_runs(runs):
-        text = json.dumps(_details(shown, runs), separators=(",", ":"), allow_nan=False)
-        script = f"plab.receive({json.dumps(shown.name)},{text});\n"
-        (out / "data" / f"{shown.name}.js").write_text(script, encoding="utf-8", newline="\n")
-    write_overview(runs, out, origin)
 
+    def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_film: bool = False) -> None:
+        """Write curves and runs of each configuration to ``data/``, and work out the rest.
 
-def write_overview(runs: Runs, out: Path, origin: Mapping[str, Any]) -> None:
-    """Write ``index.html`` alone, as :func:`write_page` does: when there are more pictures than before."""
-    folder = files("plab.report") / "web"
-    names = ("page.html", "page.css", "page.js", "theme.js")
-    text = {name: (folder / name).read_text(encoding="utf-8") for name in names}
-    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(text["page.html"])
-    content = {
-        "methods": [_look(method(name)) for name in runs.methods],
-        "configurations": _overview(runs, {shown.name: present(shown, out) for shown in best_runs(runs)}),
-        "axes": list(AXES),
-        "columns": list(_COLUMNS),
-    }
-    known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
-    html = template.render(
-        style=text["page.css"],
-        script=text["theme.js"] + text["page.js"],
+        Args:
+            runs: Our runs.
+            out: Folder to write to.
+            origin: What is said about where the page comes from: ``command``, ``digest``, ``plab``.
+            every_film: Whether each run that is shown has a film, not only the best of each task.
+        """
+        self.shown = best_runs(runs, every_film=every_film)
+        self._out, self._under_way = out, runs.under_way > 0
+        self._content = {
+            "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
+            "tasks": per_task(runs),
+            "gallery": gallery(self.shown),
+            "aggregates": aggregates(runs),
+            "axes": list(AXES),
+            "columns": list(_COLUMNS),
+            "every": _LOOK_EVERY,
+        }
+        self._configurations = _overview(runs)
+        known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
+        present = set(runs.table["method"])
+        cells = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
+        self._values = {
+            "style": asset("page.css"),
+            "script": "".join(map(asset, _SCRIPTS)),
+            "methods": [method(name) for name in runs.methods],
+            "origin": origin,
+            "runs": sorted(known, key=lambda row: [str(value) for value in row.values()]),
+            "expected": cells * sum(name in present for name in runs.methods),
+            "sentence": sentence(runs),
+            "incomplete": incomplete(runs),
+            "notes": settings_note(runs),
+            "left_out": runs.left_out(),
+            "tasks": len(set(runs.table["task"])),
+            "all_tasks": len(runs.tasks),
+        }
+        self._write_details(runs)
+
+    def _write_details(self, runs: Runs) -> None:
+        folder = self._out / "data"
+        folder.mkdir(parents=True, exist_ok=True)
+        # What a process that was killed has left.
+        for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
+            path.unlink()
+        for one in self.shown:
+            text = json.dumps(_details(one, runs), separators=(",", ":"), allow_nan=False)
+            _write(folder / f"{one.name}.js", f"plab.receive({json.dumps(one.name)},{text});\n")
+        for path in folder.glob("*-v*.js"):
+            if path.stem not in {one.name for one in self.shown}:
+                path.unlink()
+
+    def write(self, *, drawing: bool = False) -> None:
+        """Write ``index.html`` with the pictures that are there.
+
+        Args:
+            drawing: Whether more pictures are being drawn. Then, or while runs are under way, the page loads
+                itself again when it has been written anew.
+        """
+        pictures = {one.name: present(one, self._out) for one in self.shown}
+        configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
+        content = self._content | {"configurations": configurations, "live": drawing or self._under_way}
+        # Of two pages of the same runs and pictures only one may still be in the making.
+        state = hashlib.sha256(json.dumps([content, str(self._values)]).encode()).hexdigest()[:16]
+        text = json.dumps(content | {"state": state}, separators=(",", ":"), allow_nan=False)
         # The only sign with which text could leave the script that it is in.
-        content=json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        methods=[method(name) for name in runs.methods],
-        origin=origin,
-        runs=sorted(known, key=lambda row: [str(value) for value in row.values()]),
-        expected=len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds),
-        notes=settings_note(runs),
-        left_out=runs.left_out(),
-        tasks=len(set(runs.table["task"])),
-        all_tasks=len(runs.tasks),
-    )
-    (out / "index.html").write_text(html, encoding="utf-8", newline="\n")
+        html = render("page.html", **self._values, content=text.replace("<", "\\u003c"))
+        _write(self._out / "index.html", html)
+        _write(self._out / "data" / "state.js", f"plab.state({json.dumps(state)});\n")
 
 
-def _look(look: Method) -> dict[str, str]:
+def _write(path: Path, text: str) -> None:
+    """Write a file that is whole at any time, for a browser may read it."""
+    replace_file(path, text.encode(), sync=False)
+
+
+def _look(look: Method, place: int) -> dict[str, str]:
     dashes = {"-": "", "--": "6 3", "-.": "7 3 1.5 3", ":": "1.5 3"}[look.dashes]
-    return {"name": look.name, "label": look.label, "kind": look.kind, "dashes": dashes}
+    return {"name": look.name, "label": look.label, "dashes": dashes, "css": f"m{place}"}
 
 
-# --------------------------------------------------------------------------------------------------- overview
-
-
-def _overview(runs: Runs, pictures: Mapping[str, Mapping[str, str]]) -> list[dict[str, Any]]:
+def _overview(runs: Runs) -> list[dict[str, Any]]:
+    """Return our scores, the paper's and the difference of every configuration, by method."""
     ours, theirs = Cells("ours", runs), Cells("paper", runs)
     listed = []
     for task in ordered_tasks(runs.tasks):
@@ -102,26 +145,9 @@ def _overview(runs: Runs, pictures: Mapping[str, Mapping[str, str]]) -> list[dic
             for name in runs.methods:
                 mine, printed = (source.configuration(task, variant, name) for source in (ours, theirs))
                 gap = stratified_difference([mine.summary], [printed.summary])
-                cells[name] = {
-                    "ours": _numbers(mine) | {"expected": mine.expected},
-                    "paper": _numbers(printed),
-                    "difference": [_finite(value) for value in (gap.value, gap.low, gap.high)],
-                }
-            name = f"{task}-v{variant}"
-            listed.append(
-                {"name": name, "task": task, "variant": variant, "cells": cells}
-                | {"pictures": dict(pictures.get(name, {}))}
-            )
+                cells[name] = compared(mine, printed, gap)
+            listed.append({"name": f"{task}-v{variant}", "task": task, "variant": variant, "cells": cells})
     return listed
-
-
-def _numbers(cell: Cell) -> dict[str, Any]:
-    summary = cell.summary
-    return {"mean": _finite(summary.mean), "std": _finite(summary.std), "count": summary.count}
-
-
-def _finite(value: float) -> float | None:
-    return None if math.isnan(value) else round(float(value), 4)
 
 
 # ---------------------------------------------------------------------------------------------- configuration
@@ -151,12 +177,12 @@ def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
     batch = row["batch"]
     return {
         "seed": row["seed"],
-        "score": _finite(row["score"]),
-        "iou": _finite(row["iou"]),
-        "loss": _finite(row["best_loss"]),
+        "score": finite(row["score"]),
+        "iou": finite(row["iou"]),
+        "loss": finite(row["best_loss"]),
         "iterations": int(row["iterations"]),
         "best_iteration": int(row["best_iteration"]),
-        "seconds": _finite(row["seconds"]),
+        "seconds": finite(row["seconds"]),
         "batch": None if pd.isna(batch) else int(batch),
         "device": row["device"],
         "started": row["started"],

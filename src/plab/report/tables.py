@@ -27,6 +27,7 @@ __all__ = [
     "ordered_tasks",
     "settings_note",
     "solvability",
+    "task_difference",
 ]
 
 _INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
@@ -130,16 +131,21 @@ def iou_per_task(runs: Runs) -> list[Table]:
     ours, theirs = Cells("ours", runs), Cells("paper", runs)
 
     def difference(key: tuple[str, ...], name: str) -> Interval:
-        pairs = [
-            (ours.configuration(key[0], variant, name), theirs.configuration(key[0], variant, name))
-            for variant in runs.variants
-        ]
-        return stratified_difference([a.summary for a, _ in pairs], [b.summary for _, b in pairs])
+        return task_difference(ours, theirs, runs.variants, key[0], name)
 
     title = "Normalised incremental IoU per task"
     return _iou_tables(
         runs, "iou_per_task", title, what, ("task",), keys, (ours.task, theirs.task), difference
     )
+
+
+def task_difference(ours: Cells, theirs: Cells, variants: Sequence[str], task: str, name: str) -> Interval:
+    """Return the mean difference over the variants of a task that both have, see
+    :func:`plab.report.statistics.stratified_difference`."""
+    sides = [
+        [side.configuration(task, variant, name).summary for variant in variants] for side in (ours, theirs)
+    ]
+    return stratified_difference(*sides)
 
 
 def iou_per_configuration(runs: Runs) -> list[Table]:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
 from plab.report.budgets import BUDGETS
+from plab.report.templates import asset, render
 from plab.submissions.board import Board
 from plab.submissions.verifying import TOLERANCE
 from plab.suite import suite_tasks
 
 __all__ = ["write_leaderboard"]
+
+_PACKAGE = "plab.submissions"
 
 
 def write_leaderboard(board: Board, out: Path, origin: Mapping[str, Any]) -> Path:
@@ -29,12 +29,11 @@ def write_leaderboard(board: Board, out: Path, origin: Mapping[str, Any]) -> Pat
     Returns:
         The page.
     """
-    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(
-        _text("plab.submissions", "leaderboard.html")
-    )
-    html = template.render(
-        style=_text("plab.report", "page.css") + _text("plab.submissions", "leaderboard.css"),
-        script=_text("plab.report", "theme.js") + _text("plab.submissions", "leaderboard.js"),
+    html = render(
+        "leaderboard.html",
+        _PACKAGE,
+        style=asset("page.css") + asset("leaderboard.css", _PACKAGE),
+        script=asset("theme.js") + asset("leaderboard.js", _PACKAGE),
         board=board,
         budgets=[_short(budget) for budget in BUDGETS],
         tasks=suite_tasks(),
@@ -50,7 +49,3 @@ def write_leaderboard(board: Board, out: Path, origin: Mapping[str, Any]) -> Pat
 def _short(count: float) -> str:
     """Write a round number with a letter: 10k."""
     return f"{count / 1e6:g}M" if count >= 1e6 else f"{count / 1e3:g}k"
-
-
-def _text(package: str, name: str) -> str:
-    return (files(package) / "web" / name).read_text(encoding="utf-8")

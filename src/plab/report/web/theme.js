@@ -1,4 +1,3 @@
-"use strict";
 // The button #theme of every page: light or dark, remembered.
 (() => {
   const root = document.documentElement;
