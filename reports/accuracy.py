@@ -31,6 +31,7 @@ from plab.report.measurements import ACCURACY, PRECISION, origin
 from plab.report.methods import method
 from plab.report.notebook import benchmark, gather, show_figure, show_origin, show_table
 from plab.report.series import load_series
+from plab.report.table import number
 
 runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
@@ -68,7 +69,7 @@ show_figure(drawing)
 if drawing is not None:
     rows = [
         {"method": method(name).label, "runs": own["runs"]}
-        | {"mean change": f"{own['mean']:+.3f}", "largest": f"{own['largest']:+.3f}"}
+        | {"mean change": number(own["mean"], 3, sign=True), "largest": number(own["largest"], 3, sign=True)}
         for name, own in drawing.numbers.items()
     ]
     show_table(pd.DataFrame(rows))

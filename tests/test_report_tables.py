@@ -20,8 +20,9 @@ from plab.config import load_config
 from plab.examples import EXAMPLES, example_archive, resolve
 from plab.report.__main__ import main, write_tables
 from plab.report.agreement import agreement
-from plab.report.collect import NAMES, MixedRunsError, collect
+from plab.report.collect import NAMES, MixedRunsError, Setting, collect
 from plab.report.hyperparameters import hyperparameters
+from plab.report.methods import method as look
 from plab.report.reference import paper_table
 from plab.report.statistics import Summary, stratified_difference, summarise
 from plab.report.table import Table, number, write_table
@@ -203,7 +204,10 @@ def test_mixed_settings_are_refused_with_advice(folder: Path, tmp_path: Path) ->
         gather(tmp_path)
     runs = gather(tmp_path, "sim.particles_scale=0.5")
     assert len(runs.table) == 1
-    assert runs.unusual == {"method.iterations": [synthetic.ROWS], "sim.particles_scale": [0.5]}
+    assert list(map(str, runs.unusual)) == [
+        f"method.iterations = {synthetic.ROWS}",
+        "sim.particles_scale = 0.5",
+    ]
     note = by_form(iou_per_task(runs))["ours"].notes[-1]
     assert "sim.particles_scale = 0.5" in note
 
@@ -214,7 +218,7 @@ def test_runs_that_try_something_do_not_disturb_the_others(tmp_path: Path) -> No
         other["task"]["yield_stress"], other["method"]["iterations"] = stress, 200
         synthetic.save(synthetic.synthetic_run(other, rows=2))
     runs = gather(tmp_path)
-    assert (len(runs.table), runs.set_aside, runs.unusual) == (1, 2, {})
+    assert (len(runs.table), runs.set_aside, runs.unusual) == (1, 2, [])
     assert len(gather(tmp_path, "task.yield_stress=10").table) == 1
 
 
@@ -225,7 +229,7 @@ def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
         synthetic.save(synthetic.synthetic_run(other, rows=synthetic.ROWS))
     with pytest.raises(MixedRunsError, match=r"task\.yield_stress, which is .* and "):
         gather(tmp_path)
-    assert gather(tmp_path, "task.yield_stress=10").unusual["task.yield_stress"] == [10.0]
+    assert gather(tmp_path, "task.yield_stress=10").unusual[-1] == Setting("task.yield_stress", 10.0, "")
 
 
 def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
@@ -236,7 +240,7 @@ def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
             del older["method"]["max_gradient_norm"]
         synthetic.save(synthetic.synthetic_run(older, rows=synthetic.ROWS))
     runs = gather(tmp_path)
-    assert len(runs.table) == 2 and "method.max_gradient_norm" not in runs.unusual and not runs.set_aside
+    assert len(runs.table) == 2 and "method.max_gradient_norm" not in str(runs.unusual) and not runs.set_aside
 
 
 def released(folder: Path, seed: int, **changes: str) -> None:
@@ -259,14 +263,14 @@ def test_protocols_are_not_mixed(tmp_path: Path) -> None:
     ours, theirs = gather(tmp_path, "protocol.name=plab"), gather(tmp_path, "protocol.name=release")
     assert (len(ours.table), ours.protocol) == (1, "plab")
     assert (len(theirs.table), theirs.protocol) == (1, "release")
-    assert ours.unusual == theirs.unusual == {"method.iterations": [synthetic.ROWS]}
+    assert ours.unusual == theirs.unusual == [Setting("method.iterations", synthetic.ROWS, "")]
     notes = by_form(iou_per_task(theirs))["ours"].notes
     assert "Protocol: release." in notes and "protocol's own" in notes[-1]
 
 
 def test_a_changed_part_of_a_protocol_is_noted(tmp_path: Path) -> None:
     released(tmp_path, seed=0, floor="plab")
-    assert gather(tmp_path).unusual["protocol.floor"] == ["plab"]
+    assert Setting("protocol.floor", "plab", "") in gather(tmp_path).unusual
 
 
 def test_runs_from_before_protocols_are_plabs_own(tmp_path: Path) -> None:
@@ -277,6 +281,92 @@ def test_runs_from_before_protocols_are_plabs_own(tmp_path: Path) -> None:
         synthetic.save(synthetic.synthetic_run(older, rows=synthetic.ROWS))
     runs = gather(tmp_path)
     assert (len(runs.table), runs.protocol, runs.set_aside) == (2, "plab", 0)
+
+
+def test_settings_of_some_runs_are_not_printed_under_all(tmp_path: Path) -> None:
+    for name, task, variant in (("adam", "Rope", "1"), ("gd", "Rope", "1"), ("gd", "Move", "2")):
+        config = synthetic.config(tmp_path, task=task, variant=variant, method=name)
+        if name == "adam":
+            config["method"]["lr"] = 0.3
+        if task == "Move":
+            config["sim"]["particles_scale"] = 0.5
+        synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS))
+    note = by_form(iou_per_task(gather(tmp_path)))["ours"].notes[-1]
+    assert note == (
+        f"Settings other than plab's own: method.iterations = {synthetic.ROWS}; method.lr = 0.3 (Adam); "
+        "sim.particles_scale = 0.5 (GD on Move); task.floor_friction = 0.3 (GD on Move)."
+    )
+
+
+# ----------------------------------------------------------------------------------------------- side by side
+
+
+def two_rates(folder: Path) -> None:
+    for rate, score in ((0.1, 0.4), (0.01, 0.8)):
+        for seed in range(3):
+            config = synthetic.config(folder, seed=seed)
+            config["method"]["lr"] = rate
+            synthetic.save(synthetic.synthetic_run(config, rows=synthetic.ROWS, score=score))
+    synthetic.save(synthetic.run(folder, method="gd", score=0.5))
+
+
+def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path) -> None:
+    two_rates(tmp_path)
+    runs = collect(tmp_path, select(["task=Rope", "variant=1"], NAMES), "method.lr")
+    assert runs.methods[3:6] == ["adam lr=0.01", "adam lr=0.1", "gd"]
+    assert look("adam lr=0.1").label == "Adam, lr 0.1"
+    assert look("adam lr=0.1").colour != look("adam lr=0.01").colour
+    tables = by_form(iou_per_task(runs))
+    shown = tables["ours"].cells.iloc[0]
+    assert (shown["Adam, lr 0.01"], shown["Adam, lr 0.1"]) == ("0.80 ± 0.00", "0.40 ± 0.00")
+    # Both are compared with what the paper has for the method; the key is no setting that needs a note.
+    assert set(tables["paper"].cells.iloc[0][["Adam, lr 0.01", "Adam, lr 0.1"]]) == {"0.59 ± 0.13"}
+    assert "method.lr" not in tables["ours"].notes[-1]
+
+
+def test_two_folders_and_seeds_are_put_side_by_side(tmp_path: Path) -> None:
+    for name, score in (("first", 0.2), ("second", 0.6)):
+        for seed in range(3):
+            synthetic.save(synthetic.run(tmp_path / name, seed=seed, score=score + 0.1 * seed))
+    folders = [tmp_path / "first", tmp_path / "second"]
+    with pytest.raises(MixedRunsError, match="same seed"):
+        collect(folders, select(["task=Rope"], NAMES))
+    runs = collect(folders, select(["task=Rope"], NAMES), "folder")
+    assert [name for name in runs.methods if "folder" in name] == [f"adam folder={path}" for path in folders]
+    assert runs.table.groupby("method")["score"].mean().tolist() == pytest.approx([0.3, 0.7])
+    runs = collect(folders[:1], select(["task=Rope", "variant=1"], NAMES), "seed")
+    shown = by_form(iou_per_task(runs))["ours"].cells.iloc[0]
+    assert [shown[f"Adam, seed {seed}"] for seed in range(3)] == ["0.20", "0.30", "0.40"]
+
+
+@pytest.mark.parametrize(
+    ("key", "line"),
+    [
+        ("lr", "cannot split by 'lr': give a dotted key such as method.lr, or folder or seed"),
+        (
+            "sim.grid_size",
+            "no method has runs that differ in sim.grid_size: split by a key in which they do, such as "
+            "method.lr, or by folder or seed",
+        ),
+    ],
+)
+def test_nothing_to_split_gives_one_line(tmp_path: Path, capsys, key: str, line: str) -> None:
+    two_rates(tmp_path)
+    out = tmp_path / "out"
+    assert main(["tables", "--split", key, "--results", str(tmp_path), "--out", str(out)]) == 2
+    assert capsys.readouterr().err == f"plab: {line}\n"
+
+
+def test_everything_is_made_of_runs_side_by_side(tmp_path: Path) -> None:
+    two_rates(tmp_path / "results")
+    for what in ("tables", "curves", "html"):
+        words = [what, "task=Rope", "--split", "method.lr", "--results", str(tmp_path / "results")]
+        more = ["--no-pictures"] if what == "html" else []
+        assert main([*words, *more, "--out", str(tmp_path / what)]) == 0
+    assert "Adam, lr 0.01" in (tmp_path / "tables" / "ours" / "iou_per_task.md").read_text()
+    assert "Adam, lr 0.01" in (tmp_path / "html" / "index.html").read_text()
+    numbers = json.loads((tmp_path / "curves" / "interquartile_mean.json").read_text())["numbers"]
+    assert set(numbers) == {"adam lr=0.01", "adam lr=0.1", "gd"}
 
 
 def test_two_runs_of_one_seed_are_refused(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ __all__ = [
     "demonstration",
     "record",
     "record_all",
+    "record_unscored",
     "record_with_motion",
     "result",
     "say",
@@ -52,7 +53,7 @@ class Recording:
         target_mass: Mass tensor of the target, shape [n, n, n]; None if it cannot be made here.
         x: Particle positions [domain units] at the start and after each step, shape [T + 1, particle, 3].
         poses: The manipulators' poses at the same times, shape [T + 1, manipulator, 8].
-        scores: Scores of these states, shape [T + 1]; None without a target.
+        scores: Scores of these states, shape [T + 1]; None without a target, or where they are not asked for.
         v: Particle velocities at the same times, shape [T + 1, particle, 3], of a recording with motion.
         F: Deformation gradients at the same times, shape [T + 1, particle, 3, 3], likewise.
     """
@@ -159,6 +160,11 @@ def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
     return _recordings(cfgs, Problem(cfgs), actions)
 
 
+def record_unscored(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
+    """Run actions as :func:`record_all` does, without working out their scores."""
+    return _recordings(cfgs, Problem(cfgs), actions, scored=False)
+
+
 def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
     """Run actions as :func:`record` does, and keep velocities and deformation gradients.
 
@@ -201,20 +207,26 @@ def _states(simulator: Simulator, actions: np.ndarray) -> Iterator[State]:
 
 
 def _recordings(
-    cfgs: Sequence[Config], problem: Problem, actions: np.ndarray, *, motion: bool = False
+    cfgs: Sequence[Config],
+    problem: Problem,
+    actions: np.ndarray,
+    *,
+    motion: bool = False,
+    scored: bool = True,
 ) -> list[Recording]:
     """Return recordings of actions, shape [batch, T, A], in all environments of a problem."""
     states, scores = [], []
     for state in _states(problem.simulator, actions):
         states.append(state)
-        scores.append(_scores(problem, problem.simulator.mass_tensor()))
+        if scored:
+            scores.append(_scores(problem, problem.simulator.mass_tensor()))
     return [
         Recording(
             task=cfg.task.name,
             variant=cfg.variant,
             scene=problem.scenes[number],
             target_mass=problem.target_mass[number],
-            scores=np.array([score[number] for score in scores]),
+            scores=np.array([score[number] for score in scores]) if scored else None,
             **_history(states, number, motion=motion),
         )
         for number, cfg in enumerate(cfgs)

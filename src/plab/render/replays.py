@@ -108,7 +108,9 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.Recording]:
     for cases in alike.values():
         names = [name for name, _, _ in cases]
         actions = np.stack([actions for _, _, actions in cases])
-        made |= dict(zip(names, recording.record_all([cfg for _, cfg, _ in cases], actions), strict=True))
+        made |= dict(
+            zip(names, recording.record_unscored([cfg for _, cfg, _ in cases], actions), strict=True)
+        )
     return made
 
 

@@ -3,6 +3,7 @@
 python -m plab.report tables --results results --out reports/tables
 python -m plab.report curves --results runs.plab.zip.xz task=Rope,Move seed=0,1,2
 python -m plab.report notebooks --results example
+python -m plab.report tables --results first second --split folder
 python -m plab.report html --results example         real runs that come with plab
 """
 
@@ -63,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = options.out or Path("reports") / options.what
     before, quiet = None, 0
     while True:
-        runs = collect(options.results, select(options.words, NAMES))
+        runs = collect(options.results, select(options.words, NAMES), options.split)
         quiet = 0 if runs.under_way else quiet + 1
         now = (runs.digest, quiet == 0)
         if now != before and not (options.follow and runs.table.empty and not quiet):
@@ -97,7 +98,7 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
 
 def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
     _require_runs(runs, options.results)
-    page = Page(runs, out, _origin(runs, command, deep=False), every_film=options.every_film)
+    page = Page(runs, out, _origin(runs, command, deep=False), every_run=options.every_run)
     wanted = lacking(page.shown, out) if options.pictures else {}
     # It is complete but for pictures before the first of them is drawn.
     page.write(drawing=bool(wanted))
@@ -153,10 +154,12 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--bench", type=folder, default=Path("reports/bench"), help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
+    what = "key whose values are put side by side as if they were methods: method.lr, or folder, or seed"
+    parser.add_argument("--split", default="", metavar="KEY", help=what)
     what = "make it again whenever runs have ended, until none is under way"
     parser.add_argument("--follow", action="store_true", help=what)
-    what = "html: a film of every run that is shown, not only of the best of each task"
-    parser.add_argument("--every-film", action="store_true", help=what)
+    what = "html: picture and film of every method's best run, which takes several times as long"
+    parser.add_argument("--every-run", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     # Words after --results are taken for folders.
     sources, words = sources_and_words(options.results)
@@ -259,7 +262,7 @@ def _origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
         "unfinished": runs.unfinished,
         "others": runs.others,
         "set_aside": runs.set_aside,
-        "unusual": runs.unusual,
+        "unusual": [vars(setting) for setting in runs.unusual],
         "runs": "../runs.json" if deep else "runs.json",
     }
 

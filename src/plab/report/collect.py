@@ -17,7 +17,8 @@ import yaml
 from plab.errors import PlabError
 from plab.locks import held
 from plab.possible import require_possible
-from plab.report.methods import ordered
+from plab.report.methods import method, ordered
+from plab.report.splitting import SEED, split_rows
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows
 from plab.selection import Selection, one_protocol
@@ -29,6 +30,7 @@ __all__ = [
     "Ablation",
     "MixedRunsError",
     "Runs",
+    "Setting",
     "changed_settings",
     "collect",
     "collect_ablation",
@@ -66,6 +68,24 @@ class MixedRunsError(PlabError, ValueError):
 
 
 @dataclass(frozen=True)
+class Setting:
+    """A setting that is not plab's own.
+
+    Attributes:
+        key: The setting, dotted.
+        value: Its value.
+        whose: Methods, with tasks and variants as far as needed, whose runs have it; empty if all have.
+    """
+
+    key: str
+    value: Any
+    whose: str
+
+    def __str__(self) -> str:
+        return f"{self.key} = {self.value}" + (f" ({self.whose})" if self.whose else "")
+
+
+@dataclass(frozen=True)
 class Runs:
     """Finished runs, and which ones there should be.
 
@@ -80,7 +100,7 @@ class Runs:
         others: Number of finished runs that belong to nothing asked for.
         set_aside: Number of finished runs with more changes to plab's own settings than others of the same
             task and method have.
-        unusual: Settings other than plab's own: key to the values that occur.
+        unusual: Settings other than plab's own.
         protocol: Name of their protocol.
         unreadable: What could not be read.
         configs: Their configurations, in the order of ``table``.
@@ -96,7 +116,7 @@ class Runs:
     under_way: int
     others: int
     set_aside: int
-    unusual: dict[str, list[Any]]
+    unusual: list[Setting]
     protocol: str
     unreadable: list[str]
     configs: list[dict[str, Any]]
@@ -136,15 +156,18 @@ class Ablation:
     paths: dict[Any, list[Path]]
 
 
-def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Runs:
+def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split: str = "") -> Runs:
     """Find the runs for tables and curves.
 
     Args:
         source: Folder of results, archive, or several of them.
         chosen: Which runs; what it leaves open is the suite's tasks and variants, the paper's methods and
             seeds, and further methods and seeds that the results have.
+        split: Setting whose values are taken for methods of their own, see
+            :func:`plab.report.splitting.split_rows`; none if empty.
 
     Raises:
+        plab.report.splitting.SplitError: If there is nothing to split.
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
         plab.selection.SelectionError: If there are runs of several protocols.
         plab.config.ConfigError: If no run can be of the choice.
@@ -157,8 +180,15 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
+    methods, seeds = asked["method"], asked["seed"]
+    if split:
+        places = [source] if isinstance(source, str | Path) else source
+        complete, names = split_rows(complete, split, places)
+        methods = [name for whole in methods for name in names.get(whole, [whole])]
+        # Of each seed that is a method of its own there is one run.
+        seeds = seeds[:1] if split == SEED else seeds
     protocol = one_protocol(row.config for row in complete)
-    finished, unusual = _prefer_usual(complete)
+    finished, unusual = _prefer_usual(complete, split)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
     table = pd.DataFrame(
@@ -168,8 +198,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection) -> Run
         table=table.astype({"seed": str}),
         tasks=asked["task"],
         variants=asked["variant"],
-        methods=asked["method"],
-        seeds=asked["seed"],
+        methods=methods,
+        seeds=seeds,
         unfinished=len(inside) - len(complete),
         under_way=sum(held(row.path) for row in inside if row.values["status"] != "finished"),
         others=sum(row.values["status"] == "finished" for row in fitting) - len(complete),
@@ -237,14 +267,14 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
     groups: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for row in found:
         groups[row.values["task"], row.values["method"]].append(row)
-    for (task, method), own in groups.items():
+    for (task, name), own in groups.items():
         sections = ("protocol", "sim", "method")
-        _refuse_differing(f"{task} {method}", [{name: row.config[name] for name in sections} for row in own])
+        _refuse_differing(f"{task} {name}", [{key: row.config[key] for key in sections} for row in own])
         variants: dict[str, list[Row]] = defaultdict(list)
         for row in own:
             variants[row.values["variant"]].append(row)
         for variant, same in variants.items():
-            _refuse_differing(f"{task}-v{variant} {method}", [row.config for row in same])
+            _refuse_differing(f"{task}-v{variant} {name}", [row.config for row in same])
             _refuse_repeated(same)
 
 
@@ -294,24 +324,44 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
             yield f"{path}{key}", value
 
 
-def _prefer_usual(found: Sequence[Row]) -> tuple[list[Row], dict[str, list[Any]]]:
+def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Setting]]:
     """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes.
 
+    Args:
+        found: The runs.
+        apart: Key that is no such setting.
+
     Returns:
-        These runs, and their settings that are not those of plab's own files: key to the values that occur.
+        These runs, and their settings that are not those of plab's own files.
     """
-    changes = _changes(found)
+    changes = [{key: value for key, value in changed.items() if key != apart} for changed in _changes(found)]
     fewest: dict[tuple[str, str], int] = {}
     for row, changed in zip(found, changes, strict=True):
         fewest[_pair(row)] = min(len(changed), fewest.get(_pair(row), len(changed)))
     kept = []
-    unusual: dict[str, set[str]] = defaultdict(set)
+    whose: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for row, changed in zip(found, changes, strict=True):
         if len(changed) == fewest[_pair(row)]:
             kept.append(row)
             for key, value in changed.items():
-                unusual[key].add(json.dumps(value))
-    return kept, {key: [json.loads(text) for text in sorted(texts)] for key, texts in sorted(unusual.items())}
+                whose[key, json.dumps(value)].append(row)
+    return kept, [
+        Setting(key, json.loads(text), _whose(own, kept)) for (key, text), own in sorted(whose.items())
+    ]
+
+
+def _whose(own: Sequence[Row], every: Sequence[Row]) -> str:
+    """Say which runs of all these are, in as few words as tell them: nothing where they are all."""
+    for names in ((), ("method",), ("method", "task"), ("method", "task", "variant")):
+        kinds = {tuple(row.values[name] for name in names) for row in own}
+        if sum(tuple(row.values[name] for name in names) in kinds for row in every) == len(own):
+            break
+    texts = [
+        f"{method(kind[0]).label}{' on ' if kind[1:] else ''}{'-v'.join(kind[1:])}"
+        for kind in sorted(kinds)
+        if kind
+    ]
+    return ", ".join(texts[:3]) + (f" and {len(texts) - 3} more" if len(texts) > 3 else "")
 
 
 def _changes(found: Sequence[Row]) -> list[dict[str, Any]]:

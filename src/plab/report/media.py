@@ -30,12 +30,14 @@ class Shown:
         task: Name of the task.
         variant: Name of the variant.
         runs: The best run of each method: its row of the table of runs.
+        drawn: Methods whose run has a picture.
         films: Methods whose run has a film.
     """
 
     task: str
     variant: str
     runs: Mapping[str, Mapping[str, Any]]
+    drawn: frozenset[str] = frozenset()
     films: frozenset[str] = frozenset()
 
     @property
@@ -47,17 +49,19 @@ class Shown:
     def folder(self) -> str:
         """Name of the folder of its pictures: other runs or films, other folder."""
         # Runs done afresh have the same configuration, but other actions.
-        own = [[name, run["config_hash"], run["best_loss"]] for name, run in sorted(self.runs.items())]
+        drawn = [self.runs[name] for name in sorted(self.drawn)]
+        own = [[run["config_hash"], run["best_loss"]] for run in drawn]
         text = json.dumps([own, sorted(self.films)])
         return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def best_runs(runs: Runs, *, every_film: bool = False) -> list[Shown]:
+def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
     """Return the run with the highest score of each configuration and method.
 
     Args:
         runs: Our runs.
-        every_film: Whether each of them has a film, not only the best of each task.
+        every_run: Whether each of them has a picture and a film, not only the best of each configuration a
+            picture, and the best of each task a film.
     """
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
     # Of equal ones the first, whatever order the files were found in.
@@ -68,10 +72,14 @@ def best_runs(runs: Runs, *, every_film: bool = False) -> list[Shown]:
         Shown(task, variant, {name: own[name] for name in runs.methods if name in own})
         for (task, variant), own in sorted(found.items())
     ]
+    if every_run:
+        return [replace(one, drawn=frozenset(one.runs), films=frozenset(one.runs)) for one in shown]
     best = best_of_tasks(shown)
     return [
         replace(
-            one, films=frozenset(name for name in one.runs if every_film or best[one.task] == (one, name))
+            one,
+            drawn=frozenset([best_of_tasks([one])[one.task][1]]),
+            films=frozenset(name for name in one.runs if best[one.task] == (one, name)),
         )
         for one in shown
     ]
@@ -102,7 +110,7 @@ def present(shown: Shown, out: Path) -> dict[str, str]:
     if not folder.is_dir():
         return {}
     names = {"start": "start.webp", "target": "target.webp"}
-    names |= {method: f"{_stem(run)}.webp" for method, run in shown.runs.items()}
+    names |= {method: f"{_stem(shown.runs[method])}.webp" for method in shown.drawn}
     names |= {f"{method} film": f"{_stem(shown.runs[method])}.mp4" for method in shown.films}
     there = {what: folder / name for what, name in names.items()}
     return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
@@ -121,7 +129,10 @@ def lacking(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Pat
     """
     folders = {out / FOLDER / one.folder: one for one in shown}
     return {
-        folder: {_stem(run): (Path(run["path"]), name in one.films) for name, run in one.runs.items()}
+        folder: {
+            _stem(one.runs[name]): (Path(one.runs[name]["path"]), name in one.films)
+            for name in sorted(one.drawn)
+        }
         for folder, one in folders.items()
         if not folder.is_dir()
     }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from plab.families import FAMILIES, GRADIENT, RL
 from plab.suite import PAPER_METHODS
 
-__all__ = ["GRADIENT", "RL", "Method", "method", "ordered"]
+__all__ = ["GRADIENT", "RL", "Method", "method", "ordered", "part"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Method:
             plab's.
         colour: Colour of its curves.
         dashes: Line style, for those who do not see the colour.
+        of: Method that these are some of the runs of, empty if they are all: see :func:`part`.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Method:
     kind: str
     colour: str
     dashes: str = "-"
+    of: str = ""
 
     @property
     def on_dark(self) -> str:
@@ -48,6 +50,30 @@ _KNOWN = tuple(_LOOKS[name] for name in dict.fromkeys((*PAPER_METHODS, *_LOOKS))
 def method(name: str) -> Method:
     """Return how a method appears; one that plab does not know is grey and belongs to no kind."""
     return _LOOKS.get(name) or Method(name, name, "", "#777777", ":")
+
+
+_PALETTE = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+"""Okabe and Ito's, the yellow that is not seen on white apart."""
+
+_DASHES = ("-", "--", "-.", ":")
+
+
+def part(name: str, key: str, value: str, place: int) -> str:
+    """Make a method of those runs of one that have a value of a setting, known to :func:`method` from now on.
+
+    Args:
+        name: Name of the method.
+        key: Name of the setting.
+        value: Its value.
+        place: Which of all such methods it is, from 0: its colour and line style.
+
+    Returns:
+        Name of the new one.
+    """
+    whole, new = method(name), f"{name} {key}={value}"
+    look = {"colour": _PALETTE[place % len(_PALETTE)], "dashes": _DASHES[place % len(_DASHES)]}
+    _LOOKS[new] = Method(new, f"{whole.label}, {key} {value}", whole.kind, of=name, **look)
+    return new
 
 
 def ordered(present: Iterable[str]) -> list[str]:

@@ -15,7 +15,7 @@ from plab.examples import resolve
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
 from plab.report.measurements import Benchmark, measured
-from plab.report.table import Table
+from plab.report.table import Table, aligned
 from plab.results import ResultsError
 from plab.selection import select
 
@@ -71,17 +71,23 @@ def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
     cells = table.cells if isinstance(table, Table) else table
     notes = table.notes if isinstance(table, Table) else notes
     bold = table.bold if isinstance(table, Table) else None
-    head = "".join(f"<th>{escape(str(name))}</th>" for name in cells.columns)
+    sides = ["number" if side == "r" else "" for side in aligned(cells)]
+    head = "".join(
+        f'<th class="{side}">{escape(str(name))}</th>'
+        for name, side in zip(cells.columns, sides, strict=True)
+    )
     body = "".join(
-        f"<tr>{''.join(_cell(text, bold is not None and bold[r, c]) for c, text in enumerate(line))}</tr>"
+        "<tr>"
+        + "".join(_cell(text, bold is not None and bold[r, c], sides[c]) for c, text in enumerate(line))
+        + "</tr>"
         for r, line in enumerate(cells.to_numpy(dtype=str))
     )
     html = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     display(HTML(html + f'<p class="note">{escape(" ".join(notes))}</p>'))
 
 
-def _cell(text: str, bold: bool) -> str:
-    kind = _COLOURS.get(text.split(" ")[0], "") if text else ""
+def _cell(text: str, bold: bool, side: str) -> str:
+    kind = f"{_COLOURS.get(text.split(' ')[0], '') if text else ''} {side}".strip()
     shown = f"<b>{escape(text)}</b>" if bold else escape(text)
     return f'<td class="{kind}">{shown}</td>' if kind else f"<td>{shown}</td>"
 

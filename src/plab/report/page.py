@@ -53,16 +53,16 @@ class Page:
         shown: Configurations and the runs of them that pictures show.
     """
 
-    def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_film: bool = False) -> None:
+    def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_run: bool = False) -> None:
         """Write curves and runs of each configuration to ``data/``, and work out the rest.
 
         Args:
             runs: Our runs.
             out: Folder to write to.
             origin: What is said about where the page comes from: ``command``, ``digest``, ``plab``.
-            every_film: Whether each run that is shown has a film, not only the best of each task.
+            every_run: As for :func:`plab.report.media.best_runs`.
         """
-        self.shown = best_runs(runs, every_film=every_film)
+        self.shown = best_runs(runs, every_run=every_run)
         self._out, self._under_way = out, runs.under_way > 0
         self._content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],

@@ -15,11 +15,14 @@ import pandas as pd
 
 from plab.report.statistics import Summary
 
-__all__ = ["NOTHING", "Table", "number", "spread", "write_index", "write_table"]
+__all__ = ["MINUS", "NOTHING", "Table", "aligned", "number", "spread", "write_index", "write_table"]
 
 
-NOTHING = "-"
+NOTHING = "–"
 """Stands where there is no number."""
+
+MINUS = "\N{MINUS SIGN}"
+"""Sign of negative numbers."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,23 @@ class Table:
 
 
 def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
-    """Write a number, a dash if there is none."""
+    """Write a number with the sign of a minus, not that of a hyphen; a dash if there is none."""
     if math.isnan(value):
         return NOTHING
     # Without the minus of what is rounded to zero.
     rounded = round(value, decimals) + 0.0
-    return f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
+    text = f"{rounded:+.{decimals}f}" if sign else f"{rounded:.{decimals}f}"
+    return text.replace("-", MINUS)
+
+
+def aligned(cells: pd.DataFrame) -> list[str]:
+    """Return how each column of a table's texts is aligned: ``r`` where it has numbers, ``l`` elsewhere."""
+    return ["r" if any(map(_is_number, cells.iloc[:, k])) else "l" for k in range(cells.shape[1])]
+
+
+def _is_number(text: object) -> bool:
+    # A share of runs, an interval, a mean with its spread, a number with its unit.
+    return re.match(rf"\[?[+{MINUS}]?\d[\d.,]*(?![\d.,]|[A-Za-z_])", str(text)) is not None
 
 
 def spread(summary: Summary, decimals: int = 2) -> str:
@@ -109,7 +123,7 @@ INPUTS
 \end{document}
 """
 
-_LATEX_SIGNS = {"±": r"$\pm$"}
+_LATEX_SIGNS = {"±": r"$\pm$", MINUS: "$-$", NOTHING: "--"}
 """Signs that a plain document has no letter for."""
 
 
@@ -135,7 +149,7 @@ def _latex(table: Table) -> str:
     size = r"\footnotesize" if len(cells) > 15 or len(cells.columns) > 6 else r"\small"
     caption = _latex_text(" ".join([f"{table.title}.", *table.notes]))
     text = style.to_latex(
-        column_format="".join(_COLUMN.get(column, "l") for column in table.cells.columns),
+        column_format="".join(map(_COLUMN.get, table.cells.columns, aligned(table.cells))),
         hrules=True,
         convert_css=True,
         caption=caption,
@@ -151,11 +165,14 @@ def _latex(table: Table) -> str:
     return text.replace("\\centering\n", f"\\centering\n{size}\n", 1)
 
 
+_RULES = {"l": "---", "r": "---:"}
+
+
 def _markdown(table: Table, footer: list[str]) -> str:
     cells = table.cells.to_numpy(dtype=str)
     if table.bold is not None:
         cells = np.where(table.bold, np.char.add(np.char.add("**", cells), "**"), cells)
-    lines = [list(table.cells.columns), ["---"] * cells.shape[1], *cells.tolist()]
+    lines = [list(table.cells.columns), [_RULES[side] for side in aligned(table.cells)], *cells.tolist()]
     body = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     notes = f"\n{' '.join(table.notes)}\n" if table.notes else ""
     made = "".join(f"<sub>{line}</sub>  \n" for line in footer)

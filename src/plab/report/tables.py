@@ -104,7 +104,9 @@ class Cells:
 
 
 def _printed(name: str, key: tuple[str, ...], count: int) -> Summary:
-    printed = _numbers_of_paper(name).get(key)
+    # Of part of a method's runs, the whole method's.
+    *which, named = key
+    printed = _numbers_of_paper(name).get((*which, method(named).of or named))
     return summarise([]) if printed is None else Summary(*printed, count)
 
 
@@ -291,9 +293,8 @@ def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
     return best
 
 
-@functools.cache
 def _in_paper(name: str) -> bool:
-    return any(key[-1] == name for key in _numbers_of_paper("iou_per_task"))
+    return any(key[-1] == (method(name).of or name) for key in _numbers_of_paper("iou_per_task"))
 
 
 def settings_note(runs: Runs) -> list[str]:
@@ -301,7 +302,7 @@ def settings_note(runs: Runs) -> list[str]:
     protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
     if not runs.unusual:
         return protocol
-    shown = [f"{key} = {', '.join(map(str, values))}" for key, values in list(runs.unusual.items())[:6]]
+    shown = list(map(str, runs.unusual[:6]))
     more = len(runs.unusual) - len(shown)
     other = "the protocol's own" if protocol else "plab's own"
     return [

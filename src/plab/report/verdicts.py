@@ -90,7 +90,7 @@ def _cell(row: Mapping[str, Any]) -> str:
     if name == "no runs":
         return name
     count = "" if row["runs"] >= row["expected"] else f" ({row['runs']}/{row['expected']})"
-    return f"{name} {row['difference']:+.2f}{count}"
+    return f"{name} {number(row['difference'], sign=True)}{count}"
 
 
 def differences(runs: Runs) -> Drawing | None:

@@ -60,7 +60,7 @@ function films(one, details) {
         make("small", {}, `all seeds ${fixed(ours.mean)}${ours.count > 1 ? ` ± ${fixed(ours.std)}` : ""} (${ours.count}/${ours.expected})${printed}`)));
   });
   const grid = make("div", { class: "pictures" }, ...figures);
-  const head = make("div", { class: "heading" }, make("h2", {}, "The best run of each method"), playAll(grid) ?? "");
+  const head = make("div", { class: "heading" }, make("h2", {}, shown.length > 1 ? "The best run of each method" : "The best run"), playAll(grid) ?? "");
   return [head, grid, make("p", { class: "note" }, "Replayed in the hard contact model; pictures show the last state.")];
 }
 
