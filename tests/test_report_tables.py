@@ -25,7 +25,7 @@ from plab.report.hyperparameters import hyperparameters
 from plab.report.methods import method as look
 from plab.report.reference import paper_table
 from plab.report.statistics import Summary, stratified_difference, summarise
-from plab.report.table import Table, number, write_table
+from plab.report.table import NOTHING, Table, aligned, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import check, load, pack
@@ -471,7 +471,7 @@ def test_hyperparameters_are_read_from_the_files() -> None:
     tables = by_form(hyperparameters())
     both = tables["comparison"].cells.set_index(["method", "key"])
     assert both.loc[("SAC", "tau")].to_list() == ["0.005", "0.0003"]
-    assert both.loc[("TD3", "hidden")].to_list() == ["[256, 256]", "-"]
+    assert both.loc[("TD3", "hidden")].to_list() == ["[256, 256]", NOTHING]
     assert both.loc[("GD", "momentum")].to_list() == ["0.9", "0.9"]
     assert both.loc[("Adam-H", "eps")].to_list() == ["1e-8", "1e-8"]
     remarks = tables["paper"].cells.set_index(["method", "key"])["remark"]
@@ -560,7 +560,7 @@ def test_special_characters_survive_latex(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.126, "0.13"), (-0.001, "0.00"), (float("nan"), "-"), (1.0, "1.00")]
+    ("value", "text"), [(0.126, "0.13"), (-0.001, "0.00"), (float("nan"), "\N{EN DASH}"), (-0.5, "\N{MINUS SIGN}0.50"), (1.0, "1.00")]
 )
 def test_numbers(value: float, text: str) -> None:
     assert number(value) == text

@@ -71,8 +71,22 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
     if not tables:
         axes.set_xticks([])
         axes.set_yticks([])
-    text = "\n".join(short) if tables else "no runs"
-    axes.text(0.02, 0.98, text, transform=axes.transAxes, va="top", fontsize=5, color="#666666")
+    small = {"fontsize": 5, "color": "#666666", "ha": "center"}
+    if not tables:
+        axes.text(0.5, 0.5, "no runs", transform=axes.transAxes, va="center", **small)
+    elif short:
+        # Between title and axes, where it hides no curve.
+        lines = textwrap.wrap(", ".join(short), 40)
+        axes.annotate(
+            "\n".join(lines),
+            (0.5, 1.0),
+            (0, 2),
+            "axes fraction",
+            textcoords="offset points",
+            va="bottom",
+            **small,
+        )
+        axes.set_title(axes.get_title(), pad=3 + 7 * len(lines))
     return bool(tables)
 
 
@@ -193,15 +207,16 @@ def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, ti
 
 
 def rl_scores(runs: Runs) -> list[Drawing]:
-    """Return the final scores of the RL methods per task, with their limit; nothing without RL runs."""
-    tasks = ordered_tasks(runs.tasks)
-    present = set(runs.table["method"])
-    methods = [name for name in runs.methods if method(name).kind == RL and name in present]
-    if not methods:
+    """Return the final scores of the RL methods per task that they have runs of, with their limit; nothing
+    where that would be a single bar."""
+    own = runs.table[[method(name).kind == RL for name in runs.table["method"]]]
+    tasks = [task for task in ordered_tasks(runs.tasks) if task in set(own["task"])]
+    methods = [name for name in runs.methods if name in set(own["method"])]
+    if len(own[["task", "method"]].drop_duplicates()) < 2:
         return []
     with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
         known = pd.read_csv(file).groupby("task")["score"].mean()
-    figure, axes = grid(1, 1, width=7.0, height=2.4)
+    figure, axes = grid(1, 1, width=1.0 + 0.6 * max(len(tasks), 3), height=2.4)
     panel = axes[0, 0]
     width = 0.8 / max(len(methods), 1)
     table = runs.table

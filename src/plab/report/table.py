@@ -18,7 +18,7 @@ from plab.report.statistics import Summary
 __all__ = ["MINUS", "NOTHING", "Table", "aligned", "number", "spread", "write_index", "write_table"]
 
 
-NOTHING = "–"
+NOTHING = "\N{EN DASH}"
 """Stands where there is no number."""
 
 MINUS = "\N{MINUS SIGN}"
@@ -67,12 +67,13 @@ def number(value: float, decimals: int = 2, *, sign: bool = False) -> str:
 
 def aligned(cells: pd.DataFrame) -> list[str]:
     """Return how each column of a table's texts is aligned: ``r`` where it has numbers, ``l`` elsewhere."""
-    return ["r" if any(map(_is_number, cells.iloc[:, k])) else "l" for k in range(cells.shape[1])]
+    columns = ([str(text) for text in cells.iloc[:, k]] for k in range(cells.shape[1]))
+    known = ([text for text in texts if text not in ("", NOTHING)] for texts in columns)
+    return ["r" if texts and all(map(_NUMBER.match, texts)) else "l" for texts in known]
 
 
-def _is_number(text: object) -> bool:
-    # A share of runs, an interval, a mean with its spread, a number with its unit.
-    return re.match(rf"\[?[+{MINUS}]?\d[\d.,]*(?![\d.,]|[A-Za-z_])", str(text)) is not None
+_NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
+"""What begins a cell with a number: a share of runs, an interval, a mean with its spread, one with a unit."""
 
 
 def spread(summary: Summary, decimals: int = 2) -> str:

@@ -12,6 +12,7 @@ from plab.report.agreement import TOLERANCE
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, grid, legend_of_methods
 from plab.report.methods import method
+from plab.report.table import number
 from plab.report.tables import iou_per_configuration, iou_per_task, ordered_tasks
 
 __all__ = ["RULE", "VERDICTS", "differences", "verdict", "verdict_grid", "verdicts"]
@@ -122,7 +123,7 @@ def differences(runs: Runs) -> Drawing | None:
             markerfacecolor=look.colour if row["runs"] >= row["expected"] else "white",
         )
     middle = (len(methods) - 1) / 2
-    panel.set_yticks([number * (len(methods) + 1) + middle for number in range(len(tasks))], tasks)
+    panel.set_yticks([place * (len(methods) + 1) + middle for place in range(len(tasks))], tasks)
     panel.set_ylim(rows - 1.5, -1.0)
     panel.set_xlabel("score, plab minus the paper")
     panel.grid(axis="y", visible=False)
