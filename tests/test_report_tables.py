@@ -560,7 +560,14 @@ def test_special_characters_survive_latex(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.126, "0.13"), (-0.001, "0.00"), (float("nan"), "\N{EN DASH}"), (-0.5, "\N{MINUS SIGN}0.50"), (1.0, "1.00")]
+    ("value", "text"),
+    [
+        (0.126, "0.13"),
+        (-0.001, "0.00"),
+        (float("nan"), "\N{EN DASH}"),
+        (-0.5, "\N{MINUS SIGN}0.50"),
+        (1.0, "1.00"),
+    ],
 )
 def test_numbers(value: float, text: str) -> None:
     assert number(value) == text
@@ -578,3 +585,23 @@ def test_mistakes_are_one_line(folder: Path, tmp_path: Path, capsys, arguments, 
     assert main(["tables", *arguments, *default, "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_columns_of_numbers_are_on_the_right(tmp_path: Path) -> None:
+    minus = "\N{MINUS SIGN}"
+    cells = pd.DataFrame(
+        {
+            "task": ["Move", "Rope"],
+            "difference": [f"{minus}0.10", NOTHING],
+            "interval": [f"[{minus}0.20, +0.10]", NOTHING],
+            "agree": ["65 %", "7 %"],
+            "runs": ["0/15", "0.55 ± 0.30 (2/15)"],
+            "verdict": ["same +0.01", "no runs"],
+        }
+    )
+    assert "".join(aligned(cells)) == "lrrrrl"
+    write_table(Table("some", "ours", "Some", cells, cells), tmp_path, {"footer": []})
+    latex = (tmp_path / "ours" / "some.tex").read_text(encoding="utf-8")
+    assert "{lrrrrl}" in latex and "$-$0.10" in latex and "[$-$0.20, +0.10]" in latex and minus not in latex
+    lines = (tmp_path / "ours" / "some.md").read_text(encoding="utf-8").splitlines()
+    assert lines[3] == "| --- | ---: | ---: | ---: | ---: | --- |" and f"{minus}0.10" in lines[4]

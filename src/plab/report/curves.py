@@ -6,6 +6,7 @@ import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -71,7 +72,7 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
     if not tables:
         axes.set_xticks([])
         axes.set_yticks([])
-    small = {"fontsize": 5, "color": "#666666", "ha": "center"}
+    small: dict[str, Any] = {"fontsize": 5, "color": "#666666", "ha": "center"}
     if not tables:
         axes.text(0.5, 0.5, "no runs", transform=axes.transAxes, va="center", **small)
     elif short:

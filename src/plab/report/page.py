@@ -77,7 +77,7 @@ class Page:
         known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
         present = set(runs.table["method"])
         cells = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
-        self._values = {
+        self._values: dict[str, Any] = {
             "style": asset("page.css"),
             "script": "".join(map(asset, _SCRIPTS)),
             "methods": [method(name) for name in runs.methods],

@@ -17,17 +17,17 @@ def asset(name: str, package: str = _OWN) -> str:
     return (files(package) / "web" / name).read_text(encoding="utf-8")
 
 
-def render(name: str, package: str = _OWN, **values: Any) -> str:
+def render(template: str, package: str = _OWN, **values: Any) -> str:
     """Return a page.
 
     Args:
-        name: Its template, which extends ``base.html``.
+        template: Its template, which extends ``base.html``.
         package: Package whose folder ``web`` has it.
         **values: What the template needs.
     """
 
     def load(file: str) -> str:
-        return asset(file, package if file == name else _OWN)
+        return asset(file, package if file == template else _OWN)
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, loader=FunctionLoader(load))
-    return environment.get_template(name).render(**values)
+    return environment.get_template(template).render(**values)
