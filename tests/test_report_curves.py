@@ -263,6 +263,30 @@ def test_tasks_without_runs_have_no_panel_but_a_mention(folder: Path) -> None:
     assert rl_scores(runs) == []
 
 
+def test_counts_hide_nothing(folder: Path) -> None:
+    runs = collect(folder, select(["task=Rope", "method=adam,ppo"], NAMES))
+    with style():
+        for drawing in (*rewards(runs, load_series(runs)), *score_curves(runs, load_series(runs))):
+            drawing.figure.draw_without_rendering()
+            shown = [
+                (axes, text) for axes in drawing.figure.axes for text in axes.texts if "/" in text.get_text()
+            ]
+            assert shown
+            for axes, text in shown:
+                inside, title = axes.get_window_extent(), axes.title.get_window_extent()
+                assert (
+                    text.get_window_extent().y0 >= inside.y1 and text.get_window_extent().y1 <= title.y0 + 1
+                )
+
+
+def test_bars_are_of_tasks_with_runs_and_never_alone(folder: Path) -> None:
+    with style():
+        (drawing,) = rl_scores(collect(folder, select(["method=ppo"], NAMES)))
+        labels = [label.get_text() for label in drawing.figure.axes[0].get_xticklabels()]
+        assert labels == ["Move", "Rope"]
+        assert rl_scores(collect(folder, select(["method=ppo", "task=Rope"], NAMES))) == []
+
+
 @pytest.mark.parametrize(
     ("low", "high", "labels"),
     [(0.2, 4.0, ["0.2", "0.5", "1", "2"]), (1.0, 200.0, ["1", "10", "100"]), (1e4, 9e4, ["$10^{4}$"])],

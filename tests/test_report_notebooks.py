@@ -18,6 +18,7 @@ from plab.report.costs import precision_summary, work_precision
 from plab.report.figures import style
 from plab.report.measurements import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
+from plab.report.table import MINUS
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
 from plab.selection import select
@@ -67,7 +68,7 @@ def test_incomplete_cells_are_judged_on_what_is_there_and_say_so(results: Path) 
     assert judged[("Rope", "adam")] == "same" and judged[("Rope", "ppo")] in ("lower", "undecided")
     assert judged[("Move", "adam")] == "no runs"
     grid = verdict_grid(verdicts(runs)).set_index("task")
-    assert re.fullmatch(r"same [+-]0\.0\d \(6/15\)", grid.loc["Rope", "Adam"])
+    assert re.fullmatch(rf"same [+{MINUS}]0\.0\d \(6/15\)", grid.loc["Rope", "Adam"])
     single = verdict_grid(verdicts(runs, configurations=True)).set_index(["task", "variant"])
     assert "(" not in single.loc[("Rope", "1"), "Adam"] and single.loc[("Rope", "3"), "Adam"] == "no runs"
 
