@@ -67,7 +67,7 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
             draw_band(axes, drawn, name, ceiling=1.0 if column == "score" else np.inf)
         count = 0 if drawn is None else drawn.count
         if count < expected and name in set(runs.table["method"]):
-            short.append(f"{method(name).label} {count}/{expected}")
+            short.append(f"{method(name).label}\N{NO-BREAK SPACE}{count}/{expected}")
     axes.set_ylim(bottom=0.0, top=1.05 if column == "score" else None)
     if not tables:
         axes.set_xticks([])
@@ -77,7 +77,7 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
         axes.text(0.5, 0.5, "no runs", transform=axes.transAxes, va="center", **small)
     elif short:
         # Between title and axes, where it hides no curve.
-        lines = textwrap.wrap(", ".join(short), 40)
+        lines = textwrap.wrap(", ".join(short), 40, break_on_hyphens=False)
         axes.annotate(
             "\n".join(lines),
             (0.5, 1.0),

@@ -37,7 +37,9 @@ function showGallery() {
         make("small", {}, make("span", { class: "swatch", style: own(method) }), ` ${label}, variant ${name.split("-v").at(-1)}, seed ${seed}`)));
   });
   const grid = make("div", { class: "pictures small" }, ...figures);
-  find("#gallery").replaceChildren(...(figures.length ? [make("div", { class: "heading" }, make("h2", {}, "The best run of each task"), playAll(grid) ?? ""), grid] : []));
+  const lacking = content.gallery.filter(({ name }) => !pictureOf(name).start).map(({ task }) => task);
+  const note = lacking.length ? make("p", { class: "note" }, `No pictures of ${lacking.join(", ")}${content.live ? " yet" : ""}.`) : "";
+  find("#gallery").replaceChildren(...(figures.length ? [make("div", { class: "heading" }, make("h2", {}, "The best run of each task"), playAll(grid) ?? ""), grid, note] : []));
 }
 const pictureOf = (name) => configurations.find((one) => one.name === name).pictures;
 
