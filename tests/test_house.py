@@ -149,8 +149,8 @@ def test_every_dependency_has_its_reason_and_its_pin():
     explained = {name.lower() for name in re.findall(r"^\| `([^`\[]+)", reasons, re.MULTILINE)}
     assert wanted == explained
     pins = {line.partition("==")[0].lower().replace("_", "-") for line in open(ROOT / "constraints.txt")}
-    # Not together with joblib, and optional: docs/sweeps.md.
-    assert wanted - pins == {"hydra-ray-launcher", "tensorboard", "wandb"}
+    # Not together with joblib: docs/sweeps.md.
+    assert wanted - pins == {"hydra-ray-launcher"}
 
 
 TESTS = """
