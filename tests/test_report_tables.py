@@ -232,6 +232,18 @@ def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
     assert gather(tmp_path, "task.yield_stress=10").unusual[-1] == Setting("task.yield_stress", 10.0, "")
 
 
+def test_runs_from_before_the_contact_term_had_variants_had_the_nearest(tmp_path: Path) -> None:
+    for seed, terms in enumerate(({"contact": "nearest"}, None, {"contact": "soft"})):
+        own = synthetic.config(tmp_path, seed=seed)
+        own["method"]["loss_terms"] = terms
+        if terms is None:
+            del own["method"]["loss_terms"]
+        synthetic.save(synthetic.synthetic_run(own, rows=synthetic.ROWS))
+    runs = gather(tmp_path)
+    assert (len(runs.table), runs.set_aside) == (2, 1) and "loss_terms" not in str(runs.unusual)
+    assert len(gather(tmp_path, "method.loss_terms.contact=nearest").table) == 2
+
+
 def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
     for seed in range(2):
         older = synthetic.config(tmp_path, seed=seed)

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -176,7 +176,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
-    fitting = [row for row in found if chosen(row.values, row.config)]
+    fitting = [row for row in _with_contact_terms(found) if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
@@ -276,6 +276,21 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
         for variant, same in variants.items():
             _refuse_differing(f"{task}-v{variant} {name}", [row.config for row in same])
             _refuse_repeated(same)
+
+
+def _with_contact_terms(found: Sequence[Row]) -> list[Row]:
+    """Have runs from before the contact term had variants say which one they had."""
+    known: dict[int, dict[str, Any]] = {}
+    filled = []
+    for row in found:
+        method = row.config["method"]
+        if "loss_terms" not in method and "contact" in method.get("loss_weights", {}):
+            # Of thousands of runs most share their sections, which stay the same objects.
+            own = known.setdefault(id(method), method | {"loss_terms": {"contact": "nearest"}})
+            filled.append(replace(row, config={**row.config, "method": own}))
+        else:
+            filled.append(row)
+    return filled
 
 
 def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
