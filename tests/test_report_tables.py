@@ -20,7 +20,7 @@ from plab.config import load_config
 from plab.examples import EXAMPLES, example_archive, resolve
 from plab.report.__main__ import main, write_tables
 from plab.report.agreement import agreement
-from plab.report.collect import NAMES, MixedRunsError, Setting, collect
+from plab.report.collect import NAMES, MixedRunsError, Setting, changed_settings, collect
 from plab.report.hyperparameters import hyperparameters
 from plab.report.methods import method as look
 from plab.report.reference import paper_table
@@ -238,6 +238,8 @@ def test_runs_from_before_the_contact_term_had_variants_had_the_nearest(tmp_path
         own["method"]["loss_terms"] = terms
         if terms is None:
             del own["method"]["loss_terms"]
+            # What the page's commands are made of.
+            assert "method.loss_terms.contact" not in changed_settings(own)
         synthetic.save(synthetic.synthetic_run(own, rows=synthetic.ROWS))
     runs = gather(tmp_path)
     assert (len(runs.table), runs.set_aside) == (2, 1) and "loss_terms" not in str(runs.unusual)

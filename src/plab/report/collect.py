@@ -280,17 +280,22 @@ def _refuse_mixed(found: Sequence[Row]) -> None:
 
 def _with_contact_terms(found: Sequence[Row]) -> list[Row]:
     """Have runs from before the contact term had variants say which one they had."""
-    known: dict[int, dict[str, Any]] = {}
-    filled = []
-    for row in found:
-        method = row.config["method"]
-        if "loss_terms" not in method and "contact" in method.get("loss_weights", {}):
-            # Of thousands of runs most share their sections, which stay the same objects.
-            own = known.setdefault(id(method), method | {"loss_terms": {"contact": "nearest"}})
-            filled.append(replace(row, config={**row.config, "method": own}))
-        else:
-            filled.append(row)
-    return filled
+    # Of thousands of runs most share their sections, which stay the same objects.
+    methods = {id(row.config["method"]): row.config["method"] for row in found}
+    known = {number: _with_contact_term(method) for number, method in methods.items()}
+    return [
+        replace(row, config={**row.config, "method": known[id(row.config["method"])]})
+        if "loss_terms" not in row.config["method"]
+        else row
+        for row in found
+    ]
+
+
+def _with_contact_term(method: dict[str, Any]) -> dict[str, Any]:
+    """Return the section of a method, with the contact term that there was if it is older than the choice."""
+    if "loss_terms" in method or "contact" not in method.get("loss_weights", {}):
+        return method
+    return method | {"loss_terms": {"contact": "nearest"}}
 
 
 def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
@@ -402,6 +407,7 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         config: The run's configuration.
     """
+    config = {**config, "method": _with_contact_term(config["method"])}
     by_variant = {f"task.{key}" for key in _changed_by_variant(config)}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
     own = {key: (value, _present(config, key)) for key, value in expected.items() if key not in by_variant}
