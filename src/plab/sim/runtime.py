@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import io
+import linecache
 import os
 import textwrap
 import time
@@ -125,8 +127,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     with contextlib.redirect_stdout(io.StringIO()):
         free_abandoned_cache()
         _start_taichi(device, precision, wanted)
-    remember_sources()
-    remember_source_positions()
+    hasten_tracing()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
 
@@ -177,60 +178,50 @@ def cuda_available() -> bool:
     return bool(ti._lib.core.with_cuda())
 
 
-def remember_sources() -> None:
-    """Let Taichi read and lay out the source of a function once, not at every inlining.
+def hasten_tracing() -> None:
+    """Let Taichi find the source of a function and tell an AST node's place quickly: both only serve messages.
 
-    That is a sixth of what compiling from a warm cache takes. What a future Taichi no longer has is left as
-    it is.
+    Taichi looks the source up, among all modules of the process, and lays it out at each inlining, and wraps
+    an excerpt of it for each node: half of what compiling from a warm cache takes. What a future Taichi no
+    longer has is left as it is.
     """
     from taichi.lang import kernel_impl
+    from taichi.lang.ast import ast_transformer_utils
 
-    for name in ("getsourcefile", "getsourcelines"):
-        find = getattr(kernel_impl, name, None)
-        if find is not None and not hasattr(find, "__wrapped__"):
-            setattr(kernel_impl, name, _once_per_code(find))
+    find = getattr(kernel_impl, "getsourcelines", None)
+    if find is not None and not hasattr(find, "__wrapped__"):
+        kernel_impl.getsourcelines = _quick_sources(find)
     if getattr(kernel_impl, "textwrap", None) is textwrap:
         fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
         kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
+    context = ast_transformer_utils.ASTTransformerContext
+    if hasattr(context, "get_pos_info"):
+        context.get_pos_info = _position
 
 
-def _once_per_code(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Remember what is found by a function's code, which a reload may replace."""
-    found: dict[tuple, Any] = {}
+def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Read the source of functions of files where the code says that it is, and of others as before."""
+
+    @functools.cache
+    def block(file: str, first: int) -> tuple[list[str], int]:
+        return inspect.getblock(linecache.getlines(file)[first - 1 :]), first
 
     @functools.wraps(find)
-    def remembered(function: Any) -> Any:
-        key = (function.__code__.co_filename, function.__code__)
-        if key not in found:
-            found[key] = find(function)
-        return found[key]
+    def quick(function: Any) -> Any:
+        code = function.__code__
+        lines, first = block(code.co_filename, code.co_firstlineno)
+        return (list(lines), first) if lines else find(function)
 
-    return remembered
+    return quick
 
 
-def remember_source_positions() -> None:
-    """Let Taichi format the source excerpt of an AST node once, not at every inlining.
-
-    The excerpts are for its error messages; formatting them is half of what compiling from a warm cache
-    takes. Where a future Taichi has no such method, nothing is changed.
-    """
-    from taichi.lang.ast import ast_transformer_utils
-
-    context = ast_transformer_utils.ASTTransformerContext
-    original = getattr(context, "get_pos_info", None)
-    if original is None or hasattr(original, "__wrapped__"):
-        return
-    texts: dict[tuple, str] = {}
-
-    @functools.wraps(original)
-    def get_pos_info(self: Any, node: Any) -> str:
-        place = (node.lineno, node.end_lineno, node.col_offset, node.end_col_offset, type(node))
-        key = (self.file, self.lineno_offset, self.func.func.__name__, *place)
-        if key not in texts:
-            texts[key] = original(self, node)
-        return texts[key]
-
-    context.get_pos_info = get_pos_info
+def _position(context: Any, node: Any) -> str:
+    """Return place and first line of an AST node, marked, for Taichi's messages."""
+    line = context.src[node.lineno - 1]
+    begins = context.indent + node.col_offset
+    ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
+    place = f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}'
+    return f"{place}:\n{line}\n{' ' * begins}{'^' * (ends - begins)}\n"
 
 
 def register_user(user: object) -> None:
