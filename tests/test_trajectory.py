@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from plab.config import Config, ConfigError, load_config
 from plab.families import FAMILIES
@@ -115,6 +116,27 @@ def test_adam_is_adam(method) -> None:
         m, s = 0.9 * m + 0.1 * gradient, 0.999 * s + 0.001 * gradient**2
         expected = expected - 0.1 * (m / (1 - 0.9**step)) / (np.sqrt(s / (1 - 0.999**step)) + 1e-8)
         np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "gd"])
+def test_rules_give_the_bits_of_torchs_optimisers(method, optimizer: str) -> None:
+    ours = ActionSequence(replace(method, optimizer=optimizer, lr=0.03, momentum=0.8), 5, 4, seed=0)
+    theirs = torch.tensor(ours.numpy(), requires_grad=True)
+    if optimizer == "adam":
+        rule: torch.optim.Optimizer = torch.optim.Adam([theirs], 0.03, method.betas, method.eps)
+    else:
+        rule = torch.optim.SGD([theirs], 0.03, momentum=0.8, dampening=0.8)
+        # torch takes the first gradient undampened.
+        rule.state[theirs]["momentum_buffer"] = torch.zeros_like(theirs)
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        gradient = rng.normal(size=(5, 4)) * 10.0 ** rng.integers(-6, 3)
+        ours.step(gradient)
+        theirs.grad = torch.tensor(gradient)
+        rule.step()
+        with torch.no_grad():
+            theirs.clamp_(-1.0, 1.0)
+        assert np.array_equal(ours.numpy(), theirs.detach().numpy())
 
 
 @pytest.mark.parametrize("optimizer", sorted(FAMILIES["trajectory"].rules))

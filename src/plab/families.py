@@ -146,8 +146,8 @@ FAMILIES: dict[str, Family] = {
         columns=("gradient_norm",),
         batching=True,
         rules={
-            "adam": Rule("plab.runners.trajectory:adam"),
-            "gd": Rule("plab.runners.trajectory:momentum"),
+            "adam": Rule("plab.runners.trajectory:Adam"),
+            "gd": Rule("plab.runners.trajectory:Momentum"),
         },
         kind=GRADIENT,
         methods={

@@ -10,8 +10,8 @@ give alone. To reproduce a result:
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from types import FunctionType
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +23,7 @@ from plab.runners.common import measures, shared_problem
 from plab.runners.model_state import alike, moments
 from plab.runners.runner import Runner, Step, Track
 
-__all__ = ["ActionSequence", "TrajectoryRunner", "adam", "momentum"]
+__all__ = ["ActionSequence", "Adam", "Momentum", "TrajectoryRunner"]
 
 
 class TrajectoryRunner(Runner):
@@ -80,20 +80,61 @@ class TrajectoryRunner(Runner):
             )
 
 
-def adam(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
-    """Return torch's Adam for the actions."""
-    first, second = method.betas
-    return torch.optim.Adam([parameter], lr=method.lr, betas=(first, second), eps=method.eps)
+class Rule:
+    """An update rule of one tensor, with the two things that :class:`ActionSequence` needs of an optimiser.
+
+    torch's own optimisers, which fit as well, import its compiler: a second of a run's first ten.
+
+    Attributes:
+        state: What is kept between updates, by its names, of the tensor.
+    """
+
+    def __init__(self, parameter: torch.Tensor, method: TrajectoryConfig) -> None:
+        """Keep nothing yet.
+
+        Args:
+            parameter: The tensor; its ``grad`` is set before each :meth:`step`.
+            method: Rates.
+        """
+        self._parameter, self._method = parameter, method
+        self.state: dict[torch.Tensor, dict[str, torch.Tensor]] = {parameter: {}}
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Change the tensor by its gradient."""
+        self.update(self._parameter, cast(torch.Tensor, self._parameter.grad), self.state[self._parameter])
+
+    @abstractmethod
+    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
+        """Change the tensor, and what is kept, in place."""
 
 
-def momentum(parameter: torch.Tensor, method: TrajectoryConfig) -> torch.optim.Optimizer:
-    """Return gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
-    # torch's SGD weighs the gradient by 1 - dampening.
-    m = method.momentum
-    optimizer = torch.optim.SGD([parameter], lr=method.lr, momentum=m, dampening=m)
-    # Without a buffer it takes the first gradient undampened, ten times too large at m = 0.9.
-    optimizer.state[parameter]["momentum_buffer"] = torch.zeros_like(parameter)
-    return optimizer
+class Adam(Rule):
+    """Adam (Kingma and Ba, 2015), in the order of ``torch.optim.Adam``'s operations, which gives its bits."""
+
+    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
+        """Change the tensor, and what is kept, in place."""
+        if not kept:
+            kept["step"] = torch.tensor(0.0)
+            kept["exp_avg"], kept["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        first, second = self._method.betas
+        kept["step"] += 1
+        step = kept["step"].item()
+        kept["exp_avg"].lerp_(gradient, 1 - first)
+        kept["exp_avg_sq"].mul_(second).addcmul_(gradient, gradient, value=1 - second)
+        root = (kept["exp_avg_sq"].sqrt() / (1 - second**step) ** 0.5).add_(self._method.eps)
+        parameter.addcdiv_(kept["exp_avg"], root, value=-self._method.lr / (1 - first**step))
+
+
+class Momentum(Rule):
+    """Gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
+
+    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
+        """Change the tensor, and what is kept, in place."""
+        m = self._method.momentum
+        v = kept.setdefault("momentum_buffer", torch.zeros_like(parameter))
+        v.mul_(m).add_(gradient, alpha=1 - m)
+        parameter.add_(v, alpha=-self._method.lr)
 
 
 class ActionSequence:
@@ -115,7 +156,7 @@ class ActionSequence:
         self._generator = torch.Generator().manual_seed(seed)
         unit = torch.rand((horizon, action_dim), generator=self._generator, dtype=torch.float64)
         self.parameter = ((2.0 * unit - 1.0) * method.action_init).requires_grad_()
-        rule = family(method.family).rule(method.optimizer, FunctionType)
+        rule: Any = family(method.family).rule(method.optimizer, Callable)  # type: ignore[arg-type]
         self._optimizer = rule(self.parameter, method)
         self._largest = method.max_gradient_norm
 

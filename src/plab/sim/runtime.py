@@ -179,7 +179,7 @@ def cuda_available() -> bool:
 
 
 def hasten_tracing() -> None:
-    """Let Taichi find the source of a function and tell an AST node's place quickly: both only serve messages.
+    """Let Taichi find a function's source and tell an AST node's place quickly: both only serve messages.
 
     Taichi looks the source up, among all modules of the process, and lays it out at each inlining, and wraps
     an excerpt of it for each node: half of what compiling from a warm cache takes. What a future Taichi no
@@ -220,7 +220,9 @@ def _position(context: Any, node: Any) -> str:
     line = context.src[node.lineno - 1]
     begins = context.indent + node.col_offset
     ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
-    place = f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}'
+    place = (
+        f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}'
+    )
     return f"{place}:\n{line}\n{' ' * begins}{'^' * (ends - begins)}\n"
 
 
