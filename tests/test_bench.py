@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.bench import everyday, opcount, paper, skips, speed, workload
+from plab.bench import bound, everyday, paper, skips, speed, workload
 from plab.bench.table import report
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
 from plab.config import build_scene, load_config
@@ -21,7 +21,6 @@ from plab.losses import make_terms
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
-from plab.sim import linalg as linear_algebra
 from plab.sim.memory import array_bytes
 from plab.suite import suite_tasks
 
@@ -47,7 +46,6 @@ def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.Ca
         assert all(row.values()), row
         assert 0 < float(row["min_ms"]) <= float(row["median_ms"]) <= float(row["max_ms"])
         assert float(row["bound_ms"]) > 0 and float(row["memory_mb"]) > 0
-        assert row["limit"] in ("bandwidth", "arithmetic", "launches")
     assert float(rows[1]["memory_mb"]) > float(rows[0]["memory_mb"])
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].split() == list(speed.COLUMNS) and len(printed) == 1 + len(rows)
@@ -149,13 +147,24 @@ def test_the_paper_table_is_written_to_a_new_folder(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8").endswith("| 1.0 |\n")
 
 
-def test_operations_are_counted() -> None:
-    nine = opcount._numbers(9)
-    assert opcount._counted(lambda: opcount.plain(linear_algebra.mul)(nine, nine)) == 45
-    assert opcount._counted(lambda: opcount.plain(linear_algebra.det)(nine)) == 14
-    single, double = (opcount.particle_operations(p) for p in ("float32", "float64"))
-    # Only the series differ.
-    assert single["gather"] == double["gather"] and single["scatter"] < double["scatter"]
+def test_the_bound_is_what_a_step_moves_at_the_speed_of_a_copy() -> None:
+    load = workload.build(load_config(TINY), 2, 1)
+    forward, both = bound.traffic(load, False), bound.traffic(load, True)
+    assert both[:3] == forward and sum(both) > 3 * sum(forward)
+    # A particle's 24 numbers are read, and written by scatter or gather, and some node is touched.
+    assert sum(forward) > 4 * 2 * 24
+    moved = sum(forward) * 2 * load.simulator.particle_count * load.simulator.substeps
+    flat = (1e9,) * len(bound.FOOTPRINTS)
+    assert bound.least_ms(load, forward, flat) == pytest.approx(1e3 * moved / 1e9)
+    assert bound.least_ms(load, forward, (2e9,) * len(flat)) == pytest.approx(0.5e3 * moved / 1e9)
+
+
+def test_a_copy_is_at_most_as_fast_as_memory_can_be(capsys: pytest.CaptureFixture) -> None:
+    assert speed.main(["--limits"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0] == list(speed.LIMIT_COLUMNS) and len(lines) == 1 + len(bound.FOOTPRINTS)
+    # Between a slow disk's speed and that of all registers.
+    assert all(0.1 < float(rate) < 1e5 for _, _, rate in lines[1:])
 
 
 def scene() -> Scene:

@@ -7,7 +7,7 @@
     python -m plab.bench.speed --skips                               what each skip saves
     python -m plab.bench.speed --scaling                             from 1,000 to 1,000,000 particles
     python -m plab.bench.speed --paper                               the paper's table of ten tasks
-    python -m plab.bench.speed --limits                              what the machine can do
+    python -m plab.bench.speed --limits                              how fast the machine copies memory
 
 Rows are printed as they come, and written to --csv. docs/benchmarks.md explains the columns.
 """
@@ -21,16 +21,12 @@ from collections.abc import Iterator, Sequence
 
 from plab.arguments import positive, to_write
 from plab.bench import paper, scaling, skips
-from plab.bench.costs import bound, phases
-from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
+from plab.bench.bound import FOOTPRINTS, bandwidth, least_ms, traffic
 from plab.bench.table import progress, report
 from plab.bench.workload import (
     FORWARD,
     GRADIENT,
     KINDS,
-    OBSERVATION,
-    REWARD,
-    ROLLOUT,
     TENSORS,
     build,
     peak_rss_mb,
@@ -45,21 +41,10 @@ __all__ = ["COLUMNS", "main", "rows"]
 
 COLUMNS = (
     "task", "device", "precision", "batch", "what", "first_s", "median_ms", "min_ms", "max_ms",
-    "steps_per_s", "ns_per_particle", "memory_mb", "peak_rss_mb", "bound_ms", "limit", "times_bound",
+    "steps_per_s", "ns_per_particle", "memory_mb", "peak_rss_mb", "bound_ms", "times_bound",
 )  # fmt: skip
 
-LIMIT_COLUMNS = ("device", "precision", "limit", "value", "unit")
-
-LAUNCHES = {
-    FORWARD: 1,
-    REWARD: 2,
-    OBSERVATION: 3,
-    TENSORS: 3,
-    ROLLOUT: 2,
-    GRADIENT: 3,
-}
-"""Launches per environment step that cannot be fewer: one for a step, for its loss, for its observation, and
-for its adjoint."""
+LIMIT_COLUMNS = ("device", "copied_mb", "gb_per_s")
 
 WIDE = {"what": max(map(len, KINDS)), "skip": 18, "device": 6, "batch": 5}
 """Widths of columns whose entries are not as long as most."""
@@ -73,7 +58,7 @@ def rows(
     steps: int,
     repeats: int,
     kinds: Sequence[str],
-    limits: Limits,
+    speeds: tuple[float, ...],
     refused: list[str],
 ) -> Iterator[dict[str, object]]:
     """Measure one configuration and batch size.
@@ -84,7 +69,7 @@ def rows(
         steps: Environment steps per rollout.
         repeats: Timed rollouts.
         kinds: What is timed, keys of :data:`plab.bench.workload.KINDS`.
-        limits: What the machine can do.
+        speeds: How fast the machine copies memory, of :func:`plab.bench.bound.bandwidth`.
         refused: Where a kind needs more memory than there may be, a line is added here; the others go on.
 
     Yields:
@@ -102,8 +87,8 @@ def rows(
         except MemoryError as error:
             refused.append(f"{kind}, {batch} environment(s): {error}")
             continue
-        median, least, most = timing.ms(steps)
-        best = bound(load, phases(load, kind == GRADIENT), limits, LAUNCHES[kind])
+        median, best, most = timing.ms(steps)
+        least = least_ms(load, traffic(load, kind == GRADIENT), speeds)
         work = batch * simulator.particle_count * simulator.substeps
         yield {
             "task": cfg.task.name,
@@ -113,15 +98,14 @@ def rows(
             "what": kind,
             "first_s": round(load.first_step_s if kind == FORWARD else timing.first_s, 2),
             "median_ms": round(median, 3),
-            "min_ms": round(least, 3),
+            "min_ms": round(best, 3),
             "max_ms": round(most, 3),
             "steps_per_s": round(batch * 1e3 / median, 1),
             "ns_per_particle": round(median * 1e6 / work, 3),
             "memory_mb": round(simulator.memory_bytes() / 1e6, 1),
             "peak_rss_mb": round(peak_rss_mb()) if simulator.device == "cpu" else "",
-            "bound_ms": round(best.ms, 3),
-            "limit": best.limit,
-            "times_bound": round(median / best.ms, 1),
+            "bound_ms": round(least, 3),
+            "times_bound": round(median / least, 1),
         }
 
 
@@ -130,37 +114,30 @@ def _all_rows(options: argparse.Namespace, refused: list[str]) -> Iterator[dict[
     for precision in options.precision or [None]:
         chosen = [*options.overrides, *([f"sim.precision={precision}"] if precision else [])]
         first = load_config([*chosen, *_task(options.task[0] if options.task else None)])
-        limits = _limits(first)
+        speeds = _speeds(first.sim.device)
         for task in options.task or [None]:
             for batch in options.batch:
                 gc.collect()
                 cfg = load_config([*chosen, *_task(task)])
                 how = (options.steps, options.repeats, options.kinds)
-                yield from rows(cfg, batch, *how, limits, refused)
+                yield from rows(cfg, batch, *how, speeds, refused)
 
 
 def _task(name: str | None) -> list[str]:
     return [f"task={name}"] if name else []
 
 
-def _limits(cfg: Config) -> Limits:
-    progress(f"limits of the machine, {cfg.sim.device}, {cfg.sim.precision}")
-    limits = measure_limits(cfg.sim.device, cfg.sim.precision)
+def _speeds(device: str) -> tuple[float, ...]:
+    progress(f"how fast the machine copies memory, {device}")
+    speeds = bandwidth(device)
     gc.collect()
-    return limits
+    return speeds
 
 
 def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
-    for precision in options.precision or [None]:
-        cfg = load_config([*options.overrides, *([f"sim.precision={precision}"] if precision else [])])
-        limits = _limits(cfg)
-        where = {"device": cfg.sim.device, "precision": cfg.sim.precision}
-        for footprint, value in zip(FOOTPRINTS, limits.bandwidth, strict=True):
-            name = f"copy, {footprint / 1e6:.0f} MB"
-            yield where | {"limit": name, "value": round(value / 1e9, 1), "unit": "GB/s"}
-        yield where | {"limit": "arithmetic", "value": round(limits.flops / 1e9, 1), "unit": "Gflop/s"}
-        yield where | {"limit": "atomics", "value": round(limits.atomics / 1e9, 3), "unit": "G/s"}
-        yield where | {"limit": "launch", "value": round(limits.launch_s * 1e6, 1), "unit": "us"}
+    device = load_config(options.overrides).sim.device
+    for footprint, speed in zip(FOOTPRINTS, _speeds(device), strict=True):
+        yield {"device": device, "copied_mb": round(footprint / 1e6), "gb_per_s": round(speed / 1e9, 1)}
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -184,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
     modes.add_argument("--skips", nargs="*", metavar="SKIP", help="rows with one skip off; all, or these")
     modes.add_argument("--scaling", action="store_true", help="rows for numbers of particles and grids")
     modes.add_argument("--paper", action="store_true", help="the paper's table beside ours")
-    modes.add_argument("--limits", action="store_true", help="what the machine can do")
+    modes.add_argument("--limits", action="store_true", help="how fast the machine copies memory")
     parser.add_argument("--particles", type=positive, nargs="+", help="--scaling: numbers of particles")
     parser.add_argument("--grids", type=positive, nargs="+", help="--scaling: nodes per axis")
     return parser
@@ -208,7 +185,7 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     if options.limits:
-        report(LIMIT_COLUMNS, _limit_rows(options), options.csv, {"limit": 13})
+        report(LIMIT_COLUMNS, _limit_rows(options), options.csv)
     elif options.skips is not None:
         return _run_skips(options)
     elif options.scaling:

@@ -1,0 +1,136 @@
+"""The least time of an environment step: what it has to move through memory, at the speed of a copy.
+
+Each phase of a substep has to read and write the state of the particles and the grid nodes that hold mass
+once; what a phase reads again is assumed to be in registers or caches. Strain and both scatters are counted
+again in the backward pass. Arithmetic, atomic additions, launches, checkpoints and losses come on top: the
+ratio of a row to the bound says how much of its time is not memory's.
+"""
+
+import time
+
+import numpy as np
+import taichi as ti
+
+from plab.bench.workload import Workload
+from plab.sim.engine import SPLIT
+from plab.sim.runtime import Runtime, start_runtime
+from plab.sim.storage import STATE
+
+__all__ = ["FOOTPRINTS", "bandwidth", "least_ms", "traffic"]
+
+FOOTPRINTS = tuple(2.0**k * 1e6 for k in (0, 2, 4, 6, 8))
+"""Bytes that a copy touches, both arrays together: caches are faster."""
+
+VECTOR_BYTES = 64
+"""Bytes of the vectors that Taichi is given on the CPU: LLVM makes SIMD operations of them."""
+
+GPU_THREADS = 1 << 18
+"""Threads of the copy on CUDA."""
+
+TARGET_S = 0.02
+"""Seconds that a single measurement takes at least."""
+
+RUNS = 3
+
+NODE = 4
+"""Numbers per grid node: momentum and mass, or velocity."""
+
+
+@ti.data_oriented
+class Copy:
+    """A streaming copy by ``workers`` threads, which share the work on the CPU as the simulator's do."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        """Allocate for a runtime in force."""
+        self.cuda = runtime.device == "cuda"
+        self.workers = GPU_THREADS if self.cuda else runtime.threads
+        # Taichi hands out CPU loops in chunks: one iteration in each does a thread's work.
+        self.split = 1 if self.cuda else SPLIT
+        self.width = 1 if self.cuda else VECTOR_BYTES // 4
+        size = int(FOOTPRINTS[-1] / 2 / (4 * self.width))
+        # Fields, because LLVM vectorises copies of them and not those of arrays.
+        self.source = ti.Vector.field(self.width, ti.f32, shape=size)
+        self.target = ti.Vector.field(self.width, ti.f32, shape=size)
+
+    @ti.kernel
+    def copy(self, size: ti.i32, passes: ti.i32):
+        """Copy ``size`` entries, ``passes`` times."""
+        for q in range(self.workers * self.split):
+            if q % self.split == 0:
+                w = q // self.split
+                for _ in range(passes):
+                    if ti.static(self.cuda):
+                        for turn in range((size - w + self.workers - 1) // self.workers):
+                            i = w + turn * self.workers
+                            self.target[i] = self.source[i]
+                    else:
+                        for i in range(w * (size // self.workers), (w + 1) * (size // self.workers)):
+                            self.target[i] = self.source[i]
+
+    def bytes_per_second(self, footprint: float) -> float:
+        """Bytes read and written per second where both arrays together have so many; the best of runs."""
+        size = int(footprint / 2 / (4 * self.width))
+
+        def seconds(passes: int) -> float:
+            start = time.perf_counter()
+            self.copy(size, passes)
+            ti.sync()
+            return time.perf_counter() - start
+
+        passes = 1
+        seconds(passes)
+        while seconds(passes) < TARGET_S and passes < 1 << 24:
+            passes *= 2
+        return passes * 8.0 * size * self.width / min(seconds(passes) for _ in range(RUNS))
+
+
+def bandwidth(device: str) -> tuple[float, ...]:
+    """Measure bytes read and written per second, for each of the :data:`FOOTPRINTS`; takes a second or two.
+
+    Args:
+        device: ``cpu`` or ``cuda``.
+
+    Raises:
+        plab.sim.DeviceError: If CUDA was asked for and is not there.
+    """
+    copy = Copy(start_runtime(device, "float32"))
+    return tuple(copy.bytes_per_second(footprint) for footprint in FOOTPRINTS)
+
+
+def traffic(load: Workload, gradient: bool) -> list[float]:
+    """Return bytes read and written per particle by each phase of a substep, in the workload's initial state.
+
+    Args:
+        load: What is timed.
+        gradient: Whether to add the phases of the backward pass.
+    """
+    simulator = load.simulator
+    simulator.reset()
+    cells = np.unique(np.floor(simulator.state().x[0] * simulator.grid_size - 0.5).astype(np.int64), axis=0)
+    # A node holds mass where a stencil reaches.
+    offsets = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    touched = len(np.unique((cells[:, None] + offsets).reshape(-1, 3), axis=0))
+    grid = NODE * touched / simulator.particle_count
+    x, v, c, f = 3, 3, 9, 9
+    numbers = [STATE + f + grid, 3 * grid, x + x + v + c + grid]
+    if gradient:
+        # The stress is left to the backward gather; the backward scatter reads v of the state after the
+        # substep and the adjoints of x, v and C. The backward gather reads states, all adjoints and the
+        # stress, and writes all adjoints.
+        numbers += [STATE + v + x + v + c + c + 2 * grid, 6 * grid, STATE + v + STATE + c + STATE + 2 * grid]
+    return [(4 if simulator.precision == "float32" else 8) * count for count in numbers]
+
+
+def least_ms(load: Workload, phases: list[float], speeds: tuple[float, ...]) -> float:
+    """Return the least time of an environment step of all environments [ms].
+
+    Args:
+        load: What is timed.
+        phases: Bytes per particle, of :func:`traffic`.
+        speeds: Of :func:`bandwidth`.
+    """
+    simulator = load.simulator
+    particles = simulator.batch * simulator.particle_count
+    # The working set of the largest phase decides which of the caches it fits into.
+    speed = float(np.interp(np.log(max(phases) * particles), np.log(FOOTPRINTS), speeds))
+    return 1e3 * sum(phases) * particles * simulator.substeps / speed
