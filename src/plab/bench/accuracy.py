@@ -32,7 +32,6 @@ import pandas as pd
 
 from plab.arguments import folder, positive
 from plab.bench.common_scene import (
-    ANY_SCENE,
     common_actions,
     common_places,
     common_scene,
@@ -46,7 +45,7 @@ from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, DEVICES, Simulator
+from plab.sim import CONTACT_MODELS, DEVICES, Simulator, Skips
 from plab.suite import task_list
 
 __all__ = ["Setting", "attempts_at", "lattice", "main"]
@@ -274,7 +273,7 @@ def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int, device
     Yields:
         Task, contact model and :class:`Result`.
     """
-    skips = replace(ANY_SCENE, singular_values=setting.material == "series")
+    skips = Skips(singular_values=setting.material == "series")
     simulator = None
     for attempt in attempts:
         scene, x = attempt.start(setting)

@@ -18,10 +18,8 @@ import numpy as np
 from plab.losses import make_terms
 from plab.losses.term import Term
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
-from plab.sim.skips import Skips
 
 __all__ = [
-    "ANY_SCENE",
     "PLACES",
     "common_actions",
     "common_places",
@@ -29,9 +27,6 @@ __all__ = [
     "grid_terms",
     "own_components",
 ]
-
-ANY_SCENE = Skips(plasticity=False, friction=False)
-"""For simulators that are given other scenes later, which may yield or rub where the first do not."""
 
 PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
 """Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""

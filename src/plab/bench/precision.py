@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, grid_terms, own_components
+from plab.bench.common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.bench.table import report
 from plab.command import command_line
 from plab.config import build_scene, load_config
@@ -117,7 +117,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
     Yields:
         For each configuration its target and an :class:`Outcome` per kind of actions.
     """
-    simulator = Simulator([configurations[0].scene], terms=grid_terms(), precision=precision, skips=ANY_SCENE)
+    simulator = Simulator([configurations[0].scene], terms=grid_terms(), precision=precision)
     for number, start in enumerate(configurations):
         simulator.set_scenes([start.scene])
         final = {}

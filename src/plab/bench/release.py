@@ -28,13 +28,13 @@ import numpy as np
 import taichi as ti
 
 from plab.arguments import positive, to_write
-from plab.bench.common_scene import ANY_SCENE, grid_terms
+from plab.bench.common_scene import grid_terms
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
 from plab.command import command_line
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
-from plab.sim import Simulator, particle_phases
+from plab.sim import Simulator, Skips, particle_phases
 from plab.sim.spectral import SINGULAR_VALUE_MIN, mapped_values, svd_signed
 from plab.suite import suite_tasks, task_list
 
@@ -140,7 +140,7 @@ def rows(tasks: Sequence[str], particles: int, choices: Sequence[str]) -> Iterat
 
 
 def _simulator(configurations: Sequence[Start], *, series: bool) -> Simulator:
-    skips = replace(ANY_SCENE, singular_values=series)
+    skips = Skips(singular_values=series)
     return Simulator([configurations[0].scene], terms=grid_terms(), precision="float64", skips=skips)
 
 

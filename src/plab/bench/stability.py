@@ -26,7 +26,6 @@ import numpy as np
 import pandas as pd
 
 from plab.arguments import positive, to_write
-from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
 from plab.command import command_line
@@ -68,7 +67,7 @@ def run_cases(cases: Sequence[Case], precision: str) -> Iterator[dict[str, objec
     for group in _groups(cases).values():
         scenes = [group[0].scene] * min(BATCH, len(group))
         terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": group[0].contact_weight})
-        simulator = Simulator(scenes, terms=terms, precision=precision, skips=ANY_SCENE)
+        simulator = Simulator(scenes, terms=terms, precision=precision)
         simulator.set_target(*_target(simulator))
         for at in range(0, len(group), simulator.batch):
             part = group[at : at + simulator.batch]

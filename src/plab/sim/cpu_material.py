@@ -71,7 +71,7 @@ class MaterialTiles(ParticlePhases):
             self.stage[at + i] = g[i]
         for i in ti.static(range(6)):
             self.stage[at + 9 + i] = d[i]
-        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+        _q, _det, _norm, k = yield_factor(d, p[2])
         if self.all_served(z2, j):
             tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
             a = self.stress_and_momentum(tau, c)
@@ -149,7 +149,7 @@ class MaterialTiles(ParticlePhases):
             yield_strain,
             self.series,
         )
-        _q, _det, _norm, k = yield_factor(d, yield_strain, self.series)
+        _q, _det, _norm, k = yield_factor(d, yield_strain)
         for i in ti.static(range(6)):
             self.stage[at + STAGE_D_BAR + i] = d_bar[i]
         self.stage[at + STAGE_BARS] = k_bar

@@ -215,7 +215,7 @@ class CudaPhases(OrderPhases, PosePhases):
         g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
-        _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+        _q, _det, _norm, k = yield_factor(d, p[2])
         if self.served(z2, j):
             tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
             a = self.stress_and_momentum(tau, c)
@@ -248,7 +248,7 @@ class CudaPhases(OrderPhases, PosePhases):
         if self.served(z2, j):
             tau_bar = self.stress_symmetric(a_bar)
             d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
-            _q, _det, _norm, k = yield_factor(d, p[2], self.series)
+            _q, _det, _norm, k = yield_factor(d, p[2])
             if self.flows(k):
                 d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
                 k_bar += k_flow

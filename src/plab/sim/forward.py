@@ -198,7 +198,6 @@ class ForwardSimulator:
         if len(scenes) != self.batch:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
         require_alike([self.scenes[0], *scenes])
-        self._require_compiled(scenes)
         self.scenes = tuple(scenes)
         self._engine.fill_parameters(scenes)
         self._start_from(particles)
@@ -223,7 +222,6 @@ class ForwardSimulator:
         scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
         for scene in scenes:
             scene.validate()
-        self._require_compiled(scenes)
         self.scenes = scenes
         self._version += 1
         self._engine.fill_material(scenes)
@@ -393,13 +391,6 @@ class ForwardSimulator:
         iou = judges[0] if judges else peak * np.nan
         # Those that are measured only come last.
         return Measures(values[..., : len(self.terms)], iou)
-
-    def _require_compiled(self, scenes: Sequence[Scene]) -> None:
-        """Refuse scenes that need what was left out when the simulator was built."""
-        for name in self._engine.left_out(scenes):
-            raise SceneError(
-                f"this simulator was built for scenes without {name}: build it with skips=Skips({name}=False)"
-            )
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
         """Make the scenes' start the initial state."""

@@ -122,7 +122,7 @@ class GridPhases(Storage):
             r = v - u
             rn = r.dot(normal)
             if rn < 0.0:
-                t = slid(r - rn * normal, rn, self.friction[e, m], self.manipulators_rub)
+                t = slid(r - rn * normal, rn, self.friction[e, m])
                 out = u + (1.0 - strength) * r + strength * t
         return out
 
@@ -149,8 +149,8 @@ class GridPhases(Storage):
             if rn < 0.0:
                 friction = self.friction[e, m]
                 t0 = r - rn * normal
-                t = slid(t0, rn, friction, self.manipulators_rub)
-                t0_bar, rn_bar = slid_adjoint(t0, rn, friction, self.manipulators_rub, bar)
+                t = slid(t0, rn, friction)
+                t0_bar, rn_bar = slid_adjoint(t0, rn, friction, bar)
                 t0_bar *= strength
                 rn_bar *= strength
                 rn_bar -= normal.dot(t0_bar)
@@ -219,7 +219,7 @@ class GridPhases(Storage):
         """Velocity after the floor, for a floor node with v_y < 0."""
         out = v * 0.0
         if friction < STICKING:
-            t = slid(ti.Vector([v[0], v[2]]), v[1], friction, True)
+            t = slid(ti.Vector([v[0], v[2]]), v[1], friction)
             out[0] = t[0]
             out[2] = t[1]
         return out
@@ -229,19 +229,14 @@ class GridPhases(Storage):
         """Adjoint of v under :meth:`floor`."""
         out = v * 0.0
         if friction < STICKING:
-            t_bar, vy_bar = slid_adjoint(
-                ti.Vector([v[0], v[2]]), v[1], friction, True, ti.Vector([bar[0], bar[2]])
-            )
+            t_bar, vy_bar = slid_adjoint(ti.Vector([v[0], v[2]]), v[1], friction, ti.Vector([bar[0], bar[2]]))
             out = ti.Vector([t_bar[0], vy_bar, t_bar[1]])
         return out
 
     @ti.func
     def rubs(self, i, v, friction):
         """Whether the floor acts on a node, beyond stopping it as any wall does."""
-        out = False
-        if ti.static(self.floor_rubs):
-            out = friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
-        return out
+        return friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
 
     @ti.func
     def walls(self, i, v, friction):

@@ -128,7 +128,7 @@ def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
 @ti.func
 def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()):
     """Kirchhoff stress (6 components) after return mapping; arguments as for :func:`stress_adjoint`."""
-    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     qk = k * k * q
     dk = k * k * k * det_d
     e0, e1, e2 = exp_coefficients(qk, dk, series.exp_terms)
@@ -144,7 +144,7 @@ def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()
 @ti.func
 def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()):
     """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
-    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     s = k - 1.0
     m0, m1, m2 = exp_coefficients(s * s * q, s * s * s * det_d, series.exp_terms)
     m = polynomial_sym(m0, m1 * s, m2 * s * s, d, square_sym(d))
@@ -152,15 +152,11 @@ def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()
 
 
 @ti.func
-def yield_factor(d: ti.template(), yield_strain, series: ti.template()):
+def yield_factor(d: ti.template(), yield_strain):
     """q = tr(d^2) / 2, det d, the regularised norm of d and the factor k of return mapping."""
     q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
-    norm = 0.0 * q + 1.0
-    k = 0.0 * q + 1.0
-    if ti.static(series.plastic):
-        norm = ti.sqrt(2.0 * q + NORM_SHIFT)
-        k = ti.min(yield_strain / norm, 1.0)
-    return q, det_sym(d), norm, k
+    norm = ti.sqrt(2.0 * q + NORM_SHIFT)
+    return q, det_sym(d), norm, ti.min(yield_strain / norm, 1.0)
 
 
 @ti.func
@@ -206,7 +202,7 @@ def stress_adjoint(
     Returns:
         Adjoints of d (6) at fixed k, of k, of c2 and of J.
     """
-    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     d2 = square_sym(d)
     qk = k * k * q
     dk = k * k * k * det_d
@@ -261,7 +257,7 @@ def parameter_adjoint(
     """
     # The stress is linear in mu and lambda.
     mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
-    _q, _det, norm, k = yield_factor(d, yield_strain, series)
+    _q, _det, norm, k = yield_factor(d, yield_strain)
     yield_bar = ti.select(k < 1.0, k_bar / norm, 0.0 * k)
     return mu_bar, (tau_bar[0] + tau_bar[1] + tau_bar[2]) * j * (j - 1.0), yield_bar
 
@@ -284,7 +280,7 @@ def flow_adjoint(
     Returns:
         Adjoints of d (6) at fixed k, of k, and of G (9) at fixed d.
     """
-    q, det_d, _norm, k = yield_factor(d, yield_strain, series)
+    q, det_d, _norm, k = yield_factor(d, yield_strain)
     s = k - 1.0
     qs = s * s * q
     ds = s * s * s * det_d
@@ -328,11 +324,9 @@ def log_adjoint(
     Returns:
         Adjoint of Z, 6 components.
     """
-    _q, _det, norm, k = yield_factor(d, yield_strain, series)
+    _q, _det, norm, k = yield_factor(d, yield_strain)
     # k = yield_strain / norm where it yields, else constant.
-    q_bar = 0.0 * k
-    if ti.static(series.plastic):
-        q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
+    q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
     full = scaled_sum(1.0, d_bar, -q_bar, d)
     mean = (full[0] + full[1] + full[2]) * (1.0 / 3.0)
     dev = (full[0] - mean, full[1] - mean, full[2] - mean, full[3], full[4], full[5])

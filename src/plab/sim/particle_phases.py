@@ -166,8 +166,6 @@ class ParticlePhases(Storage):
         """Whether plastic flow is computed where the factor of return mapping is ``k``, the least of a
         tile."""
         out = k < 1.0
-        if ti.static(not self.series.plastic):
-            out = False
         if ti.static(not self.skips.flow):
             out = True
         return out

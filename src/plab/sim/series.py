@@ -38,7 +38,6 @@ class Series:
         z_squared_max: Largest |Z|^2 (Frobenius) that the series serve.
         j_min: Smallest J that the series serve.
         j_max: Largest J that the series serve.
-        plastic: Whether anything yields; if not, k = 1 without being computed.
     """
 
     log_terms: int
@@ -47,7 +46,6 @@ class Series:
     z_squared_max: float = 0.0144
     j_min: float = 0.6
     j_max: float = 1.6
-    plastic: bool = True
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":

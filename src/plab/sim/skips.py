@@ -20,9 +20,7 @@ class Skips:
         far_manipulators: Manipulators that cannot reach a block; on CUDA a node, in the backward pass.
         rotations: Rotation of round manipulators and spin of all, where they do not rotate.
         singular_values: The decomposition into singular values where series serve.
-        plasticity: Everything about yielding where the yield stress is infinite in all environments.
         flow: Plastic flow of particles that do not yield; on the CPU of tiles in which none does.
-        friction: Friction of manipulators or floor that have none in any environment.
         history: Keeping all states where no gradient is asked for.
         still_manipulators: Distances from, and adjoints of, manipulators that cannot move.
         adjoints: Particles' adjoints in the environment steps before a moving manipulator touches the body of
@@ -36,9 +34,7 @@ class Skips:
     far_manipulators: bool = True
     rotations: bool = True
     singular_values: bool = True
-    plasticity: bool = True
     flow: bool = True
-    friction: bool = True
     history: bool = True
     still_manipulators: bool = True
     adjoints: bool = True

@@ -14,7 +14,6 @@ depend on the number of threads.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -134,19 +133,7 @@ class Storage:
         series = Series.for_precision(precision)
         if not self.skips.singular_values:
             series = replace(series, z_squared_max=-1.0)
-        yields = any(math.isfinite(s.yield_stress) for s in scenes)
-        self.series = replace(series, plastic=yields or not self.skips.plasticity)
-        self.floor_rubs = not self.skips.friction or any(s.floor_friction > 0 for s in scenes)
-
-    def left_out(self, scenes: Sequence[Scene]) -> list[str]:
-        """Names of the :class:`Skips` because of which these scenes cannot be simulated any more."""
-        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
-        needed = {
-            "plasticity": any(math.isfinite(s.yield_stress) for s in scenes) and not self.series.plastic,
-            "friction": (any(s.floor_friction > 0 for s in scenes) and not self.floor_rubs)
-            or (rub and not self.manipulators_rub),
-        }
-        return [name for name, missing in needed.items() if missing]
+        self.series = series
 
     def _set_threads(self, threads: int) -> None:
         self.threads = threads
@@ -160,8 +147,6 @@ class Storage:
         self.shapes = tuple(m.shape for m in manipulators)
         require_surfaces(self.shapes)
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
-        rub = any(m.friction > 0 for s in scenes for m in s.manipulators)
-        self.manipulators_rub = rub or not self.skips.friction
         dims = [m.action_dim for m in manipulators]
         self.action_offsets = tuple(int(o) for o in np.cumsum([0, *dims])[:-1])
         self.action_dims = tuple(dims)
