@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from browsing import browser  # noqa: F401
-from plab.checks import cuda_is_usable
 from plab.config import Config
+from plab.config.checks import cuda_is_usable
 from plab.reuse import SimulatorCache
 from plab.tally import Outcome
 from refusals import ending, refusal, snapshot

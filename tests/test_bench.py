@@ -17,13 +17,13 @@ from plab.bench import everyday, opcount, paper, skips, speed, workload
 from plab.bench.table import report
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
 from plab.config import build_scene, load_config
+from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
 from plab.sim import linalg as linear_algebra
 from plab.sim.memory import array_bytes
-from plab.suite import suite_tasks
 
 pytestmark = pytest.mark.physics
 

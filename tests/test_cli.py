@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from plab.checks import cuda_is_usable
 from plab.config import GROUPS, Config, choices
+from plab.config.checks import cuda_is_usable
 from plab.results import ResultsError
 from plab.reuse import SimulatorCache
 from plab.run import main

@@ -28,6 +28,7 @@ from hypothesis import strategies as st
 
 import synthetic
 from plab.config import Config, ConfigError, build_scene, load_config
+from plab.config.selection import Selection, SelectionError
 from plab.mesh import load_mesh
 from plab.report.collect import MixedRunsError, collect, collect_ablation
 from plab.report.series import load_series
@@ -35,7 +36,6 @@ from plab.results import ResultsError, check, load, pack, read
 from plab.runners.policy import load_policy, policy_path, save_policy
 from plab.runners.rl_models import Spaces, model_kind
 from plab.scene import SceneError
-from plab.selection import Selection, SelectionError
 from plab.shape_files import ShapeError
 from plab.status import __main__ as status
 from plab.targets import TargetError, load_release_target

@@ -10,9 +10,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from plab.config import ConfigError, build_scene, choices, conf_folder, load_config
-from plab.config_types import TaskConfig
-from plab.random_variant import FIRST_TARGET_SEED, draw_variant
+from plab.config import ConfigError, TaskConfig, build_scene, choices, conf_folder, load_config
+from plab.config.variants import FIRST_TARGET_SEED, draw_variant
 from plab.results import result_path
 from plab.run import main
 

@@ -15,6 +15,7 @@ import pytest
 
 from plab import capacity, sizes
 from plab.config import load_config
+from plab.config.words import quoted
 from plab.envs.sb3 import make_sb3
 from plab.errors import PlabError
 from plab.problem import Problem
@@ -22,7 +23,6 @@ from plab.results import load
 from plab.run import main
 from plab.sim import Simulator
 from plab.status import __main__ as status
-from plab.words import quoted
 from suite import scene
 
 ROOM = 16e9

@@ -17,6 +17,7 @@ from scipy import stats
 
 import synthetic
 from plab.config import load_config
+from plab.config.selection import SelectionError, select
 from plab.examples import EXAMPLES, example_archive, resolve
 from plab.report.__main__ import main, write_tables
 from plab.report.agreement import agreement
@@ -29,7 +30,6 @@ from plab.report.table import NOTHING, Table, aligned, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import check, load, pack
-from plab.selection import SelectionError, select
 
 GOLDEN = Path(__file__).parent / "golden"
 

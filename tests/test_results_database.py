@@ -20,6 +20,7 @@ import pandas as pd
 import pytest
 
 import synthetic
+from plab.config.selection import Selection
 from plab.examples import example_archive
 from plab.render.__main__ import _parse as parse_render
 from plab.render.__main__ import main as render
@@ -39,7 +40,6 @@ from plab.results import (
 )
 from plab.results.__main__ import main
 from plab.results.store import Store
-from plab.selection import Selection
 from plab.status import survey
 from plab.status.__main__ import main as status
 

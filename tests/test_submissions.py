@@ -23,6 +23,7 @@ from browsing import browsing, press
 from plab import leaderboard, submit, verify
 from plab.bench.results import synthetic_run, template
 from plab.config import load_config
+from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table
 from plab.submissions.board import board
 from plab.submissions.card import Card, CardError, parse_card
@@ -39,7 +40,6 @@ from plab.submissions.verifying import (
     read_verification,
     write_verification,
 )
-from plab.suite import suite_tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)

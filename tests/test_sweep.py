@@ -13,11 +13,11 @@ import pytest
 
 import toy_runner
 from plab.config import Config, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.families import FAMILIES
 from plab.locks import acquire
 from plab.results import RunFile, config_hash, read, result_path
 from plab.run import main
-from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin

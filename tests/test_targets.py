@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from plab.config import ConfigError, build_scene, load_config, variant_task
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
 from plab.scene import Scene, sample_particles
-from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.targets import (
     RECIPES,
     TARGET_SEED,

@@ -7,9 +7,20 @@ from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Sequence
 from pathlib import Path
 
+from plab.config.suite import suite_tasks
 from plab.errors import ArgumentError
 
-__all__ = ["folder", "positive", "rates", "refuse_task", "seed", "sources_and_words", "to_write", "told"]
+__all__ = [
+    "folder",
+    "positive",
+    "rates",
+    "refuse_task",
+    "seed",
+    "sources_and_words",
+    "task_list",
+    "to_write",
+    "told",
+]
 
 
 def positive(text: str) -> int:
@@ -50,6 +61,15 @@ def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         raise ArgumentError("the name of a folder is empty: give one, or . for this one")
     words = [argument for argument in arguments if "=" in argument and not os.path.exists(argument)]
     return [argument for argument in arguments if argument not in words], words
+
+
+def task_list(text: str) -> list[str]:
+    """Parse names of tasks with commas between them."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in suite_tasks():
+            raise ArgumentTypeError(f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}")
+    return names
 
 
 def folder(text: str) -> Path:

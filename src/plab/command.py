@@ -12,18 +12,15 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 from plab.arguments import told
-from plab.errors import PlabError
+from plab.errors import TRACEBACK, PlabError, out_of_memory, traceback_wanted
 
 __all__ = [
     "EXIT_BROKEN_PIPE",
     "EXIT_BUG",
     "EXIT_INTERRUPTED",
     "EXIT_USER_ERROR",
-    "TRACEBACK",
     "command_line",
     "complain",
-    "out_of_memory",
-    "traceback_wanted",
 ]
 
 EXIT_USER_ERROR = 2
@@ -32,9 +29,6 @@ EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 """What a shell says of a program that a closed pipe has ended."""
-
-TRACEBACK = "PLAB_TRACEBACK"
-"""Variable of the environment that lets a bug through with its traceback."""
 
 Main = TypeVar("Main", bound=Callable[..., int])
 
@@ -83,16 +77,6 @@ def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
     with suppress(BrokenPipeError):
         print(f"plab: {' '.join(message.split())}", file=sys.stderr)
     return code
-
-
-def out_of_memory(error: MemoryError) -> str:
-    """Return one line about memory that is lacking; Python's own error says nothing."""
-    return str(error) or "this computer has too little memory for that: close something, or ask for less"
-
-
-def traceback_wanted() -> bool:
-    """Whether bugs are to be shown with their tracebacks."""
-    return bool(os.environ.get(TRACEBACK))
 
 
 def _exit_code(main: Callable[..., int], argv: Sequence[str] | None) -> int:

@@ -2,7 +2,22 @@
 
 from __future__ import annotations
 
-__all__ = ["ArgumentError", "PlabError"]
+import difflib
+import os
+from collections.abc import Sequence
+
+__all__ = [
+    "TRACEBACK",
+    "ArgumentError",
+    "ConfigError",
+    "PlabError",
+    "out_of_memory",
+    "pick",
+    "traceback_wanted",
+]
+
+TRACEBACK = "PLAB_TRACEBACK"
+"""Variable of the environment that lets a bug through with its traceback."""
 
 
 class PlabError(Exception):
@@ -11,3 +26,24 @@ class PlabError(Exception):
 
 class ArgumentError(PlabError, ValueError):
     """An argument, from Python, that does not fit."""
+
+
+class ConfigError(PlabError, ValueError):
+    """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
+
+
+def pick(name: str, names: Sequence[str]) -> str:
+    """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
+    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
+    guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
+    return f"{guess}choose from: {', '.join(names)}"
+
+
+def out_of_memory(error: MemoryError) -> str:
+    """Return one line about memory that is lacking; Python's own error says nothing."""
+    return str(error) or "this computer has too little memory for that: close something, or ask for less"
+
+
+def traceback_wanted() -> bool:
+    """Whether bugs are to be shown with their tracebacks."""
+    return bool(os.environ.get(TRACEBACK))

@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from plab.config_errors import ConfigError
+    from plab.errors import ConfigError
 
 __all__ = ["load_object", "passed_on", "search_in"]
 
@@ -95,6 +95,6 @@ def _module(text: str, name: str) -> ModuleType:
 
 def _error(message: str) -> ConfigError:
     # Imported here: with it comes Hydra, which readers of results do without.
-    from plab.config_errors import ConfigError
+    from plab.errors import ConfigError
 
     return ConfigError(message)

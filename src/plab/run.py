@@ -23,17 +23,17 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from plab.checks import check_device, check_packages, check_sources
 from plab.cli_help import full_help_text, help_text
 from plab.command import EXIT_INTERRUPTED, EXIT_USER_ERROR, command_line, complain
 from plab.config import ConfigError, check_overrides, conf_folder, finish
-from plab.config_errors import COMPOSE_ERRORS, explain, pick
-from plab.errors import PlabError
+from plab.config.checks import check_device, check_packages, check_sources
+from plab.config.errors import COMPOSE_ERRORS, explain
+from plab.config.words import quote_folders, shortened, unusable
+from plab.errors import PlabError, pick
 from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
 from plab.targets import TargetError
-from plab.words import quote_folders, shortened, unusable
 
 __all__ = ["main"]
 

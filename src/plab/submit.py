@@ -17,14 +17,14 @@ from pathlib import Path
 
 from plab.arguments import seed, sources_and_words, to_write
 from plab.command import command_line, complain
+from plab.config.selection import select
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.examples import resolve
-from plab.selection import select
 from plab.submissions.card import CARD_BYTES, Card, CardError, parse_card
 from plab.submissions.collecting import from_policies, from_sources
 from plab.submissions.files import inconsistency, write
 from plab.submissions.members import SubmissionError
 from plab.submissions.schema import SUFFIX, UNSEEN, Submission
-from plab.suite import SUITE_VARIANTS, suite_tasks
 
 __all__ = ["main"]
 

@@ -30,7 +30,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import folder, positive
+from plab.arguments import folder, positive, task_list
 from plab.bench.common_scene import (
     ANY_SCENE,
     common_actions,
@@ -47,7 +47,6 @@ from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, DEVICES, Simulator
-from plab.suite import task_list
 
 __all__ = ["Setting", "attempts_at", "lattice", "main"]
 

@@ -27,16 +27,16 @@ from typing import cast
 import numpy as np
 import taichi as ti
 
-from plab.arguments import positive, to_write
+from plab.arguments import positive, task_list, to_write
 from plab.bench.common_scene import ANY_SCENE, grid_terms
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
 from plab.command import command_line
+from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
 from plab.sim import Simulator, particle_phases
 from plab.sim.spectral import SINGULAR_VALUE_MIN, mapped_values, svd_signed
-from plab.suite import suite_tasks, task_list
 
 __all__ = ["CHOICES", "main", "rows"]
 

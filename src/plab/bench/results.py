@@ -29,6 +29,8 @@ from plab.arguments import positive, to_write
 from plab.bench.table import report
 from plab.command import command_line
 from plab.config import load_config
+from plab.config.selection import Selection
+from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
@@ -37,9 +39,7 @@ from plab.report.collect import collect
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
 from plab.results.query import query, scores
 from plab.results.schema import COLUMNS, loss_columns
-from plab.selection import Selection
 from plab.status import survey
-from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 
 __all__ = ["SETTLE", "main", "synthetic_run", "template", "write_runs"]
 

@@ -32,8 +32,7 @@ from stable_baselines3.common.logger import Logger
 from plab.arguments import positive, to_write
 from plab.bench.table import report
 from plab.command import command_line
-from plab.config import Config, PpoConfig, load_config
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES
 from plab.runners.common import torch_settings

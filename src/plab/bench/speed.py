@@ -19,7 +19,7 @@ import gc
 import sys
 from collections.abc import Iterator, Sequence
 
-from plab.arguments import positive, to_write
+from plab.arguments import positive, task_list, to_write
 from plab.bench import paper, scaling, skips
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
@@ -39,7 +39,7 @@ from plab.bench.workload import (
 )
 from plab.command import command_line
 from plab.config import Config, load_config
-from plab.suite import suite_tasks, task_list
+from plab.config.suite import suite_tasks
 
 __all__ = ["COLUMNS", "main", "rows"]
 

@@ -31,10 +31,10 @@ from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
 from plab.command import command_line
 from plab.config import ConfigError
+from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
-from plab.suite import suite_tasks
 
 __all__ = ["main", "run_cases", "run_refusals", "write_norms"]
 

@@ -22,18 +22,17 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from plab.arguments import positive, rates, refuse_task, seed, to_write
-from plab.checks import check_sources
+from plab.arguments import positive, rates, refuse_task, seed, task_list, to_write
 from plab.command import command_line
-from plab.config import Config, ConfigError, build_scene, load_config
-from plab.config_types import TrajectoryConfig
+from plab.config import Config, ConfigError, TrajectoryConfig, build_scene, load_config
+from plab.config.checks import check_sources
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.words import IDLE, require_effect
 from plab.demonstrations import action_names, known_actions, recorded_scores, save_actions
 from plab.demonstrations.search import search
 from plab.objective import Scores
 from plab.problem import Problem
-from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
 from plab.targets import EPISODE_STEPS
-from plab.words import IDLE, require_effect
 
 HEADING = """\
 # Demonstrations

@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 from plab.arguments import folder
 from plab.command import command_line
 from plab.config import choices, load_config
+from plab.config.words import require_effect
 from plab.render.choice import WITHOUT_EFFECT, make_parser, require_writable, rollout, settle
 from plab.render.graphics import RenderError, require_graphics
-from plab.words import require_effect
 
 __all__ = ["main"]
 

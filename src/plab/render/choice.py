@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 
 from plab.arguments import positive, sources_and_words, to_write
-from plab.checks import check_sources
 from plab.config import load_config
+from plab.config.checks import check_sources
+from plab.config.selection import one_protocol, select
+from plab.config.words import IDLE, require_effect
 from plab.examples import EXAMPLES, resolve
 from plab.render.graphics import RenderError
-from plab.selection import one_protocol, select
-from plab.words import IDLE, require_effect
 
 if TYPE_CHECKING:
-    from plab.config_types import Config
+    from plab.config import Config
 
 __all__ = ["WITHOUT_EFFECT", "make_parser", "require_writable", "rollout", "settle"]
 

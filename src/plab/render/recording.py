@@ -14,9 +14,8 @@ import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.checks import cuda_is_usable
-from plab.config import build_scene, load_config
-from plab.config_types import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig
+from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
+from plab.config.checks import cuda_is_usable
 from plab.objective import scores_from_iou, soft_iou
 from plab.problem import Problem, build_scenes, build_simulator
 from plab.render.graphics import RenderError

@@ -23,6 +23,7 @@ import pandas as pd
 import plab
 from plab.arguments import folder, sources_and_words
 from plab.command import command_line
+from plab.config.selection import select
 from plab.examples import EXAMPLES, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
@@ -39,7 +40,6 @@ from plab.report.table import Table, write_index, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.results import ResultsError
-from plab.selection import select
 
 if TYPE_CHECKING:
     from plab.report.figures import Drawing

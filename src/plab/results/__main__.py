@@ -20,14 +20,13 @@ from typing import Any
 
 from plab.arguments import folder, positive, sources_and_words
 from plab.command import command_line
+from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.examples import EXAMPLES, resolve
-from plab.possible import require_possible
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.loading import readable_rows
 from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError
-from plab.selection import Selection, SelectionError, select
 
 __all__ = ["main"]
 

@@ -16,8 +16,8 @@ from typing import Any
 
 from plab.arguments import sources_and_words
 from plab.command import command_line
+from plab.config.selection import select
 from plab.examples import EXAMPLES, resolve
-from plab.selection import select
 from plab.status.survey import NAMES, STATES, Survey, survey
 
 __all__ = ["main"]

@@ -20,16 +20,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from plab.arguments import refuse_task, to_write
+from plab.arguments import refuse_task, task_list, to_write
 from plab.cache import cache_dir
-from plab.checks import check_sources
 from plab.command import command_line
 from plab.config import build_scene, load_config
+from plab.config.checks import check_sources
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.words import IDLE, require_effect
 from plab.objective import target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator
-from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
-from plab.words import IDLE, require_effect
 
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian that hides where single particles were drawn [domain units]."""
