@@ -79,7 +79,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 @pytest.fixture
 def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
     """Call a command line that has to refuse, see that it leaves the folder alone, return what it says."""
-    from plab.run import main
+    from plab.cli.run import main
 
     def call(
         argv: Sequence[str],

@@ -12,9 +12,9 @@ import pytest
 from scipy import stats
 
 import synthetic
+from plab.cli.report import main
 from plab.config.selection import select
 from plab.config.suite import PAPER_METHODS
-from plab.report.__main__ import main
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
 from plab.report.budgets import at_budgets, score_at_budget, scores_at
 from plab.report.collect import NAMES, collect, collect_ablation

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
+from plab.cli import results
 from plab.config import (
     GROUPS,
     Config,
@@ -27,7 +28,6 @@ from plab.config import (
     choices,
     load_config,
 )
-from plab.results import __main__ as results
 from plab.results import read, write
 from plab.scene import SceneError
 from plab.targets import TargetError

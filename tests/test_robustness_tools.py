@@ -14,21 +14,13 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab import run
 from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
-from plab.command import command_line
-from plab.demonstrations import __main__ as demonstrations
-from plab.export import __main__ as export
-from plab.render import __main__ as render
+from plab.cli import demonstrations, export, render, report, results, run, status, targets, view
+from plab.cli.command import command_line
 from plab.render import graphics
-from plab.report import __main__ as report
 from plab.results import ResultsError
-from plab.results import __main__ as results
 from plab.sim import Simulator
-from plab.status import __main__ as status
-from plab.targets import __main__ as targets
-from plab.view import __main__ as view
 from refusals import refusal
 from rights import ordinary_rights
 

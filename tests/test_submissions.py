@@ -20,8 +20,8 @@ import yaml
 import plab
 import synthetic
 from browsing import browsing, press
-from plab import leaderboard, submit, verify
 from plab.bench.results import synthetic_run, template
+from plab.cli import leaderboard, submit, verify
 from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table

@@ -30,7 +30,6 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import folder, positive, task_list
 from plab.bench.common_scene import (
     ANY_SCENE,
     common_actions,
@@ -41,7 +40,8 @@ from plab.bench.common_scene import (
 )
 from plab.bench.precision import angle
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import folder, positive, task_list
+from plab.cli.command import command_line
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf

@@ -22,10 +22,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import plab
-from plab.arguments import positive, to_write
 from plab.bench.results import SETTLE, write_runs
 from plab.bench.table import progress, report
-from plab.command import command_line
+from plab.cli.arguments import positive, to_write
+from plab.cli.command import command_line
 
 __all__ = ["COLUMNS", "THINGS", "main", "measure"]
 

@@ -19,10 +19,10 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, task_list, to_write
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, grid_terms, own_components
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import positive, task_list, to_write
+from plab.cli.command import command_line
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions

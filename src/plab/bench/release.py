@@ -27,11 +27,11 @@ from typing import cast
 import numpy as np
 import taichi as ti
 
-from plab.arguments import positive, task_list, to_write
 from plab.bench.common_scene import ANY_SCENE, grid_terms
 from plab.bench.precision import Start, angle, spread, starts
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import positive, task_list, to_write
+from plab.cli.command import command_line
 from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles

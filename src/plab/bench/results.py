@@ -25,17 +25,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, to_write
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import positive, to_write
+from plab.cli.command import command_line
 from plab.config import load_config
 from plab.config.selection import Selection
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
-from plab.report.__main__ import write_tables
 from plab.report.collect import collect
+from plab.report.writing import write_tables
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
 from plab.results.query import query, scores
 from plab.results.schema import COLUMNS, loss_columns

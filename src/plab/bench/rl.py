@@ -29,9 +29,9 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
-from plab.arguments import positive, to_write
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import positive, to_write
+from plab.cli.command import command_line
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES

@@ -19,7 +19,6 @@ import gc
 import sys
 from collections.abc import Iterator, Sequence
 
-from plab.arguments import positive, task_list, to_write
 from plab.bench import paper, scaling, skips
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
@@ -37,7 +36,8 @@ from plab.bench.workload import (
     restart_peak_rss,
     time_calls,
 )
-from plab.command import command_line
+from plab.cli.arguments import positive, task_list, to_write
+from plab.cli.command import command_line
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
 

@@ -25,11 +25,11 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, to_write
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import positive, to_write
+from plab.cli.command import command_line
 from plab.config import ConfigError
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms

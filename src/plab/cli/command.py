@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar, cast
 
-from plab.arguments import told
+from plab.cli.arguments import told
 from plab.errors import TRACEBACK, PlabError, out_of_memory, traceback_wanted
 
 __all__ = [

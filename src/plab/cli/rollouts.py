@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from plab.arguments import positive, sources_and_words, to_write
+from plab.cli.arguments import positive, sources_and_words, to_write
 from plab.config import load_config
 from plab.config.checks import check_sources
 from plab.config.selection import one_protocol, select

@@ -1,0 +1,266 @@
+"""The command line of result files.
+
+python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
+python -m plab.results sql "select ..." [results]             any question to the tables of docs/results.md
+python -m plab.results check [results ...]                    check every file against the schema
+python -m plab.results pack results --output runs.plab.zip.xz    put finished runs into one small file
+python -m plab.results unpack runs.plab.zip.xz --output folder   make files of them again
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from plab.cli.arguments import folder, positive, sources_and_words
+from plab.cli.command import command_line
+from plab.config.selection import Selection, SelectionError, require_possible, select
+from plab.examples import EXAMPLES, resolve
+from plab.results.archive import pack, unpack
+from plab.results.checking import check
+from plab.results.loading import readable_rows
+from plab.results.query import query, scores
+from plab.results.schema import STATUSES, ResultsError
+
+__all__ = ["main"]
+
+SELECTABLE = ("task", "variant", "method", "seed", "status")
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns:
+        Exit code: 0, 1 if ``check`` found something wrong, 2 for a mistake of the user's.
+    """
+    options = _parse(argv)
+    return options.run(options)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="plab.results",
+        description=__doc__.splitlines()[0],
+        epilog=__doc__.partition("\n\n")[2],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = {
+        "scores": _scores_parser,
+        "sql": _sql_parser,
+        "check": _check_parser,
+        "pack": _pack_parser,
+        "unpack": _unpack_parser,
+    }
+    parser.add_argument("command", choices=commands, help="what to do; it has a --help of its own")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER)
+    first = parser.parse_args(argv)
+    command = commands[first.command](argparse.ArgumentParser(prog=f"plab.results {first.command}"))
+    # Not by subparsers: they cannot have words on both sides of an option.
+    return command.parse_intermixed_args(first.arguments)
+
+
+def _scores_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.description = "Print runs with their scores, a line each."
+    what = f"{_SOURCES} (default: results), and runs: task=Rope,Move seed=0,1,2; by default those finished"
+    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
+    what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
+    parser.add_argument("--keys", type=_names, default=[], help=what)
+    parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
+    parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
+    parser.set_defaults(run=_scores)
+    return _with_forms(parser)
+
+
+def _sql_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.description = (
+        "Answer an SQL query about the tables runs, config, evaluations, times and iterations."
+    )
+    parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
+    parser.add_argument(
+        "source", nargs="?", type=_source, default=Path("results"), help=f"{_SOURCES} (default: results)"
+    )
+    parser.set_defaults(run=_sql)
+    return _with_forms(parser)
+
+
+def _with_forms(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--csv", action="store_true", help="print CSV instead of a text")
+    form.add_argument("--json", action="store_true", help="print a JSON list of objects instead of a text")
+    return parser
+
+
+def _source(text: str) -> Path:
+    return resolve(folder(text))
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+_SOURCES = f"folder, file, archive, or one of {', '.join(EXAMPLES)}"
+
+
+def _check_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.description = "Check every file against the schema; exit code 1 if anything is wrong."
+    parser.add_argument(
+        "sources", nargs="*", type=_source, default=[Path("results")], help=f"each a {_SOURCES}"
+    )
+    parser.set_defaults(run=_check)
+    return parser
+
+
+def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.description = "Put runs into one small file."
+    parser.add_argument("source", type=_source, help=_SOURCES)
+    what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
+    parser.add_argument("words", nargs="*", help=what)
+    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
+    parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
+    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
+    parser.add_argument("--digits", type=positive, help=what)
+    parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
+    parser.set_defaults(run=_pack)
+    return parser
+
+
+def _unpack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    parser.description = "Make files of the runs of an archive; files that are there stay."
+    parser.add_argument("archive", type=_source, help="archive to read")
+    parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
+    parser.set_defaults(run=_unpack)
+    return parser
+
+
+def _scores(options: argparse.Namespace) -> int:
+    sources, words = sources_and_words(options.arguments)
+    chosen = _finished_unless_said(select(words, SELECTABLE))
+    table, unreadable = scores(
+        list(map(resolve, sources or ["results"])),
+        chosen,
+        options.keys,
+        options.sort,
+        descending=options.descending,
+    )
+    _tell_left_out(unreadable)
+    _print(list(table.columns), table.astype(object).itertuples(index=False, name=None), options)
+    return 0
+
+
+def _sql(options: argparse.Namespace) -> int:
+    columns, rows, unreadable = query(options.source, options.query)
+    _tell_left_out(unreadable)
+    _print(columns, rows, options)
+    return 0
+
+
+def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
+    for error in unreadable:
+        print(f"plab: left out: {error}", file=sys.stderr)
+
+
+def _print(columns: Sequence[str], rows: Iterable[Sequence[Any]], options: argparse.Namespace) -> None:
+    """Print a table in the form that is asked for; what there is no value of is empty, in JSON null."""
+    cells = [[None if value is None or value != value else value for value in row] for row in rows]
+    if options.json:
+        # JSON has no infinite numbers.
+        shown = [[value if _finite(value) else str(value) for value in row] for row in cells]
+        print(json.dumps([dict(zip(columns, row, strict=True)) for row in shown], indent=1))
+    elif options.csv:
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerows([columns, *cells])
+    else:
+        _print_aligned(columns, cells)
+
+
+def _finite(value: Any) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _check(options: argparse.Namespace) -> int:
+    count = wrong = 0
+    for source in options.sources:
+        for _, problem in check(source):
+            count += 1
+            if problem is not None:
+                wrong += 1
+                print(f"{problem.path}: {problem.reason}: {problem.advice}", flush=True)
+    print(
+        f"{count} run(s) checked, {wrong} with something wrong"
+        if wrong
+        else f"{count} run(s) checked, all well"
+    )
+    return 1 if wrong else 0
+
+
+def _pack(options: argparse.Namespace) -> int:
+    chosen = select(options.words, SELECTABLE)
+    _require_statuses(chosen.choices.get("status", ()))
+    if options.words:
+        others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
+        require_possible(Selection(others, chosen.keys), readable_rows(options.source)[0])
+    chosen = _finished_unless_said(chosen)
+    done = pack(
+        options.source,
+        options.output,
+        wanted=lambda row: chosen(row.values, row.config),
+        keep_masses=options.masses,
+        keep_resume=options.resume,
+        digits=options.digits,
+    )
+    _tell_left_out(done.unreadable)
+    size = f"{done.archive_bytes / 1e3:.1f} kB, {done.archive_bytes / done.runs / 1e3:.1f} kB per run"
+    before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
+    print(f"{options.output}: {done.runs} run(s), {size}{before}")
+    return 0
+
+
+def _require_statuses(texts: Sequence[str]) -> None:
+    for text in texts:
+        if text not in (*STATUSES, "all"):
+            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
+
+
+def _finished_unless_said(chosen: Selection) -> Selection:
+    """Take finished runs unless the words say something about the status."""
+    statuses = chosen.choices.setdefault("status", ["finished"])
+    if statuses == ["all"]:
+        del chosen.choices["status"]
+    return chosen
+
+
+def _unpack(options: argparse.Namespace) -> int:
+    written, kept = unpack(options.archive, options.output)
+    there = f", {kept} there already" if kept else ""
+    print(f"{options.output}: {written} run(s) written{there}")
+    return 0
+
+
+def _print_aligned(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print a table as text, numbers to the right."""
+    texts = [list(columns), *([_text(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    numeric = [
+        all(isinstance(row[k], int | float | None) for row in rows) and bool(rows)
+        for k in range(len(columns))
+    ]
+    for line in texts:
+        cells = (
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(line, widths, numeric, strict=True)
+        )
+        print("  ".join(cells).rstrip())
+
+
+def _text(value: Any) -> str:
+    """Write a value for readers: numbers with six digits."""
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else " ".join(str(value).split())
