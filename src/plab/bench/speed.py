@@ -36,7 +36,7 @@ from plab.bench.workload import (
     restart_peak_rss,
     time_calls,
 )
-from plab.cli.arguments import positive, task_list, to_write
+from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
@@ -164,11 +164,7 @@ def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m plab.bench.speed",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.bench.speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
     parser.add_argument("--device", help="the same as sim.device=...")

@@ -28,7 +28,7 @@ import pandas as pd
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.bench.table import report
-from plab.cli.arguments import positive, to_write
+from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
 from plab.config import ConfigError
 from plab.config.suite import suite_tasks
@@ -199,7 +199,7 @@ def _speeds(simulator: Simulator, cases: Sequence[Case]) -> np.ndarray:
 @command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.stability", description=__doc__.splitlines()[0])
+    parser = Parser("plab.bench.stability", __doc__)
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
     parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
@@ -209,10 +209,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "file for the gradient's norm per step back in time"
     parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     cases = _cases(options)
     rows = (row for precision in options.precision for row in run_cases(cases, precision))
     table = list(report(COLUMNS, _chain(rows, options), options.csv))

@@ -1,17 +1,20 @@
-"""Arguments of command lines: numbers, words and files that are checked before anything is computed."""
+"""Arguments of command lines: a parser; numbers, words and files, checked before anything is computed."""
 
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from plab.config.suite import suite_tasks
-from plab.errors import ArgumentError
+from plab.errors import ArgumentError, pick
 
 __all__ = [
+    "Parser",
     "folder",
+    "name_flag",
     "positive",
     "rates",
     "refuse_task",
@@ -21,6 +24,32 @@ __all__ = [
     "to_write",
     "told",
 ]
+
+
+class Parser(ArgumentParser):
+    """The parser of a command line: a docstring is its help, a mistake an ArgumentError."""
+
+    def __init__(self, name: str, text: str) -> None:
+        """Make it without arguments.
+
+        Args:
+            name: Of the module that is run.
+            text: Docstring: a paragraph that says what it does, then whatever helps, such as examples.
+        """
+        what, _, more = text.partition("\n\n")
+        formed = RawDescriptionHelpFormatter
+        super().__init__(f"python -m {name}", description=what, epilog=more, formatter_class=formed)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong with the arguments, in one line; the usage is what ``--help`` is for."""
+        raise ArgumentError(name_flag(self, message))
+
+
+def name_flag(parser: ArgumentParser, message: str) -> str:
+    """Return a parser's message with the flags that there are, where it is about one that there is not."""
+    unknown = message.partition("unrecognized arguments: ")[2]
+    flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
+    return f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown.startswith("-") else message
 
 
 def positive(text: str) -> int:

@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar, cast
 
 from plab.cli.arguments import told
 from plab.errors import TRACEBACK, PlabError, out_of_memory, traceback_wanted
@@ -30,15 +29,13 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 """What a shell says of a program that a closed pipe has ended."""
 
-Main = TypeVar("Main", bound=Callable[..., int])
 
-
-def command_line(main: Main) -> Main:
+def command_line(main: Callable[[Sequence[str] | None], int | None]) -> Callable[..., int]:
     """Let a command line answer what goes wrong in one line.
 
     Args:
         main: Takes the arguments after the program's name, those of the process if None; returns the exit
-            code.
+            code, None for 0.
 
     Returns:
         The same; where it raises, it says in one line what, and returns 2 for what the user can put right,
@@ -69,7 +66,7 @@ def command_line(main: Main) -> Main:
                 raise
             return complain(_bug(error), EXIT_BUG)
 
-    return cast(Main, answered)
+    return answered
 
 
 def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
@@ -79,9 +76,9 @@ def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
     return code
 
 
-def _exit_code(main: Callable[..., int], argv: Sequence[str] | None) -> int:
+def _exit_code(main: Callable[[Sequence[str] | None], int | None], argv: Sequence[str] | None) -> int:
     try:
-        return main(argv)
+        return main(argv) or 0
     except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):
             # Rich's answer to a closed pipe.

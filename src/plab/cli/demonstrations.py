@@ -1,4 +1,4 @@
-"""The command line of demonstrations.
+"""Replay, record or search for demonstrations.
 
 python -m plab.demonstrations                          replay all and print a table
 python -m plab.demonstrations --task Torus,Rope        only these
@@ -21,7 +21,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from plab.cli.arguments import positive, rates, refuse_task, seed, task_list, to_write
+from plab.cli.arguments import Parser, positive, rates, refuse_task, seed, task_list, to_write
 from plab.cli.command import command_line
 from plab.config import Config, ConfigError, TrajectoryConfig, build_scene, load_config
 from plab.config.checks import check_sources
@@ -69,13 +69,9 @@ class Replay:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     args = _parse(argv)
-    return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
     rows = []
     tasks = [
         [load_config([f"task={task}", f"variant={variant}", *args.overrides]) for variant in SUITE_VARIANTS]
@@ -95,7 +91,6 @@ def _run(args: argparse.Namespace) -> int:
             _record(replays)
         rows += [_row(item) for item in replays]
     _show(pd.DataFrame(rows), args.markdown)
-    return 0
 
 
 def replay(cfgs: Sequence[Config]) -> list[Replay]:
@@ -190,9 +185,7 @@ def _show(table: pd.DataFrame, markdown: Path | None) -> None:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m plab.demonstrations", description="Replay, record or search for demonstrations."
-    )
+    parser = Parser("plab.demonstrations", __doc__)
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")

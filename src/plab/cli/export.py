@@ -1,4 +1,17 @@
-"""The command line of exports: ``python -m plab.export RESULT_FILE --format vtk`` writes for ParaView."""
+"""The rollout of a run's best actions, or of the best actions known for a task, for ParaView or Blender.
+
+python -m plab.export RESULT_FILE [--format vtk|ply] [--output FOLDER]
+python -m plab.export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
+
+What is written into the folder:
+  vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
+  ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
+Both hold the target's surface, too.
+
+EXAMPLES
+  python -m plab.export results/Rope-v1/adam/seed0-12ab34cd.h5
+  python -m plab.export task=Torus variant=2 --format ply --output torus
+"""
 
 from __future__ import annotations
 
@@ -13,36 +26,11 @@ from plab.render.graphics import RenderError, require_packages
 
 __all__ = ["main"]
 
-_USAGE = """\
-python -m plab.export RESULT_FILE [--format vtk|ply] [--output FOLDER]
-python -m plab.export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
-
-Writes the rollout of a run's best actions, or of the best actions known for a task, into a folder:
-  vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
-  ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
-Both hold the target's surface, too.
-
-EXAMPLES
-  python -m plab.export results/Rope-v1/adam/seed0-12ab34cd.h5
-  python -m plab.export task=Torus variant=2 --format ply --output torus
-"""
-
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments after the program's name; those of the process by default.
-
-    Returns:
-        Exit code: 0.
-    """
-    _run(_parse(argv))
-    return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    arguments = _parse(argv)
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
     # Imported here: it loads the simulator, for which no mistake above should have to wait.
     from plab.export.files import write_ply, write_vtk
@@ -60,7 +48,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without simulating."""
-    parser = make_parser(_USAGE, "the series")
+    parser = make_parser("plab.export", __doc__, "the series")
     add = parser.add_argument
     add("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
     add("--output", type=folder, metavar="FOLDER", help="by default named like the result or the task")

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import plab
-from plab.cli.arguments import folder
+from plab.cli.arguments import Parser, folder
 from plab.cli.command import command_line
 from plab.submissions.board import board
 from plab.submissions.page import write_leaderboard
@@ -25,8 +25,8 @@ __all__ = ["main"]
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     options = _parse(arguments)
     origin = {
@@ -40,16 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for line in made.left_out:
         print(f"plab: left out: {line}", file=sys.stderr)
     print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
-    return 0
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.leaderboard",
-        description=__doc__.partition("\n\n")[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.leaderboard", __doc__)
     parser.add_argument("folder", type=folder, help="folder of submissions")
     what = "settings of a leaderboard of your own, such as sim.grid_size=32"
     parser.add_argument("overrides", nargs="*", help=what)

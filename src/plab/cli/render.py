@@ -1,23 +1,5 @@
-"""The command line of pictures: ``python -m plab.render task=Torus variant=2 --output torus.gif``."""
+"""Pictures and films of a run's best actions, of the best actions known for a task, or of all tasks.
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
-
-from omegaconf import OmegaConf
-
-from plab.cli.arguments import folder
-from plab.cli.command import command_line
-from plab.cli.rollouts import WITHOUT_EFFECT, make_parser, require_writable, rollout, settle
-from plab.config import choices, load_config
-from plab.config.words import require_effect
-from plab.render.graphics import RenderError, require_graphics
-
-__all__ = ["main"]
-
-_USAGE = """\
 python -m plab.render RESULT_FILE [--output FILE]
 python -m plab.render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
 python -m plab.render KEY=VALUE ... [--output FILE]
@@ -38,6 +20,23 @@ EXAMPLES
   python -m plab.render task=Torus variant=2 --output torus.gif
 """
 
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from plab.cli.arguments import folder
+from plab.cli.command import command_line
+from plab.cli.rollouts import WITHOUT_EFFECT, make_parser, require_writable, rollout, settle
+from plab.config import choices, load_config
+from plab.config.words import require_effect
+from plab.render.graphics import RenderError, require_graphics
+
+__all__ = ["main"]
+
 _FRAME = (480, 360)
 _CELL = (360, 150)
 _STRIP_FRAME = (240, 180)
@@ -47,20 +46,9 @@ _LARGEST = 4096
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments after the program's name; those of the process by default.
-
-    Returns:
-        Exit code: 0.
-    """
-    _run(_parse(argv))
-    return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    arguments = _parse(argv)
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
     from plab.render.pictures import check_output
@@ -153,7 +141,7 @@ def _check_sheet(arguments: argparse.Namespace, option: str, path: Path, suffix:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser(_USAGE, "a film")
+    parser = make_parser("plab.render", __doc__, "a film")
     add = parser.add_argument
     add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from plab.cli.arguments import folder, sources_and_words
+from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.examples import EXAMPLES, resolve
@@ -46,8 +46,8 @@ _QUIET = 2
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     options = _parse(arguments)
     command = shlex.join(["python", "-m", "plab.report", *arguments])
@@ -62,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _tell(runs, made, out)
             before = now
         if not options.follow or quiet == _QUIET:
-            return 0
+            return
         time.sleep(_PAUSE)
 
 
@@ -125,12 +125,7 @@ def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.report",
-        description=__doc__.partition("\n\n")[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.report", __doc__)
     parser.add_argument("what", choices=list(_MAKERS), help="what to make")
     parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
     what = f"folder of results, archive, or several; {', '.join(EXAMPLES)}: real runs (default: results)"

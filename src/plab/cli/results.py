@@ -1,4 +1,4 @@
-"""The command line of result files.
+"""Show, query, check, pack and unpack result files.
 
 python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
 python -m plab.results sql "select ..." [results]             any question to the tables of docs/results.md
@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from plab.cli.arguments import folder, positive, sources_and_words
+from plab.cli.arguments import Parser, folder, positive, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.examples import EXAMPLES, resolve
@@ -45,29 +45,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.results",
-        description=__doc__.splitlines()[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.results", __doc__)
     commands = {
-        "scores": _scores_parser,
-        "sql": _sql_parser,
-        "check": _check_parser,
-        "pack": _pack_parser,
-        "unpack": _unpack_parser,
+        "scores": _scores_arguments,
+        "sql": _sql_arguments,
+        "check": _check_arguments,
+        "pack": _pack_arguments,
+        "unpack": _unpack_arguments,
     }
     parser.add_argument("command", choices=commands, help="what to do; it has a --help of its own")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
-    command = commands[first.command](argparse.ArgumentParser(prog=f"plab.results {first.command}"))
+    arguments = commands[first.command]
     # Not by subparsers: they cannot have words on both sides of an option.
+    command = Parser(f"plab.results {first.command}", arguments.__doc__ or "")
+    arguments(command)
     return command.parse_intermixed_args(first.arguments)
 
 
-def _scores_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.description = "Print runs with their scores, a line each."
+def _scores_arguments(parser: Parser) -> None:
+    """Print runs with their scores, a line each."""
     what = f"{_SOURCES} (default: results), and runs: task=Rope,Move seed=0,1,2; by default those finished"
     parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
     what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
@@ -75,26 +72,23 @@ def _scores_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
     parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
     parser.set_defaults(run=_scores)
-    return _with_forms(parser)
+    _add_forms(parser)
 
 
-def _sql_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.description = (
-        "Answer an SQL query about the tables runs, config, evaluations, times and iterations."
-    )
+def _sql_arguments(parser: Parser) -> None:
+    """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
     parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
     parser.add_argument(
         "source", nargs="?", type=_source, default=Path("results"), help=f"{_SOURCES} (default: results)"
     )
     parser.set_defaults(run=_sql)
-    return _with_forms(parser)
+    _add_forms(parser)
 
 
-def _with_forms(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+def _add_forms(parser: Parser) -> None:
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--csv", action="store_true", help="print CSV instead of a text")
     form.add_argument("--json", action="store_true", help="print a JSON list of objects instead of a text")
-    return parser
 
 
 def _source(text: str) -> Path:
@@ -108,17 +102,16 @@ def _names(text: str) -> list[str]:
 _SOURCES = f"folder, file, archive, or one of {', '.join(EXAMPLES)}"
 
 
-def _check_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.description = "Check every file against the schema; exit code 1 if anything is wrong."
+def _check_arguments(parser: Parser) -> None:
+    """Check every file against the schema; exit code 1 if anything is wrong."""
     parser.add_argument(
         "sources", nargs="*", type=_source, default=[Path("results")], help=f"each a {_SOURCES}"
     )
     parser.set_defaults(run=_check)
-    return parser
 
 
-def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.description = "Put runs into one small file."
+def _pack_arguments(parser: Parser) -> None:
+    """Put runs into one small file."""
     parser.add_argument("source", type=_source, help=_SOURCES)
     what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
     parser.add_argument("words", nargs="*", help=what)
@@ -128,15 +121,13 @@ def _pack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
     parser.add_argument("--digits", type=positive, help=what)
     parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
     parser.set_defaults(run=_pack)
-    return parser
 
 
-def _unpack_parser(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    parser.description = "Make files of the runs of an archive; files that are there stay."
+def _unpack_arguments(parser: Parser) -> None:
+    """Make files of the runs of an archive; files that are there stay."""
     parser.add_argument("archive", type=_source, help="archive to read")
     parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
     parser.set_defaults(run=_unpack)
-    return parser
 
 
 def _scores(options: argparse.Namespace) -> int:

@@ -23,13 +23,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
+from plab.cli.arguments import name_flag
 from plab.cli.command import EXIT_INTERRUPTED, EXIT_USER_ERROR, command_line, complain
 from plab.cli.help import full_help_text, help_text
 from plab.config import ConfigError, check_overrides, conf_folder, finish
 from plab.config.checks import check_device, check_packages, check_sources
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.words import quote_folders, shortened, unusable
-from plab.errors import PlabError, pick
+from plab.errors import PlabError
 from plab.reuse import SimulatorCache
 from plab.scene import SceneError
 from plab.tally import Refusal, Tally
@@ -164,11 +165,9 @@ def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
     """
     parser = get_args_parser()
     parser.add_argument("--help-all", action="store_true")
-    flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
 
     def refuse(message: str) -> NoReturn:
-        unknown = message.partition("unrecognized arguments: ")[2]
-        raise ConfigError(f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown else message)
+        raise ConfigError(name_flag(parser, message))
 
     parser.error = refuse  # type: ignore[method-assign]
     arguments = parser.parse_intermixed_args(argv)

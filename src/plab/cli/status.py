@@ -1,4 +1,4 @@
-"""What is done, running, failed and missing: ``python -m plab.status [results] [task=... seed=...]``.
+"""Show what is done, running, failed and missing.
 
 The runs that the results have. Words choose among them as those of a sweep do, and ask for all combinations
 of what they name, so that those which are not there are missing; --missing asks for the whole suite.
@@ -6,7 +6,6 @@ of what they name, so that those which are not there are missing; --missing asks
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import sys
@@ -14,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from plab.cli.arguments import sources_and_words
+from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.examples import EXAMPLES, resolve
@@ -37,9 +36,9 @@ def _csv(found: Survey) -> None:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.status", description=__doc__.partition("\n\n")[2])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = Parser("plab.status", __doc__)
     where = f"folders of results, archives, or of {', '.join(EXAMPLES)} (default: results)"
     what = f"{where}, and runs: task=Rope,Move variant=1 seed=0,1,2"
     parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
@@ -68,4 +67,3 @@ def main(argv: Sequence[str] | None = None) -> int:
             watch(look)
         else:
             show(look())
-    return 0

@@ -14,7 +14,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from plab.cli.arguments import seed, sources_and_words, to_write
+from plab.cli.arguments import Parser, seed, sources_and_words, to_write
 from plab.cli.command import command_line, complain
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -70,12 +70,7 @@ def _card(path: Path) -> Card:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.submit",
-        description=__doc__.partition("\n\n")[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.submit", __doc__)
     what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
     parser.add_argument("arguments", nargs="*", help=what)
     parser.add_argument("--card", type=Path, required=True, help="YAML file about the method")

@@ -1,4 +1,4 @@
-"""The command line of targets: build, cache and describe those of the suite.
+"""Build, cache and describe the targets of the suite.
 
 python -m plab.targets                       all fifty
 python -m plab.targets --task Torus,Rope     only these
@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from plab.cache import cache_dir
-from plab.cli.arguments import refuse_task, task_list, to_write
+from plab.cli.arguments import Parser, refuse_task, task_list, to_write
 from plab.cli.command import command_line
 from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
@@ -35,19 +35,14 @@ SMOOTHING = 1 / 32
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
     args = _parse(argv)
-    return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
     table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
     print(table.to_string(index=False, float_format="{:.4g}".format))
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if args.csv is not None:
         _write(table, args.csv)
-    return 0
 
 
 def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:
@@ -113,7 +108,7 @@ def _write(table: pd.DataFrame, path: Path) -> None:
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m plab.targets", description="Build the suite's targets.")
+    parser = Parser("plab.targets", __doc__)
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")

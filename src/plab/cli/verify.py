@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import plab
-from plab.cli.arguments import sources_and_words
+from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line, complain
 from plab.config import PRECISIONS
 from plab.errors import PlabError
@@ -97,12 +97,7 @@ def _show(submission: Submission, verification: Verification, precisions: Sequen
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.verify",
-        description=__doc__.partition("\n\n")[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.verify", __doc__)
     what = (
         f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda or targets.source=..."
     )
