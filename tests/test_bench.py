@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from plab.bench import everyday, opcount, paper, skips, speed, workload
-from plab.bench.table import report
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
+from plab.cli.tables import report
 from plab.config import build_scene, load_config
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms

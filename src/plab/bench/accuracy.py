@@ -38,9 +38,9 @@ from plab.bench.common_scene import (
     own_components,
 )
 from plab.bench.precision import angle
-from plab.bench.table import report
 from plab.cli.arguments import Parser, folder, positive, task_list
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf

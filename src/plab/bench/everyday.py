@@ -22,9 +22,9 @@ from pathlib import Path
 
 import plab
 from plab.bench.results import SETTLE, write_runs
-from plab.bench.table import progress, report
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import progress, report
 
 __all__ = ["COLUMNS", "THINGS", "main", "measure"]
 

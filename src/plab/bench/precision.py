@@ -19,9 +19,9 @@ import numpy as np
 import pandas as pd
 
 from plab.bench.common_scene import ANY_SCENE, common_actions, common_scene, grid_terms, own_components
-from plab.bench.table import report
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions

@@ -28,9 +28,9 @@ import taichi as ti
 
 from plab.bench.common_scene import ANY_SCENE, grid_terms
 from plab.bench.precision import Start, angle, spread, starts
-from plab.bench.table import report
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles

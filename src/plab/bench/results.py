@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.bench.table import report
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import load_config
 from plab.config.selection import Selection
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks

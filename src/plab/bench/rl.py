@@ -28,9 +28,9 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
-from plab.bench.table import report
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES

@@ -22,7 +22,6 @@ from collections.abc import Iterator, Sequence
 from plab.bench import paper, scaling, skips
 from plab.bench.costs import bound, phases
 from plab.bench.roofline import FOOTPRINTS, Limits, measure_limits
-from plab.bench.table import progress, report
 from plab.bench.workload import (
     FORWARD,
     GRADIENT,
@@ -38,6 +37,7 @@ from plab.bench.workload import (
 )
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import progress, report
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
 

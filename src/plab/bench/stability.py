@@ -27,9 +27,9 @@ import pandas as pd
 
 from plab.bench.common_scene import ANY_SCENE
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
-from plab.bench.table import report
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import ConfigError
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms

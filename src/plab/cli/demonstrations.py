@@ -17,12 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
 from plab.cli.arguments import Parser, positive, rates, refuse_task, seed, task_list, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import markdown, print_table
 from plab.config import Config, ConfigError, TrajectoryConfig, build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -90,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if args.record:
             _record(replays)
         rows += [_row(item) for item in replays]
-    _show(pd.DataFrame(rows), args.markdown)
+    _show(rows, args.markdown)
 
 
 def replay(cfgs: Sequence[Config]) -> list[Replay]:
@@ -168,20 +166,13 @@ def _row(item: Replay) -> dict[str, object]:
     }
 
 
-def _show(table: pd.DataFrame, markdown: Path | None) -> None:
+def _show(rows: Sequence[dict[str, object]], path: Path | None) -> None:
     """Print a table, and write it as Markdown if asked to."""
-    printed = Table(title="Reference demonstrations, hard contact model")
-    for name in table.columns:
-        printed.add_column(name)
-    cells = [[f"{v:.3f}" if isinstance(v, float) else str(v) for v in row] for row in table.to_numpy()]
-    for row in cells:
-        printed.add_row(*row)
-    Console().print(printed)
-    if markdown is not None:
-        lines = [list(table.columns), ["---"] * len(table.columns), *cells]
-        table_text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-        markdown.parent.mkdir(parents=True, exist_ok=True)
-        markdown.write_text(HEADING + table_text, encoding="utf-8")
+    shown = [{k: f"{v:.3f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    print_table(list(shown[0]), [list(row.values()) for row in shown])
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(HEADING + markdown(list(shown[0]), shown), encoding="utf-8")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

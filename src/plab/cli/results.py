@@ -10,16 +10,13 @@ python -m plab.results unpack runs.plab.zip.xz --output folder   make files of t
 from __future__ import annotations
 
 import argparse
-import csv
-import json
-import math
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from plab.cli.arguments import Parser, folder, positive, sources_and_words
 from plab.cli.command import command_line
+from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.examples import EXAMPLES, resolve
 from plab.results.archive import pack, unpack
@@ -87,8 +84,10 @@ def _sql_arguments(parser: Parser) -> None:
 
 def _add_forms(parser: Parser) -> None:
     form = parser.add_mutually_exclusive_group()
-    form.add_argument("--csv", action="store_true", help="print CSV instead of a text")
-    form.add_argument("--json", action="store_true", help="print a JSON list of objects instead of a text")
+    for name, what in (("csv", "CSV"), ("json", "a JSON list of objects")):
+        what = f"print {what} instead of a text"
+        form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
+    parser.set_defaults(form="text")
 
 
 def _source(text: str) -> Path:
@@ -141,38 +140,20 @@ def _scores(options: argparse.Namespace) -> int:
         descending=options.descending,
     )
     _tell_left_out(unreadable)
-    _print(list(table.columns), table.astype(object).itertuples(index=False, name=None), options)
+    print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
     return 0
 
 
 def _sql(options: argparse.Namespace) -> int:
     columns, rows, unreadable = query(options.source, options.query)
     _tell_left_out(unreadable)
-    _print(columns, rows, options)
+    print_table(columns, rows, options.form)
     return 0
 
 
 def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
     for error in unreadable:
         print(f"plab: left out: {error}", file=sys.stderr)
-
-
-def _print(columns: Sequence[str], rows: Iterable[Sequence[Any]], options: argparse.Namespace) -> None:
-    """Print a table in the form that is asked for; what there is no value of is empty, in JSON null."""
-    cells = [[None if value is None or value != value else value for value in row] for row in rows]
-    if options.json:
-        # JSON has no infinite numbers.
-        shown = [[value if _finite(value) else str(value) for value in row] for row in cells]
-        print(json.dumps([dict(zip(columns, row, strict=True)) for row in shown], indent=1))
-    elif options.csv:
-        writer = csv.writer(sys.stdout, lineterminator="\n")
-        writer.writerows([columns, *cells])
-    else:
-        _print_aligned(columns, cells)
-
-
-def _finite(value: Any) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -232,26 +213,3 @@ def _unpack(options: argparse.Namespace) -> int:
     there = f", {kept} there already" if kept else ""
     print(f"{options.output}: {written} run(s) written{there}")
     return 0
-
-
-def _print_aligned(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table as text, numbers to the right."""
-    texts = [list(columns), *([_text(value) for value in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
-    numeric = [
-        all(isinstance(row[k], int | float | None) for row in rows) and bool(rows)
-        for k in range(len(columns))
-    ]
-    for line in texts:
-        cells = (
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(line, widths, numeric, strict=True)
-        )
-        print("  ".join(cells).rstrip())
-
-
-def _text(value: Any) -> str:
-    """Write a value for readers: numbers with six digits."""
-    if value is None:
-        return ""
-    return f"{value:.6g}" if isinstance(value, float) else " ".join(str(value).split())

@@ -6,15 +6,14 @@ of what they name, so that those which are not there are missing; --missing asks
 
 from __future__ import annotations
 
-import csv
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line
+from plab.cli.tables import print_table
 from plab.config.selection import select
 from plab.examples import EXAMPLES, resolve
 from plab.status.survey import NAMES, STATES, Survey, survey
@@ -28,11 +27,9 @@ def _json(found: Survey) -> dict[str, Any]:
 
 def _csv(found: Survey) -> None:
     columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
-    writer = csv.DictWriter(sys.stdout, columns, lineterminator="\n")
-    writer.writeheader()
-    for group in found.groups:
-        values = asdict(group)
-        writer.writerow(values.pop("counts") | values)
+    groups = [asdict(group) for group in found.groups]
+    rows = ([(group | group["counts"])[name] for name in columns] for group in groups)
+    print_table(columns, rows, "csv")
 
 
 @command_line

@@ -22,6 +22,7 @@ import pandas as pd
 from plab.cache import cache_dir
 from plab.cli.arguments import Parser, refuse_task, task_list, to_write
 from plab.cli.command import command_line
+from plab.cli.tables import print_table
 from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     args = _parse(argv)
     table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
-    print(table.to_string(index=False, float_format="{:.4g}".format))
+    print_table(list(table.columns), table.itertuples(index=False, name=None), digits=4)
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if args.csv is not None:
         _write(table, args.csv)

@@ -15,12 +15,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 import plab
 from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line, complain
+from plab.cli.tables import print_table
 from plab.config import PRECISIONS
 from plab.errors import PlabError
 from plab.submissions.collecting import submission_files
@@ -83,17 +81,16 @@ def _show(submission: Submission, verification: Verification, precisions: Sequen
     version = f"plab {submission.plab}"
     if submission.plab != plab.__version__:
         version += f", simulated by plab {plab.__version__}"
-    printed = Table(title=f"{name}: {submission.track}, {version}", title_justify="left")
-    for column in ("configuration", "steps", "claimed", *precisions, "difference"):
-        printed.add_column(column, justify="left" if column == "configuration" else "right")
+    print(f"{name}: {submission.track}, {version}")
+    rows = []
     for verdict in verification.verdicts:
         entry, scores = verdict.entry, verdict.scores
         numbers = [f"{scores[p]:.4f}" if p in scores else "" for p in precisions]
         first = scores.get(precisions[0])
         difference = "" if first is None else f"{first - entry.score:+.4f}"
-        row = (entry.configuration.name, f"{entry.steps:,}", f"{entry.score:.4f}", *numbers, difference)
-        printed.add_row(*row)
-    Console().print(printed, markup=False)
+        claim = (entry.configuration.name, f"{entry.steps:,}", f"{entry.score:.4f}")
+        rows.append((*claim, *numbers, difference))
+    print_table(("configuration", "steps", "claimed", *precisions, "difference"), rows)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
