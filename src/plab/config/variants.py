@@ -12,12 +12,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config.errors import explain
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
+from plab.config.words import parse
 from plab.errors import ConfigError, pick
 from plab.scene import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
@@ -99,7 +99,7 @@ def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:
     Returns:
         The key below ``task``, or None.
     """
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    for override in parse(overrides):
         group, _, key = override.key_or_group.partition(".")
         if group == "task" and key and OmegaConf.select(changes, key) is not None:
             return key
