@@ -299,6 +299,24 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("entry", "argv", "flag"),
+    [
+        (run.main, ["--mutlirun"], "multirun"),
+        (status.main, ["--misisng"], "missing"),
+        (results.main, ["scores", "--descendign"], "descending"),
+        (render.main, ["task=Rope", "--film-srtip", "a.jpg"], "film-strip"),
+        (stability.main, ["--qiuck"], "quick"),
+    ],
+)
+def test_an_unknown_flag_is_answered_by_those_that_there_are(capsys, entry, argv, flag):
+    assert entry(argv) == 2
+    line = capsys.readouterr().err
+    wrong = next(word for word in argv if word.startswith("--"))
+    assert line.startswith(f"plab: unknown flag {wrong}")
+    assert f"; did you mean --{flag}? choose from: --help, " in line and line.count("\n") == 1
+
+
 # ------------------------------------------------------------------------------------------------ rights
 
 

@@ -31,6 +31,8 @@ from plab.objective import Scores
 from plab.problem import Problem
 from plab.targets import EPISODE_STEPS
 
+__all__ = ["Replay", "main", "replay"]
+
 HEADING = """\
 # Demonstrations
 

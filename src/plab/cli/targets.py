@@ -31,6 +31,8 @@ from plab.objective import target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator
 
+__all__ = ["main", "moments"]
+
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian that hides where single particles were drawn [domain units]."""
 
