@@ -303,7 +303,7 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
     ("entry", "argv", "flag"),
     [
         (run.main, ["--mutlirun"], "multirun"),
-        (status.main, ["--misisng"], "missing"),
+        (status.main, ["--missing-runs"], "missing"),
         (results.main, ["scores", "--descendign"], "descending"),
         (render.main, ["task=Rope", "--film-srtip", "a.jpg"], "film-strip"),
         (stability.main, ["--qiuck"], "quick"),
