@@ -1,10 +1,12 @@
-"""What all of plab's own exceptions have in common."""
+"""Mistakes: what can be put right by whoever uses plab, and how it is told."""
 
 from __future__ import annotations
 
 import difflib
 import os
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 __all__ = [
     "TRACEBACK",
@@ -13,6 +15,7 @@ __all__ = [
     "PlabError",
     "out_of_memory",
     "pick",
+    "tell",
     "traceback_wanted",
 ]
 
@@ -25,7 +28,7 @@ class PlabError(Exception):
 
 
 class ArgumentError(PlabError, ValueError):
-    """An argument, from Python, that does not fit."""
+    """An argument, from Python or on a command line, that does not fit."""
 
 
 class ConfigError(PlabError, ValueError):
@@ -37,6 +40,12 @@ def pick(name: str, names: Sequence[str]) -> str:
     close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
     guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
     return f"{guess}choose from: {', '.join(names)}"
+
+
+def tell(message: str) -> None:
+    """Print a line on standard error, as every mistake and warning is told."""
+    with suppress(BrokenPipeError):
+        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
 
 
 def out_of_memory(error: MemoryError) -> str:

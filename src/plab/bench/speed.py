@@ -40,6 +40,7 @@ from plab.cli.command import command_line
 from plab.cli.tables import progress, report
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
+from plab.errors import tell
 
 __all__ = ["COLUMNS", "main", "rows"]
 
@@ -221,7 +222,7 @@ def _run(options: argparse.Namespace) -> int:
 def _not_measured(refused: Sequence[str]) -> int:
     """Say what needs more memory than there may be; the exit code."""
     for line in refused:
-        print(f"plab: not measured: {line}", file=sys.stderr)
+        tell(f"not measured: {line}")
     return 1 if refused else 0
 
 
@@ -247,7 +248,7 @@ def _run_skips(options: argparse.Namespace) -> int:
         again = ""
         if table[0]["device"] == "cuda" and table[0]["precision"] == "float32":
             again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
-        print(f"plab: results differ by more than rounding: {', '.join(broken)}{again}", file=sys.stderr)
+        tell(f"results differ by more than rounding: {', '.join(broken)}{again}")
     return 1 if broken else code
 
 

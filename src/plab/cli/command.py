@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from plab.cli.arguments import told
-from plab.errors import TRACEBACK, PlabError, out_of_memory, traceback_wanted
+from plab.errors import TRACEBACK, PlabError, out_of_memory, tell, traceback_wanted
 
 __all__ = [
     "EXIT_BROKEN_PIPE",
@@ -71,8 +71,7 @@ def command_line(main: Callable[[Sequence[str] | None], int | None]) -> Callable
 
 def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
     """Print a line on standard error; return the exit code."""
-    with suppress(BrokenPipeError):
-        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+    tell(message)
     return code
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import plab
 from plab.cli.arguments import Parser, folder
 from plab.cli.command import command_line
+from plab.errors import tell
 from plab.submissions.board import board
 from plab.submissions.page import write_leaderboard
 from plab.targets.store import PHYSICS_VERSION
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     made = board(options.folder, options.overrides)
     path = write_leaderboard(made, options.out, origin)
     for line in made.left_out:
-        print(f"plab: left out: {line}", file=sys.stderr)
+        tell(f"left out: {line}")
     print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
 
 

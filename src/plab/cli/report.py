@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
+from plab.errors import tell
 from plab.examples import EXAMPLES, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
@@ -96,7 +97,7 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
         try:
             _draw(wanted, lambda: page.write(drawing=True))
         except RenderError as error:
-            print(f"plab: without pictures: {error}", file=sys.stderr)
+            tell(f"without pictures: {error}")
         finally:
             remove_earlier(page.shown, out)
             page.write()

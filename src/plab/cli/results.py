@@ -10,7 +10,6 @@ python -m plab.results unpack runs.plab.zip.xz --output folder   make files of t
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from plab.cli.arguments import Parser, folder, positive, sources_and_words
 from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
+from plab.errors import tell
 from plab.examples import EXAMPLES, resolve
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
@@ -153,7 +153,7 @@ def _sql(options: argparse.Namespace) -> int:
 
 def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
     for error in unreadable:
-        print(f"plab: left out: {error}", file=sys.stderr)
+        tell(f"left out: {error}")
 
 
 def _check(options: argparse.Namespace) -> int:

@@ -11,7 +11,6 @@ and run only if --run-policies is given.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line, complain
 from plab.cli.tables import print_table
 from plab.config import PRECISIONS
-from plab.errors import PlabError
+from plab.errors import PlabError, tell
 from plab.submissions.collecting import submission_files
 from plab.submissions.files import read
 from plab.submissions.members import SubmissionError
@@ -69,7 +68,7 @@ def _run(path: Path, words: Sequence[str], run_policies: bool, precisions: Seque
     _show(submission, verification, precisions)
     # Of a policy that was not run one line is enough.
     for why in dict.fromkeys(verdict.why for verdict in verification.verdicts if verdict.why):
-        print(f"plab: {path}: {why}", file=sys.stderr)
+        tell(f"{path}: {why}")
     kept = write_verification(verification, path)
     good = sum(verdict.outcome == "holds" for verdict in verification.verdicts)
     print(f"{path}: {good} of {len(verification.verdicts)} claim(s) hold; kept in {kept}")
