@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from browsing import browser  # noqa: F401
-from plab.checks import cuda_is_usable
 from plab.config import Config
+from plab.config.checks import cuda_is_usable
 from plab.reuse import SimulatorCache
 from plab.tally import Outcome
 from refusals import ending, refusal, snapshot
@@ -79,7 +79,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 @pytest.fixture
 def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
     """Call a command line that has to refuse, see that it leaves the folder alone, return what it says."""
-    from plab.run import main
+    from plab.cli.run import main
 
     def call(
         argv: Sequence[str],

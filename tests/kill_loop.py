@@ -19,10 +19,10 @@ from collections import Counter
 from pathlib import Path
 
 import toy_runner
+from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.families import FAMILIES
 from plab.results import read, result_path
-from plab.run import main
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SWEEP = ("method=adam,gd", "seed=0,1,2", "checkpoint_seconds=0", "hydra.launcher.batch_size=2")

@@ -62,7 +62,7 @@ class Watch:
 def runs(count: int) -> None:
     """Carry out a sweep of tiny runs, each alone: everything begins and ends with each."""
     from plab import runners
-    from plab.run import main
+    from plab.cli.run import main
 
     intact, watch = runners.run_batch, Watch(count)
 

@@ -37,9 +37,8 @@ def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
     assert "Traceback" not in err
     lines = err.splitlines()
     assert lines, f"no message: {argv}"
-    assert lines[-1].startswith(("plab", "python -m plab")) and ": " in lines[-1]
-    # argparse prints the usage, too, which goes over several lines.
-    assert len(lines) == 1 or lines[0].startswith("usage: ")
+    assert lines[-1].startswith("plab: ")
+    assert len(lines) == 1
     assert len(lines[-1]) > 15
     return lines[-1]
 

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from plab.bench import bound, everyday, paper, skips, speed, workload
-from plab.bench.table import report
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
+from plab.cli.tables import report
 from plab.config import build_scene, load_config
+from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.objective import target_sdf
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
 from plab.sim.memory import array_bytes
-from plab.suite import suite_tasks
 
 pytestmark = pytest.mark.physics
 

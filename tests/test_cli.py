@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from plab.checks import cuda_is_usable
+from plab.cli.run import main
 from plab.config import GROUPS, Config, choices
+from plab.config.checks import cuda_is_usable
 from plab.results import ResultsError
 from plab.reuse import SimulatorCache
-from plab.run import main
 from plab.runners import RunError
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
@@ -138,7 +138,7 @@ def test_help_all_names_everything(capsys):
 
 def test_help_is_quick_and_imports_neither_torch_nor_taichi(tmp_path):
     code = (
-        "import sys; from plab.run import main; main(['--help']); "
+        "import sys; from plab.cli.run import main; main(['--help']); "
         "print(sorted({'torch', 'taichi', 'pandas', 'scipy.ndimage'} & set(sys.modules)))"
     )
     start = time.perf_counter()

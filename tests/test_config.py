@@ -15,11 +15,15 @@ from omegaconf import OmegaConf
 from plab.config import (
     GROUPS,
     ApgConfig,
+    BodyConfig,
     Config,
     ConfigError,
+    DrawConfig,
+    ManipulatorConfig,
     MethodConfig,
     PpoConfig,
     ProtocolConfig,
+    RandomConfig,
     SacConfig,
     SimConfig,
     TaskConfig,
@@ -31,7 +35,6 @@ from plab.config import (
     load_config,
     variant_task,
 )
-from plab.config_types import BodyConfig, DrawConfig, ManipulatorConfig, RandomConfig
 from plab.scene import SceneError
 
 YAML_FILES = sorted(conf_folder().rglob("*.yaml"))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import plab.demonstrations as demonstrations
+from plab.cli.demonstrations import main, replay
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, load_actions, recorded_scores, save_actions
-from plab.demonstrations.__main__ import main, replay
 from plab.demonstrations.search import carry, search
 from plab.targets import demonstration
 

@@ -15,15 +15,14 @@ import pytest
 
 import toy_runner
 from faults import Failing, watched
+from plab.cli import results, status
+from plab.cli.run import main
 from plab.config import Config, ConfigError, load_config
+from plab.config.selection import select
 from plab.families import FAMILIES
 from plab.locks import held, lock_path
 from plab.results import RunFile, load, read, result_path
-from plab.results import __main__ as results
-from plab.run import main
 from plab.runners import run_batch
-from plab.selection import select
-from plab.status import __main__ as status
 from refusals import snapshot
 from rights import ordinary_rights
 

@@ -18,10 +18,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
 from PIL import Image, ImageColor
 
+from plab.cli.run import _parse as parse_run
 from plab.config import choices, load_config
+from plab.config.selection import select
 from plab.report import methods
-from plab.run import _parse as parse_run
-from plab.selection import select
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(

@@ -24,10 +24,10 @@ from omegaconf import OmegaConf
 import plab.envs.core as core
 import plab.sim.runtime as runtime
 from plab.config import ConfigError, choices, conf_folder
+from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, observation, total_loss
-from plab.suite import suite_tasks
 
 pytestmark = pytest.mark.physics
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plab.cli.export import main
 from plab.config import load_config
-from plab.export.__main__ import main
 from plab.render import graphics
 from plab.render.recording import Recording, record_with_motion
 

@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
-from plab.checks import check_sources
+from plab.cli.run import main
 from plab.config import GROUPS, Config, choices, load_config
+from plab.config.checks import check_sources
+from plab.config.selection import select
 from plab.errors import PlabError
 from plab.report.collect import collect
-from plab.run import main
-from plab.selection import select
 from plab.status import NAMES, survey
 
 FEW, MANY = 200, 2000

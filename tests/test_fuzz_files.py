@@ -27,7 +27,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
+from plab.cli import status
 from plab.config import Config, ConfigError, build_scene, load_config
+from plab.config.selection import Selection, SelectionError
 from plab.mesh import load_mesh
 from plab.report.collect import MixedRunsError, collect, collect_ablation
 from plab.report.series import load_series
@@ -35,9 +37,7 @@ from plab.results import ResultsError, check, load, pack, read
 from plab.runners.policy import load_policy, policy_path, save_policy
 from plab.runners.rl_models import Spaces, model_kind
 from plab.scene import SceneError
-from plab.selection import Selection, SelectionError
 from plab.shape_files import ShapeError
-from plab.status import __main__ as status
 from plab.targets import TargetError, load_release_target
 
 OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError, ShapeError)

@@ -36,9 +36,9 @@ def test_imports_point_one_way(monkeypatch):
     [
         "import plab",
         "import plab; from plab.config import load_config; load_config(['task=Move'])",
-        "from plab.run import main; main(['--help'])",
-        "from plab.run import main; main(['--cfg', 'job'])",
-        "from plab.run import main; main(['task=Ropee'])",
+        "from plab.cli.run import main; main(['--help'])",
+        "from plab.cli.run import main; main(['--cfg', 'job'])",
+        "from plab.cli.run import main; main(['task=Ropee'])",
     ],
 )
 def test_starting_imports_nothing_heavy(code, tmp_path):
@@ -51,7 +51,7 @@ def test_starting_imports_nothing_heavy(code, tmp_path):
 
 def test_tables_are_made_without_what_draws_or_simulates(tmp_path):
     heavy = HEAVY - {"pandas"} | {"scipy.stats"}
-    code = "import sys; from plab.report.__main__ import main"
+    code = "import sys; from plab.cli.report import main"
     code += "; assert main(['tables', '--results', 'example']) == 0"
     done = subprocess.run(
         [sys.executable, "-c", f"{code}; print(sorted({heavy} & set(sys.modules)))"],

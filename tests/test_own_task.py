@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from plab.cli.run import main
 from plab.config import ConfigError, build_scene, choices, load_config
 from plab.results import load
-from plab.run import main
 from plab.targets import build_target
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -140,7 +140,7 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
 
 @pytest.mark.physics
 def test_a_runner_that_is_none_is_said(folder: Path) -> None:
-    wrong = "from plab.families import *\nFAMILY = Family('', 'plab.config_types:ApgConfig', dict)\n"
+    wrong = "from plab.families import *\nFAMILY = Family('', 'plab.config:ApgConfig', dict)\n"
     (folder / "zz_wrong.py").write_text(wrong)
     cfg = load_config(["method=apg", f"results_dir={folder}"])
     cfg.method.family = "zz_wrong:FAMILY"
@@ -156,7 +156,7 @@ def test_a_runner_that_lacks_hooks_is_refused(hook: str, folder: Path) -> None:
     (folder / f"zz_lacks_{hook}.py").write_text(
         "from plab.families import *\nfrom plab.runners import Runner\n"
         f"class Lacking(Runner):\n    def {hook}(self, *given): ...\n"
-        "FAMILY = Family('', 'plab.config_types:ApgConfig', Lacking)\n"
+        "FAMILY = Family('', 'plab.config:ApgConfig', Lacking)\n"
     )
     cfg = load_config(["method=apg", f"results_dir={folder}"])
     cfg.method.family = f"zz_lacks_{hook}:FAMILY"

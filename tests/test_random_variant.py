@@ -10,11 +10,10 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from plab.config import ConfigError, build_scene, choices, conf_folder, load_config
-from plab.config_types import TaskConfig
-from plab.random_variant import FIRST_TARGET_SEED, draw_variant
+from plab.cli.run import main
+from plab.config import ConfigError, TaskConfig, build_scene, choices, conf_folder, load_config
+from plab.config.variants import FIRST_TARGET_SEED, draw_variant
 from plab.results import result_path
-from plab.run import main
 
 SCENES = 30
 SCRIPTED = [task for task, path in choices("task").items() if "seed" in OmegaConf.load(path).target.keys()]

@@ -13,16 +13,16 @@ import gymnasium
 import numpy as np
 import pytest
 
-from plab import capacity, sizes
-from plab.config import load_config
+from plab import sizes
+from plab.cli import status
+from plab.cli.run import main
+from plab.config import capacity, load_config
+from plab.config.words import quoted
 from plab.envs.sb3 import make_sb3
 from plab.errors import PlabError
 from plab.problem import Problem
 from plab.results import load
-from plab.run import main
 from plab.sim import Simulator
-from plab.status import __main__ as status
-from plab.words import quoted
 from suite import scene
 
 ROOM = 16e9

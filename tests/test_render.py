@@ -14,10 +14,10 @@ import torch
 
 import reference_mpm
 from plab import results
+from plab.cli.render import main
 from plab.config import build_scene, choices, load_config
 from plab.objective import spread_mass
 from plab.render import graphics
-from plab.render.__main__ import main
 from plab.render.camera import VIEWS, Camera, View, fit_camera, scene_camera
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
@@ -554,7 +554,7 @@ def test_the_contact_sheet(capsys, monkeypatch):
     from PIL import Image
 
     some = {name: path for name, path in choices("task").items() if name in ("Move", "Rope")}
-    monkeypatch.setattr("plab.render.__main__.choices", lambda group, config_dir: some)
+    monkeypatch.setattr("plab.cli.render.choices", lambda group, config_dir: some)
     coarse = ["sim.grid_size=32", "sim.particles_scale=0.03"]
     assert main(["--contact-sheet", "sheet.png", "--size", "80x40", *coarse]) == 0
     with Image.open("sheet.png") as sheet:
@@ -568,7 +568,7 @@ def test_the_film_strip(capsys, monkeypatch):
     from PIL import Image
 
     some = {name: path for name, path in choices("task").items() if name in ("Move", "Rope", "Torus")}
-    monkeypatch.setattr("plab.render.__main__.choices", lambda group, config_dir: some)
+    monkeypatch.setattr("plab.cli.render.choices", lambda group, config_dir: some)
     monkeypatch.setattr(
         "plab.demonstrations.known_actions", lambda cfg: np.zeros((2, build_scene(cfg).action_dim))
     )

@@ -12,7 +12,9 @@ import pytest
 from scipy import stats
 
 import synthetic
-from plab.report.__main__ import main
+from plab.cli.report import main
+from plab.config.selection import select
+from plab.config.suite import PAPER_METHODS
 from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
 from plab.report.budgets import at_budgets, score_at_budget, scores_at
 from plab.report.collect import NAMES, collect, collect_ablation
@@ -20,8 +22,6 @@ from plab.report.curves import budget_curves, rewards, rl_scores, score_curves
 from plab.report.figures import grid, log_axis, style
 from plab.report.methods import method, ordered
 from plab.report.series import band, load_series, rows_on_axes
-from plab.selection import select
-from plab.suite import PAPER_METHODS
 
 # ------------------------------------------------------------------------------------------------------ bands
 

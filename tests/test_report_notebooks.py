@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 
 import synthetic
+from plab.cli.report import main
+from plab.config.selection import select
 from plab.examples import example_archive
-from plab.report.__main__ import main
 from plab.report.collect import NAMES, collect
 from plab.report.costs import precision_summary, work_precision
 from plab.report.figures import style
@@ -21,7 +22,6 @@ from plab.report.notebooks import NOTEBOOKS, notebook_folder
 from plab.report.table import MINUS
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
-from plab.selection import select
 
 # ------------------------------------------------------------------------------------------------- verdicts
 

@@ -15,17 +15,17 @@ import pytest
 import synthetic
 from browsing import browsing, press, until
 from plab.bench.results import synthetic_run, template
+from plab.cli.report import main
+from plab.config.selection import select
 from plab.examples import example_archive
 from plab.locks import acquire
 from plab.render import replays
 from plab.render.graphics import missing_graphics
-from plab.report.__main__ import main
 from plab.report.aggregate import interquartile_mean, shared_strata
 from plab.report.collect import NAMES, collect
 from plab.report.media import best_runs, present
 from plab.report.methods import method
 from plab.results import load
-from plab.selection import select
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

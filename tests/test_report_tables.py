@@ -16,9 +16,10 @@ import pytest
 from scipy import stats
 
 import synthetic
+from plab.cli.report import main
 from plab.config import load_config
+from plab.config.selection import SelectionError, select
 from plab.examples import EXAMPLES, example_archive, resolve
-from plab.report.__main__ import main, write_tables
 from plab.report.agreement import agreement
 from plab.report.collect import NAMES, MixedRunsError, Setting, changed_settings, collect
 from plab.report.hyperparameters import hyperparameters
@@ -28,8 +29,8 @@ from plab.report.statistics import Summary, stratified_difference, summarise
 from plab.report.table import NOTHING, Table, aligned, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
+from plab.report.writing import write_tables
 from plab.results import check, load, pack
-from plab.selection import SelectionError, select
 
 GOLDEN = Path(__file__).parent / "golden"
 

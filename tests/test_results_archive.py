@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 
 import synthetic
+from plab.cli.results import main
 from plab.results import ResultsError, RunFile, load, pack, read, unpack
-from plab.results.__main__ import main
 
 
 @pytest.fixture
@@ -188,7 +188,7 @@ def test_command_line(folder: Path, tmp_path: Path, capsys) -> None:
 
 def test_commands_start_without_torch_and_taichi() -> None:
     slow = "{'torch', 'taichi', 'scipy', 'hydra'} & {*sys.modules}"
-    code = f"import sys, plab.results.__main__, plab.status.__main__; assert not {slow}, {slow}"
+    code = f"import sys, plab.cli.results, plab.cli.status; assert not {slow}, {slow}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

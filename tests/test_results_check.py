@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import synthetic
+from plab.cli.results import main
+from plab.config.suite import PAPER_METHODS
 from plab.results import SCHEMA_VERSION, RunResult, check, pack
-from plab.results.__main__ import main
-from plab.suite import PAPER_METHODS
 
 
 def problem(path: Path) -> str:

@@ -20,9 +20,12 @@ import pandas as pd
 import pytest
 
 import synthetic
+from plab.cli.render import _parse as parse_render
+from plab.cli.render import main as render
+from plab.cli.results import main
+from plab.cli.status import main as status
+from plab.config.selection import Selection
 from plab.examples import example_archive
-from plab.render.__main__ import _parse as parse_render
-from plab.render.__main__ import main as render
 from plab.report.collect import collect
 from plab.results import (
     connect,
@@ -37,11 +40,8 @@ from plab.results import (
     workers,
     write,
 )
-from plab.results.__main__ import main
 from plab.results.store import Store
-from plab.selection import Selection
 from plab.status import survey
-from plab.status.__main__ import main as status
 
 DATABASE = ".plab.sqlite"
 

@@ -342,7 +342,7 @@ def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> Non
 
 def test_what_is_not_installed_is_said_before_anything_is_built(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(rl, "shared_batches", None)
-    monkeypatch.setattr("plab.checks.find_spec", lambda name: None)
+    monkeypatch.setattr("plab.config.checks.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"TensorBoard: pip install 'plab\[tensorboard\]'"):
         run_config(make_config(tmp_path, "ppo", "logger=tensorboard"))
     monkeypatch.setattr(rl.torch.cuda, "is_available", lambda: False)

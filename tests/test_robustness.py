@@ -14,9 +14,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import synthetic
-from plab.config import GROUPS, Config, ConfigError, choices, load_config
-from plab.config_types import PpoConfig, ProtocolConfig, SacConfig, SimConfig, Td3Config, TrajectoryConfig
-from plab.results import __main__ as results
+from plab.cli import results
+from plab.config import (
+    GROUPS,
+    Config,
+    ConfigError,
+    PpoConfig,
+    ProtocolConfig,
+    SacConfig,
+    SimConfig,
+    Td3Config,
+    TrajectoryConfig,
+    choices,
+    load_config,
+)
 from plab.results import read, write
 from plab.scene import SceneError
 from plab.targets import TargetError

@@ -14,21 +14,13 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab import run
 from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
 from plab.bench import results as bench_results
-from plab.command import command_line
-from plab.demonstrations import __main__ as demonstrations
-from plab.export import __main__ as export
-from plab.render import __main__ as render
+from plab.cli import demonstrations, export, render, report, results, run, status, targets, view
+from plab.cli.command import command_line
 from plab.render import graphics
-from plab.report import __main__ as report
 from plab.results import ResultsError
-from plab.results import __main__ as results
 from plab.sim import Simulator
-from plab.status import __main__ as status
-from plab.targets import __main__ as targets
-from plab.view import __main__ as view
 from refusals import refusal
 from rights import ordinary_rights
 
@@ -305,6 +297,24 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
     )
     refusal(done.returncode, done.stdout, done.stderr, argv)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("entry", "argv", "flag"),
+    [
+        (run.main, ["--mutlirun"], "multirun"),
+        (status.main, ["--missing-runs"], "missing"),
+        (results.main, ["scores", "--descendign"], "descending"),
+        (render.main, ["task=Rope", "--film-srtip", "a.jpg"], "film-strip"),
+        (stability.main, ["--qiuck"], "quick"),
+    ],
+)
+def test_an_unknown_flag_is_answered_by_those_that_there_are(capsys, entry, argv, flag):
+    assert entry(argv) == 2
+    line = capsys.readouterr().err
+    wrong = next(word for word in argv if word.startswith("--"))
+    assert line.startswith(f"plab: unknown flag {wrong}")
+    assert f"; did you mean --{flag}? choose from: --help, " in line and line.count("\n") == 1
 
 
 # ------------------------------------------------------------------------------------------------ rights

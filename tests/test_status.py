@@ -16,12 +16,12 @@ import pytest
 from rich.console import Console
 
 import synthetic
+from plab.cli.status import main
+from plab.config.selection import SelectionError, select
 from plab.errors import ArgumentError
 from plab.locks import acquire
 from plab.results import pack
-from plab.selection import SelectionError, select
 from plab.status import NAMES, STATES, survey, view
-from plab.status.__main__ import main
 from plab.status.view import duration, watch
 
 

@@ -20,9 +20,10 @@ import yaml
 import plab
 import synthetic
 from browsing import browsing, press
-from plab import leaderboard, submit, verify
 from plab.bench.results import synthetic_run, template
+from plab.cli import leaderboard, submit, verify
 from plab.config import load_config
+from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table
 from plab.submissions.board import board
 from plab.submissions.card import Card, CardError, parse_card
@@ -39,7 +40,6 @@ from plab.submissions.verifying import (
     read_verification,
     write_verification,
 )
-from plab.suite import suite_tasks
 
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)
@@ -464,12 +464,12 @@ def test_mistakes_of_submit(tmp_path: Path, card: Path, told: Callable[..., str]
     missing = tmp_path / "no.yaml"
     cannot = f"cannot read {missing}: No such file or directory"
     assert line(str(folder), "--card", str(missing), "--output", out) == cannot
-    apart = "plab.submit: error: give either recordings or results, or --policy"
+    apart = "plab: give either recordings or results, or --policy"
     assert line(*usual) == apart
     assert line(str(folder), "--policy", "Move=a.pt", "--steps", "1", *usual) == apart
-    assert line("--policy", "Move=a.pt", *usual) == "plab.submit: error: --policy and --steps go together"
-    assert line(str(folder), "--unseen", *usual) == "plab.submit: error: --unseen is for --policy"
-    kinds = "plab.submit: error: argument --policy: 'Move=a.bin' is not like Move=move.pt or Move=move.onnx"
+    assert line("--policy", "Move=a.pt", *usual) == "plab: --policy and --steps go together"
+    assert line(str(folder), "--unseen", *usual) == "plab: --unseen is for --policy"
+    kinds = "plab: argument --policy: 'Move=a.bin' is not like Move=move.pt or Move=move.onnx"
     assert line("--policy", "Move=a.bin", "--steps", "1", *usual) == kinds
     absent = f"cannot read {tmp_path / 'a.pt'}: No such file or directory"
     assert line("--policy", f"Move={tmp_path / 'a.pt'}", "--steps", "1", *usual) == absent
@@ -498,7 +498,7 @@ def test_mistakes_of_verify(tmp_path: Path, path: Path, told: Callable[..., str]
     with_manifest(path, lambda about: about.update(physics=99, plab="9.0"))
     here = f"this plab ({plab.__version__}) simulates version 1"
     assert told([str(path)], verify.main) == f"plab: {path} is of physics version 99 (plab 9.0), {here}"
-    nothing = "plab.verify: error: name a submission, or a folder of them"
+    nothing = "plab: name a submission, or a folder of them"
     assert told(["sim.device=cpu"], verify.main) == nothing
 
 

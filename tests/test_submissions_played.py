@@ -19,7 +19,7 @@ from gymnasium.wrappers import RescaleAction
 from onnx import TensorProto, helper
 
 import plab  # noqa: F401
-from plab import leaderboard, submit, verify
+from plab.cli import leaderboard, submit, verify
 from plab.envs.vector import PlabVectorEnv
 from plab.submissions import record
 from plab.submissions.files import read, write

@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from plab.cli.targets import moments
 from plab.config import load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.scene import Scene
-from plab.suite import SUITE_VARIANTS, suite_tasks
-from plab.targets.__main__ import moments
 
 pytestmark = pytest.mark.physics
 

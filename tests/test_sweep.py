@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 import toy_runner
+from plab.cli.run import main
 from plab.config import Config, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.families import FAMILIES
 from plab.locks import acquire
 from plab.results import RunFile, config_hash, read, result_path
-from plab.run import main
-from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin
@@ -230,7 +230,7 @@ _SWEEP = """
 import sys
 import toy_runner
 from plab.families import FAMILIES
-from plab.run import main
+from plab.cli.run import main
 FAMILIES["trajectory"] = toy_runner.toy_family("trajectory")
 toy_runner.PAUSE = 0.02
 sys.exit(main(sys.argv[1:]))

@@ -11,10 +11,10 @@ import h5py
 import pytest
 
 import toy_runner
+from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.families import FAMILIES
 from plab.results import SCHEMA_VERSION, read, result_path
-from plab.run import main
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

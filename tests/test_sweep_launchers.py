@@ -19,9 +19,9 @@ from hydra.core.plugins import Plugins
 from rich.console import Console
 
 from plab import progress
+from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.results import read, result_path
-from plab.run import main
 from plab.runners import run_batch
 from same_runs import assert_same_numbers
 

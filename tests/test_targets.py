@@ -11,11 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from plab.cli import targets as command
 from plab.config import ConfigError, build_scene, load_config, variant_task
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
 from plab.scene import Scene, sample_particles
-from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.targets import (
     RECIPES,
     TARGET_SEED,
@@ -27,7 +28,6 @@ from plab.targets import (
     load_release_target,
     make_recipe,
 )
-from plab.targets import __main__ as command
 from plab.targets.store import TargetStore
 
 pytestmark = pytest.mark.physics

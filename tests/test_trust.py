@@ -19,14 +19,13 @@ import pytest
 
 import synthetic
 import test_fuzz_files as fuzz
+from plab.cli import results, status
 from plab.config import load_config
 from plab.families import FAMILIES
 from plab.results import ResultsError, RunFile, check, pack, read, result_path, unpack
-from plab.results import __main__ as results
 from plab.results.loading import read_rows, run_files
 from plab.runners import run_config
 from plab.runners.policy import load_policy
-from plab.status import __main__ as status
 from plab.targets import TargetError, load_release_target
 
 

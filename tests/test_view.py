@@ -20,12 +20,12 @@ import pytest
 from PIL import Image
 
 from plab import results
+from plab.cli.view import main
 from plab.config import load_config
 from plab.problem import Problem
 from plab.render import graphics
 from plab.render.recording import Recording, record, record_with_motion
 from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.view.__main__ import main
 
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")

@@ -14,11 +14,11 @@ import pytest
 from rich.console import Console
 
 from plab import progress
+from plab.cli.next_steps import next_steps
+from plab.cli.run import main
 from plab.config import load_config
-from plab.next_steps import next_steps
 from plab.results import RunFile
 from plab.results import read as read_result
-from plab.run import main
 from plab.runners.jobs import Job
 from plab.sim.compiling import watch_compiling
 

@@ -16,8 +16,8 @@ import griffe
 import mkdocs_gen_files
 import yaml
 
-from plab import config_types
-from plab.suite import conf_folder
+from plab import config
+from plab.config.suite import conf_folder
 from plab.targets import RECIPES
 
 ROOT = Path(__file__).parents[1]
@@ -56,28 +56,28 @@ PYTHON = {
 """Pages of the reference: title, first line, modules."""
 
 SECTIONS = (
-    ("A run", "", config_types.Config, "config.yaml"),
-    ("protocol", "protocol.", config_types.ProtocolConfig, "protocol/plab.yaml"),
-    ("sim", "sim.", config_types.SimConfig, "sim/fast.yaml"),
-    ("targets", "targets.", config_types.TargetsConfig, "config.yaml:targets"),
-    ("method, all", "method.", config_types.MethodConfig, "method/adam.yaml"),
-    ("method=adam, gd, adam_h", "method.", config_types.TrajectoryConfig, "method/adam.yaml"),
-    ("method=cem, mppi, cmaes, multistart", "method.", config_types.PlannerConfig, "method/cem.yaml"),
-    ("method=cem, mppi, cmaes", "method.", config_types.SamplerConfig, "method/cem.yaml"),
-    ("method=cem", "method.", config_types.CemConfig, "method/cem.yaml"),
-    ("method=mppi", "method.", config_types.MppiConfig, "method/mppi.yaml"),
-    ("method=multistart", "method.", config_types.MultistartConfig, "method/multistart.yaml"),
-    ("method=hybrid, solve", "method.", config_types.StagesConfig, "method/solve.yaml"),
-    ("method=apg", "method.", config_types.ApgConfig, "method/apg.yaml"),
-    ("method=sac, td3, ppo", "method.", config_types.RlConfig, "method/sac.yaml"),
-    ("method=sac, td3", "method.", config_types.OffPolicyConfig, "method/sac.yaml"),
-    ("method=td3", "method.", config_types.Td3Config, "method/td3.yaml"),
-    ("method=ppo", "method.", config_types.PpoConfig, "method/ppo.yaml"),
-    ("task", "task.", config_types.TaskConfig, "task/Rope.yaml"),
-    ("task.bodies.NAME", "task.bodies.NAME.", config_types.BodyConfig, None),
-    ("task.manipulators.NAME", "task.manipulators.NAME.", config_types.ManipulatorConfig, None),
-    ("task.random", "task.random.", config_types.RandomConfig, None),
-    ("task.random.ranges.NAME", "task.random.ranges.NAME.", config_types.DrawConfig, None),
+    ("A run", "", config.Config, "config.yaml"),
+    ("protocol", "protocol.", config.ProtocolConfig, "protocol/plab.yaml"),
+    ("sim", "sim.", config.SimConfig, "sim/fast.yaml"),
+    ("targets", "targets.", config.TargetsConfig, "config.yaml:targets"),
+    ("method, all", "method.", config.MethodConfig, "method/adam.yaml"),
+    ("method=adam, gd, adam_h", "method.", config.TrajectoryConfig, "method/adam.yaml"),
+    ("method=cem, mppi, cmaes, multistart", "method.", config.PlannerConfig, "method/cem.yaml"),
+    ("method=cem, mppi, cmaes", "method.", config.SamplerConfig, "method/cem.yaml"),
+    ("method=cem", "method.", config.CemConfig, "method/cem.yaml"),
+    ("method=mppi", "method.", config.MppiConfig, "method/mppi.yaml"),
+    ("method=multistart", "method.", config.MultistartConfig, "method/multistart.yaml"),
+    ("method=hybrid, solve", "method.", config.StagesConfig, "method/solve.yaml"),
+    ("method=apg", "method.", config.ApgConfig, "method/apg.yaml"),
+    ("method=sac, td3, ppo", "method.", config.RlConfig, "method/sac.yaml"),
+    ("method=sac, td3", "method.", config.OffPolicyConfig, "method/sac.yaml"),
+    ("method=td3", "method.", config.Td3Config, "method/td3.yaml"),
+    ("method=ppo", "method.", config.PpoConfig, "method/ppo.yaml"),
+    ("task", "task.", config.TaskConfig, "task/Rope.yaml"),
+    ("task.bodies.NAME", "task.bodies.NAME.", config.BodyConfig, None),
+    ("task.manipulators.NAME", "task.manipulators.NAME.", config.ManipulatorConfig, None),
+    ("task.random", "task.random.", config.RandomConfig, None),
+    ("task.random.ranges.NAME", "task.random.ranges.NAME.", config.DrawConfig, None),
 )
 """Heading, prefix of the keys, type, and file with the defaults, of each table."""
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plab.config_errors import ConfigError
-from plab.config_types import MethodConfig
+from plab.config import ConfigError, MethodConfig
 from plab.families import Family
 from plab.runners import Runner, Step, Track
 from plab.runners.common import measures, shared_problem

@@ -11,8 +11,7 @@ from typing import Any
 from sb3_contrib import TQC
 from stable_baselines3.common.vec_env import VecEnv
 
-from plab.config_errors import ConfigError
-from plab.config_types import OffPolicyConfig
+from plab.config import ConfigError, OffPolicyConfig
 from plab.families import FAMILIES, Rule
 from plab.runners.rl_models import ModelKind, off_policy
 

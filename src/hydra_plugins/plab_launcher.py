@@ -56,7 +56,7 @@ class BatchSweeper(BasicSweeper):
         super().__init__(max_batch_size, params)
 
     def _parse_config(self) -> list[str]:
-        from plab.words import quote_folders
+        from plab.config.words import quote_folders
 
         return quote_folders(super()._parse_config())
 
@@ -67,8 +67,8 @@ class BatchSweeper(BasicSweeper):
             plab.config.ConfigError: If it has no jobs, or too many.
         """
         from plab.config import ConfigError
+        from plab.config.words import parse, require_few
         from plab.results.files import make_folder, remove_folders
-        from plab.words import parse, require_few
 
         assert self.hydra_context is not None and self.launcher is not None
         loader = self.hydra_context.config_loader
@@ -120,8 +120,8 @@ class BatchLauncher(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run all jobs; see :meth:`hydra.plugins.launcher.Launcher.launch`."""
-        from plab.checks import check_device, check_packages
         from plab.config import ConfigError
+        from plab.config.checks import check_device, check_packages
         from plab.results import result_path
         from plab.sweep.carry import carry_here, run_sweep
         from plab.sweep.compose import Refused, compose_jobs

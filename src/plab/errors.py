@@ -1,8 +1,26 @@
-"""What all of plab's own exceptions have in common."""
+"""Mistakes: what can be put right by whoever uses plab, and how it is told."""
 
 from __future__ import annotations
 
-__all__ = ["ArgumentError", "PlabError"]
+import difflib
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+__all__ = [
+    "TRACEBACK",
+    "ArgumentError",
+    "ConfigError",
+    "PlabError",
+    "out_of_memory",
+    "pick",
+    "tell",
+    "traceback_wanted",
+]
+
+TRACEBACK = "PLAB_TRACEBACK"
+"""Variable of the environment that lets a bug through with its traceback."""
 
 
 class PlabError(Exception):
@@ -10,4 +28,31 @@ class PlabError(Exception):
 
 
 class ArgumentError(PlabError, ValueError):
-    """An argument, from Python, that does not fit."""
+    """An argument, from Python or on a command line, that does not fit."""
+
+
+class ConfigError(PlabError, ValueError):
+    """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
+
+
+def pick(name: str, names: Sequence[str]) -> str:
+    """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
+    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
+    guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
+    return f"{guess}choose from: {', '.join(names)}"
+
+
+def tell(message: str) -> None:
+    """Print a line on standard error, as every mistake and warning is told."""
+    with suppress(BrokenPipeError):
+        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+
+
+def out_of_memory(error: MemoryError) -> str:
+    """Return one line about memory that is lacking; Python's own error says nothing."""
+    return str(error) or "this computer has too little memory for that: close something, or ask for less"
+
+
+def traceback_wanted() -> bool:
+    """Whether bugs are to be shown with their tracebacks."""
+    return bool(os.environ.get(TRACEBACK))

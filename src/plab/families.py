@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from plab.errors import ConfigError, pick
 from plab.plugins import load_object
 
 __all__ = ["FAMILIES", "GRADIENT", "RL", "Appearance", "Family", "Rule", "family", "known_family", "schemas"]
@@ -19,7 +20,7 @@ __all__ = ["FAMILIES", "GRADIENT", "RL", "Appearance", "Family", "Rule", "family
 RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
 
-_TYPES = "plab.config_types"
+_TYPES = "plab.config"
 _AGENTS = "plab.runners.population"
 _PLANNERS = "plab.runners.planners"
 
@@ -225,8 +226,6 @@ def family(name: str) -> Family:
         return FAMILIES[name]
     if ":" in name:
         return load_object(name, Family)
-    from plab.config_errors import ConfigError, pick
-
     raise ConfigError(f"method.family '{name}' does not exist; {pick(name, [*FAMILIES, 'module:NAME'])}")
 
 
@@ -237,8 +236,6 @@ def known_family(name: str) -> Family | None:
         return FAMILIES[name]
     if name.partition(":")[0] not in sys.modules:
         return None
-    from plab.config_errors import ConfigError
-
     try:
         return family(name)
     except ConfigError:

@@ -1,62 +1,10 @@
-"""One static page from a folder of submissions: tracks, equal budgets, one table for each protocol.
+"""``python -m plab.leaderboard``: a page from a folder of submissions; see :mod:`plab.cli.leaderboard`."""
 
-python -m plab.leaderboard submissions
-python -m plab.leaderboard submissions --out public/leaderboard
-
-Run plab.verify on the folder before: what it has kept is shown. The page is index.html; it needs no server.
-"""
-
-from __future__ import annotations
-
-import argparse
-import shlex
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
-import plab
-from plab.arguments import folder
-from plab.command import command_line
-from plab.submissions.board import board
-from plab.submissions.page import write_leaderboard
-from plab.targets.store import PHYSICS_VERSION
+from plab.cli.leaderboard import main
 
 __all__ = ["main"]
-
-
-@command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    options = _parse(arguments)
-    origin = {
-        "command": shlex.join(["python", "-m", "plab.leaderboard", *arguments]),
-        "plab": plab.__version__,
-        "physics": PHYSICS_VERSION,
-        "overrides": options.overrides,
-    }
-    made = board(options.folder, options.overrides)
-    path = write_leaderboard(made, options.out, origin)
-    for line in made.left_out:
-        print(f"plab: left out: {line}", file=sys.stderr)
-    print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
-    return 0
-
-
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="plab.leaderboard",
-        description=__doc__.partition("\n\n")[0],
-        epilog=__doc__.partition("\n\n")[2],
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("folder", type=folder, help="folder of submissions")
-    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
-    parser.add_argument("overrides", nargs="*", help=what)
-    what = "folder to write to (default: reports/leaderboard)"
-    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
-    return parser.parse_intermixed_args(argv)
-
 
 if __name__ == "__main__":
     sys.exit(main())

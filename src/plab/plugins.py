@@ -15,10 +15,9 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
-if TYPE_CHECKING:
-    from plab.config_errors import ConfigError
+from plab.errors import ConfigError
 
 __all__ = ["load_object", "passed_on", "search_in"]
 
@@ -65,13 +64,13 @@ def load_object(text: str, kind: type[Kind]) -> Kind:
     """
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
-        raise _error(f"'{text}' does not name an object: write module:NAME")
+        raise ConfigError(f"'{text}' does not name an object: write module:NAME")
     module = _module(text, module_name)
     if not hasattr(module, name):
-        raise _error(f"'{text}': {module.__file__} has no {name}")
+        raise ConfigError(f"'{text}': {module.__file__} has no {name}")
     found = getattr(module, name)
     if not isinstance(found, kind):
-        raise _error(f"'{text}' has to be a {kind.__name__}, and is a {type(found).__name__}")
+        raise ConfigError(f"'{text}' has to be a {kind.__name__}, and is a {type(found).__name__}")
     return found
 
 
@@ -82,19 +81,12 @@ def _module(text: str, name: str) -> ModuleType:
         missing = str(error.name)
         if name == missing or name.startswith(f"{missing}."):
             places = "in the config folder, the folder above it, the working directory or PYTHONPATH"
-            raise _error(f"'{text}': there is no module {missing} {places}") from None
-        raise _error(f"'{text}': module {name} needs {missing}, which is not installed") from None
+            raise ConfigError(f"'{text}': there is no module {missing} {places}") from None
+        raise ConfigError(f"'{text}': module {name} needs {missing}, which is not installed") from None
     except SyntaxError as error:
-        raise _error(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
+        raise ConfigError(f"'{text}': {error.filename}, line {error.lineno}: {error.msg}") from None
     except Exception as error:
         # Of the module's own code: where it went wrong is what its author needs.
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}, line {last.lineno}"
-        raise _error(f"'{text}': {where}: {type(error).__name__}: {error}") from error
-
-
-def _error(message: str) -> ConfigError:
-    # Imported here: with it comes Hydra, which readers of results do without.
-    from plab.config_errors import ConfigError
-
-    return ConfigError(message)
+        raise ConfigError(f"'{text}': {where}: {type(error).__name__}: {error}") from error

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene, variant_task
+from plab.config.words import shortened
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -29,7 +30,6 @@ from plab.objective import (
 from plab.sim import Rollout, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, load_release_target
-from plab.words import shortened
 
 if TYPE_CHECKING:
     import torch

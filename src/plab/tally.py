@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections import Counter
 from dataclasses import dataclass, field
+
+from plab.errors import tell
 
 __all__ = ["MOST_RUNS", "Outcome", "Refusal", "Tally"]
 
@@ -91,5 +92,5 @@ class Tally:
         print(f"{len(self.outcomes)} runs: {', '.join(parts)}", flush=True)
         for one in self.outcomes:
             if not one.finished:
-                print(f"plab: {one.title}: {one.message}", file=sys.stderr)
+                tell(f"{one.title}: {one.message}")
         return 2 if count["refused"] else int(any(not one.finished for one in self.outcomes))

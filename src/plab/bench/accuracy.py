@@ -19,7 +19,6 @@ see :mod:`plab.bench.common_scene`.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -30,7 +29,6 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import folder, positive
 from plab.bench.common_scene import (
     common_actions,
     common_places,
@@ -39,14 +37,14 @@ from plab.bench.common_scene import (
     own_components,
 )
 from plab.bench.precision import angle
-from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import Parser, folder, positive, task_list
+from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, DEVICES, Simulator, Skips
-from plab.suite import task_list
 
 __all__ = ["Setting", "attempts_at", "lattice", "main"]
 
@@ -377,9 +375,9 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, run, print, write the table and the diagrams; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.accuracy", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, run, print, write the table and the diagrams."""
+    parser = Parser("plab.bench.accuracy", __doc__)
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
     parser.add_argument(
         "--task",
@@ -396,10 +394,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
     plan = QUICK if options.quick else Plan()
     plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
-    return _run(tasks, plan, options.output)
-
-
-def _run(tasks: Sequence[str], plan: Plan, output: Path) -> int:
+    output = options.output
     output.mkdir(parents=True, exist_ok=True)
     table = report(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
     # Imported late: the numbers are there even where Matplotlib is not.
@@ -407,7 +402,6 @@ def _run(tasks: Sequence[str], plan: Plan, output: Path) -> int:
 
     for path in draw(pd.DataFrame(table), output):
         print(path)
-    return 0
 
 
 if __name__ == "__main__":

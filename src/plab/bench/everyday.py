@@ -10,7 +10,6 @@ takes turns with the code of another source tree, so that both have the same mac
 
 from __future__ import annotations
 
-import argparse
 import os
 import resource
 import shutil
@@ -22,10 +21,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import plab
-from plab.arguments import positive, to_write
 from plab.bench.results import SETTLE, write_runs
-from plab.bench.table import progress, report
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import progress, report
 
 __all__ = ["COLUMNS", "THINGS", "main", "measure"]
 
@@ -126,9 +125,9 @@ def _children() -> float:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.everyday", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, measure, print, write a CSV file if asked to."""
+    parser = Parser("plab.bench.everyday", __doc__)
     parser.add_argument("--runs", type=positive, default=1000, help="number of result files")
     parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
     parser.add_argument("--repeats", type=positive, default=3, help="times that each thing is done")
@@ -140,10 +139,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if options.against is not None and not (options.against / "plab" / "__init__.py").is_file():
         parser.error(f"--against: {options.against} holds no package plab; name a source tree's src")
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     own = Path(plab.__file__).parents[1]
     sources = [own] if options.against is None else [options.against.resolve(), own]
     with tempfile.TemporaryDirectory() as name:
@@ -151,7 +146,6 @@ def _run(options: argparse.Namespace) -> int:
         write_runs(options.runs, options.rows, folder / "results")
         time.sleep(SETTLE)
         report(COLUMNS, measure(folder, sources, options.repeats, options.only), options.csv, {"what": 18})
-    return 0
 
 
 if __name__ == "__main__":

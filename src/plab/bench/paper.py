@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from plab.bench.table import markdown, progress
 from plab.bench.workload import GRADIENT, REWARD, build, time_calls
+from plab.cli.tables import markdown, progress
 from plab.config import load_config
 
 __all__ = ["COLUMNS", "paper_table", "rows", "write_markdown"]

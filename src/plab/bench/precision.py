@@ -10,7 +10,6 @@ share one compiled simulator per precision, see :mod:`plab.bench.common_scene`; 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,16 +18,16 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, to_write
 from plab.bench.common_scene import common_actions, common_scene, grid_terms, own_components
-from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, task_list, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import build_scene, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
 from plab.scene import Scene, sample_particles
 from plab.sim import Simulator
-from plab.suite import SUITE_VARIANTS, suite_tasks, task_list
 from plab.targets import EPISODE_STEPS
 
 __all__ = ["angle", "main"]
@@ -174,24 +173,19 @@ def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, run, print, write the files asked for; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.precision", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, run, print, write the files asked for."""
+    parser = Parser("plab.bench.precision", __doc__)
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
     parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
     parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
     options = parser.parse_args(argv)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
     if options.markdown is not None:
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
         options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles), encoding="utf-8")
-    return 0
 
 
 def markdown(table: pd.DataFrame, particles: int) -> str:

@@ -17,7 +17,6 @@ The target is what the demonstration ends with in plab. All tasks share a compil
 :mod:`plab.bench.common_scene`; the loss has no contact term.
 """
 
-import argparse
 import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,16 +26,16 @@ from typing import cast
 import numpy as np
 import taichi as ti
 
-from plab.arguments import positive, to_write
 from plab.bench.common_scene import grid_terms
 from plab.bench.precision import Start, angle, spread, starts
-from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, task_list, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
+from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
 from plab.sim import Simulator, Skips, particle_phases
 from plab.sim.spectral import SINGULAR_VALUE_MIN, mapped_values, svd_signed
-from plab.suite import suite_tasks, task_list
 
 __all__ = ["CHOICES", "main", "rows"]
 
@@ -197,16 +196,15 @@ def _row(start: Start, kind: str, ours: np.ndarray, theirs: np.ndarray) -> dict[
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.release", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, run, print, write a CSV file if asked to."""
+    parser = Parser("plab.bench.release", __doc__)
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
     parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
     parser.add_argument("--choice", nargs="+", choices=CHOICES, default=list(CHOICES), help="only these")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
     report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
-    return 0
 
 
 if __name__ == "__main__":

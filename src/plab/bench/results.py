@@ -10,7 +10,6 @@ the end it says how much memory all of this took.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import itertools
 import os
@@ -25,21 +24,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, to_write
-from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import load_config
+from plab.config.selection import Selection
+from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
-from plab.report.__main__ import write_tables
 from plab.report.collect import collect
+from plab.report.writing import write_tables
 from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
 from plab.results.query import query, scores
 from plab.results.schema import COLUMNS, loss_columns
-from plab.selection import Selection
 from plab.status import survey
-from plab.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 
 __all__ = ["SETTLE", "main", "synthetic_run", "template", "write_runs"]
 
@@ -178,18 +177,14 @@ def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.results", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, measure, print, write a CSV file if asked to."""
+    parser = Parser("plab.bench.results", __doc__)
     parser.add_argument("--runs", type=positive, default=5000, help="number of result files")
     parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
     parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
         table = _rows(options.runs, options.rows, Path(folder), options.archive)
@@ -197,7 +192,6 @@ def _run(options: argparse.Namespace) -> int:
     # Linux counts in KiB, macOS in bytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1024.0)
     print(f"most memory: {peak:.0f} MiB")
-    return 0
 
 
 if __name__ == "__main__":

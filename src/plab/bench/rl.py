@@ -13,7 +13,6 @@ of a training that waits for nothing, evaluations and states of checkpoints incl
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -29,11 +28,10 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
-from plab.arguments import positive, to_write
-from plab.bench.table import report
-from plab.command import command_line
-from plab.config import Config, PpoConfig, load_config
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
+from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES
 from plab.runners.common import torch_settings
@@ -216,9 +214,9 @@ def _config(overrides: list[str], method: str, num_envs: int, batches: int, *, w
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, measure, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.rl", description=__doc__.splitlines()[0])
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, measure, print, write a CSV file if asked to."""
+    parser = Parser("plab.bench.rl", __doc__)
     parser.add_argument(
         "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
     )
@@ -229,10 +227,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     if options.agents:
         batches = options.batches
         rows = (
@@ -242,14 +236,13 @@ def _run(options: argparse.Namespace) -> int:
             for method in options.methods
         )
         report(POPULATION, rows, options.csv)
-        return 0
+        return
     table = (
         measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
         for num_envs in options.envs
         for method in options.methods
     )
     report(COLUMNS, table, options.csv)
-    return 0
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from plab.bench.table import progress
 from plab.bench.workload import build, time_calls
+from plab.cli.tables import progress
 from plab.config import load_config
 from plab.sim.storage import BLOCK
 

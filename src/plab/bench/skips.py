@@ -12,10 +12,10 @@ from typing import cast
 
 import numpy as np
 
-from plab.bench.table import progress
 from plab.bench.workload import FORWARD, GRADIENT, REWARD, WARM_UP, Workload, build
+from plab.cli.tables import progress
 from plab.config import ConfigError, load_config
-from plab.config_errors import pick
+from plab.errors import pick
 from plab.sim import Skips
 
 __all__ = ["CASES", "COLUMNS", "Case", "cases_for", "rows"]

@@ -19,10 +19,8 @@ import gc
 import sys
 from collections.abc import Iterator, Sequence
 
-from plab.arguments import positive, to_write
 from plab.bench import paper, scaling, skips
 from plab.bench.bound import FOOTPRINTS, bandwidth, least_ms, traffic
-from plab.bench.table import progress, report
 from plab.bench.workload import (
     FORWARD,
     GRADIENT,
@@ -33,9 +31,12 @@ from plab.bench.workload import (
     restart_peak_rss,
     time_calls,
 )
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, task_list, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import progress, report
 from plab.config import Config, load_config
-from plab.suite import suite_tasks, task_list
+from plab.config.suite import suite_tasks
+from plab.errors import tell
 
 __all__ = ["COLUMNS", "main", "rows"]
 
@@ -141,11 +142,7 @@ def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m plab.bench.speed",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("plab.bench.speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
     parser.add_argument("--device", help="the same as sim.device=...")
@@ -202,7 +199,7 @@ def _run(options: argparse.Namespace) -> int:
 def _not_measured(refused: Sequence[str]) -> int:
     """Say what needs more memory than there may be; the exit code."""
     for line in refused:
-        print(f"plab: not measured: {line}", file=sys.stderr)
+        tell(f"not measured: {line}")
     return 1 if refused else 0
 
 
@@ -228,7 +225,7 @@ def _run_skips(options: argparse.Namespace) -> int:
         again = ""
         if table[0]["device"] == "cuda" and table[0]["precision"] == "float32":
             again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
-        print(f"plab: results differ by more than rounding: {', '.join(broken)}{again}", file=sys.stderr)
+        tell(f"results differ by more than rounding: {', '.join(broken)}{again}")
     return 1 if broken else code
 
 

@@ -25,15 +25,15 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
-from plab.arguments import positive, to_write
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
-from plab.bench.table import report
-from plab.command import command_line
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
 from plab.config import ConfigError
+from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
-from plab.suite import suite_tasks
 
 __all__ = ["main", "run_cases", "run_refusals", "write_norms"]
 
@@ -198,7 +198,7 @@ def _speeds(simulator: Simulator, cases: Sequence[Case]) -> np.ndarray:
 @command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
-    parser = argparse.ArgumentParser(prog="plab.bench.stability", description=__doc__.splitlines()[0])
+    parser = Parser("plab.bench.stability", __doc__)
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
     parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
@@ -208,10 +208,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     what = "file for the gradient's norm per step back in time"
     parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
     cases = _cases(options)
     rows = (row for precision in options.precision for row in run_cases(cases, precision))
     table = list(report(COLUMNS, _chain(rows, options), options.csv))

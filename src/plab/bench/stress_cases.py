@@ -16,8 +16,8 @@ import numpy as np
 
 from plab.bench.common_scene import common_actions, common_scene
 from plab.config import build_scene, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.scene import Body, Manipulator, Scene, Vec3, vector3
-from plab.suite import SUITE_VARIANTS, suite_tasks
 
 __all__ = ["Case", "Plan", "refusals", "stress_cases"]
 

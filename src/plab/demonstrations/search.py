@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from plab.config import Config, build_scene
-from plab.config_types import TrajectoryConfig
+from plab.config import Config, TrajectoryConfig, build_scene
 from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.progress import show_progress

@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 
-from plab.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 
 __all__ = ["ENTRY_POINT", "register_suite", "register_task"]
 

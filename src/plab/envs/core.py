@@ -17,13 +17,13 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
+from plab.config.words import word_list
 from plab.errors import ArgumentError
 from plab.objective import OBSERVED_PARTICLES
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
-from plab.words import word_list
 
 if TYPE_CHECKING:
     import torch

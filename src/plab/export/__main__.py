@@ -1,78 +1,8 @@
-"""The command line of exports: ``python -m plab.export RESULT_FILE --format vtk`` writes for ParaView."""
+"""``python -m plab.export``: rollouts for ParaView and Blender; see :mod:`plab.cli.export`."""
 
-from __future__ import annotations
-
-import argparse
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
-from plab.arguments import folder
-from plab.command import command_line
-from plab.render.choice import make_parser, require_writable, rollout, settle
-from plab.render.graphics import RenderError, require_packages
-
-__all__ = ["main"]
-
-_USAGE = """\
-python -m plab.export RESULT_FILE [--format vtk|ply] [--output FOLDER]
-python -m plab.export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
-
-Writes the rollout of a run's best actions, or of the best actions known for a task, into a folder:
-  vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
-  ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
-Both hold the target's surface, too.
-
-EXAMPLES
-  python -m plab.export results/Rope-v1/adam/seed0-12ab34cd.h5
-  python -m plab.export task=Torus variant=2 --format ply --output torus
-"""
-
-
-@command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        argv: Arguments after the program's name; those of the process by default.
-
-    Returns:
-        Exit code: 0.
-    """
-    _run(_parse(argv))
-    return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    require_packages("exports need", {"pyvista": "PyVista"}, "render")
-    # Imported here: it loads the simulator, for which no mistake above should have to wait.
-    from plab.export.files import write_ply, write_vtk
-    from plab.render.recording import record_with_motion
-
-    output: Path = arguments.output
-    recording = record_with_motion(*rollout(arguments))
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        (write_vtk if arguments.format == "vtk" else write_ply)(recording, output, arguments.every or 1)
-    except OSError as error:
-        raise RenderError(f"cannot write {output}: {error.strerror or error}") from error
-    print(output)
-
-
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the arguments, checked as far as can be done without simulating."""
-    parser = make_parser(_USAGE, "the series")
-    add = parser.add_argument
-    add("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
-    add("--output", type=folder, metavar="FOLDER", help="by default named like the result or the task")
-    arguments = parser.parse_args(argv)
-    usual = settle(arguments, f"-{arguments.format}")
-    output = arguments.output = arguments.output or usual
-    require_writable(output / "target")
-    if output.is_dir() and any(output.iterdir()):
-        raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
-    return arguments
-
+from plab.cli.export import main
 
 if __name__ == "__main__":
     sys.exit(main())

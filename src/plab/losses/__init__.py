@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from plab.config_errors import ConfigError
+from plab.errors import ConfigError
 from plab.losses.registry import TERMS, check_terms
 from plab.plugins import load_object
 

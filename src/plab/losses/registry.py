@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from plab.config_errors import ConfigError, pick
+from plab.errors import ConfigError, pick
 
 __all__ = ["TERMS", "check_terms"]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.checks import cuda_is_usable
-from plab.config import build_scene, load_config
-from plab.config_types import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig
+from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
+from plab.config.checks import cuda_is_usable
+from plab.errors import tell
 from plab.objective import scores_from_iou, soft_iou
 from plab.problem import Problem, build_scenes, build_simulator
 from plab.render.graphics import RenderError
@@ -253,4 +252,4 @@ def _scores(problem: Problem, mass: np.ndarray) -> list[float]:
 @functools.cache
 def say(message: str) -> None:
     """Print a message, once however many runs it is true of."""
-    print(f"plab: {message}", file=sys.stderr)
+    tell(message)

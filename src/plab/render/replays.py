@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plab.config import ConfigError
-from plab.config_types import Config
+from plab.config import Config, ConfigError
 from plab.progress import show_progress
 from plab.render import recording
 from plab.render.graphics import RenderError, require_graphics

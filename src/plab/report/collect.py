@@ -14,15 +14,14 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from plab.config.selection import Selection, one_protocol, require_possible
+from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 from plab.errors import PlabError
 from plab.locks import held
-from plab.possible import require_possible
 from plab.report.methods import method, ordered
 from plab.report.splitting import SEED, split_rows
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows
-from plab.selection import Selection, one_protocol
-from plab.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
 
 __all__ = [
     "KEYS",
@@ -169,7 +168,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     Raises:
         plab.report.splitting.SplitError: If there is nothing to split.
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
-        plab.selection.SelectionError: If there are runs of several protocols.
+        plab.config.selection.SelectionError: If there are runs of several protocols.
         plab.config.ConfigError: If no run can be of the choice.
         plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
             can be read.

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from plab.config.suite import conf_folder
 from plab.report.methods import method
 from plab.report.reference import paper_table
 from plab.report.table import NOTHING, Table
-from plab.suite import conf_folder
 
 __all__ = ["hyperparameters"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from plab.config.suite import PAPER_METHODS
 from plab.families import FAMILIES, GRADIENT, RL
-from plab.suite import PAPER_METHODS
 
 __all__ = ["GRADIENT", "RL", "Method", "method", "ordered", "part"]
 

@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 from IPython.display import HTML, Image, Markdown, display
 
+from plab.config.selection import select
 from plab.examples import resolve
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
 from plab.report.measurements import Benchmark, measured
 from plab.report.table import Table, aligned
 from plab.results import ResultsError
-from plab.selection import select
 
 __all__ = ["benchmark", "gather", "say", "show_figure", "show_origin", "show_table"]
 

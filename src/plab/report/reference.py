@@ -7,7 +7,7 @@ from importlib.resources import files
 
 import pandas as pd
 
-from plab.suite import PAPER_SEEDS
+from plab.config.suite import PAPER_SEEDS
 
 __all__ = ["PAPER_SEED_COUNT", "paper_table"]
 

@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from plab.config.suite import SUITE_VARIANTS
 from plab.report.collect import Runs
 from plab.report.methods import GRADIENT, RL, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
 from plab.report.table import NOTHING, Table, number, spread
-from plab.suite import SUITE_VARIANTS
 
 __all__ = [
     "INTERVAL",

@@ -8,6 +8,7 @@ folders; ``python -m plab.results`` packs, checks and shows scores. What is load
 reading results is quick.
 """
 
+from plab.config.selection import lookup
 from plab.results.archive import pack, unpack
 from plab.results.checking import Problem, check
 from plab.results.curves import read_curves
@@ -29,7 +30,6 @@ from plab.results.schema import (
     result_path,
     row_count,
 )
-from plab.selection import lookup
 
 __all__ = [
     "BUDGETS",

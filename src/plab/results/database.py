@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from plab.config.selection import lookup
 from plab.results.schema import ResultsError
 from plab.results.store import DAMAGED, File, Store
-from plab.selection import lookup
 
 __all__ = ["COLUMNS", "Database", "Row", "run_number", "sql_value", "text"]
 

@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
+from plab.config.selection import lookup
 from plab.reading import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
 from plab.results.hdf5 import array, attributes, check_heaps, columns, groups, numbers, take, tree
 from plab.results.schema import (
@@ -33,7 +34,6 @@ from plab.results.schema import (
     stored_config,
     stored_hash,
 )
-from plab.selection import lookup
 
 __all__ = [
     "cause",

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
+from plab.config.selection import lookup
 from plab.reading import member_bytes
 from plab.results.database import COLUMNS, Database, Row
 from plab.results.files import explained, opened, opened_archive, opened_image, split_archive
@@ -33,7 +34,6 @@ from plab.results.schema import (
 )
 from plab.results.store import File
 from plab.results.workers import each
-from plab.selection import lookup
 
 __all__ = [
     "Row",

@@ -10,12 +10,12 @@ from typing import Any
 
 import pandas as pd
 
+from plab.config.selection import Selection, SelectionError, lookup
 from plab.errors import PlabError
 from plab.results.curves import add_iterations
 from plab.results.database import Row
 from plab.results.loading import readable_rows, up_to_date, warn_of
 from plab.results.schema import ResultsError
-from plab.selection import Selection, SelectionError, lookup
 
 __all__ = ["QueryError", "connect", "query", "scores"]
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.config.selection import lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
-from plab.selection import lookup
 
 __all__ = [
     "ARCHIVE_SUFFIX",

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from plab.command import TRACEBACK, traceback_wanted
-from plab.config_errors import ConfigError
+from plab.errors import TRACEBACK, ConfigError, traceback_wanted
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.results.schema import resume_fault

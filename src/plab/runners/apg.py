@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from plab.config_types import ApgConfig
+from plab.config import ApgConfig
 from plab.runners.common import policy_episode, shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.runner import Runner, Step, Track

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from plab.command import out_of_memory
-from plab.config_errors import ConfigError
 from plab.envs.core import EpisodeBatch
+from plab.errors import ConfigError, out_of_memory
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError

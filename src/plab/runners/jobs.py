@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from plab.config_errors import ConfigError
-from plab.errors import PlabError
+from plab.errors import ConfigError, PlabError
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
 from plab.results.schema import counts_last

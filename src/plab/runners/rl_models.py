@@ -16,8 +16,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from plab.config import PpoConfig, SacConfig, Td3Config
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.config import OffPolicyConfig, PpoConfig, RlConfig, SacConfig, Td3Config
 from plab.families import family
 from plab.runners.captured import CapturedPPO, CapturedSAC, CapturedTD3
 

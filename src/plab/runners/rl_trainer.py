@@ -17,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.config import OffPolicyConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.model_state import model_arrays, restore_model

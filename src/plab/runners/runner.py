@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from plab.checks import check_packages
 from plab.config import ConfigError
+from plab.config.checks import check_packages
 from plab.families import family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from plab.config_types import TrajectoryConfig
+from plab.config import TrajectoryConfig
 from plab.families import family
 from plab.runners.common import measures, shared_problem
 from plab.runners.model_state import alike, moments

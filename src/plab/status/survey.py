@@ -12,15 +12,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
+from plab.config.selection import Selection, SelectionError, one_protocol, require_possible
+from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.locks import held
-from plab.possible import require_possible
 from plab.results import ResultsError, Row, row_count
 from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes, columns, numbers
 from plab.results.loading import readable_rows
 from plab.results.schema import parse_member
-from plab.selection import Selection, SelectionError, one_protocol
-from plab.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.tally import MOST_RUNS
 
 __all__ = ["NAMES", "STATES", "Group", "Run", "Survey", "survey"]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from plab.config import Config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.examples import example_archive
 from plab.report.budgets import BUDGETS
 from plab.report.methods import GRADIENT, method
@@ -23,7 +24,6 @@ from plab.submissions.files import read
 from plab.submissions.members import SubmissionError
 from plab.submissions.schema import UNSEEN, Configuration, Digests, Submission
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, Verification, read_verification
-from plab.suite import SUITE_VARIANTS, suite_tasks
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["Board", "Line", "Section", "board"]

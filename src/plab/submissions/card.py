@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from plab.config_errors import pick
+from plab.errors import pick
 from plab.submissions.members import SubmissionError
 
 __all__ = ["CARD_BYTES", "Card", "CardError", "parse_card"]

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from plab.config import Config, load_config
+from plab.config.selection import Selection
 from plab.render import RenderError, recording
 from plab.report.series import load_rows
 from plab.results import Row
 from plab.results.loading import readable_rows
-from plab.selection import Selection
 from plab.submissions.files import read
 from plab.submissions.members import SubmissionError
 from plab.submissions.playing import play_policy

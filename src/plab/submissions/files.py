@@ -18,6 +18,7 @@ import yaml
 from numpy.lib import format as npy
 
 import plab
+from plab.config.suite import suite_tasks
 from plab.results.files import replace_file
 from plab.submissions.card import CardError, parse_card
 from plab.submissions.members import Limits, SubmissionError, read_members
@@ -31,7 +32,6 @@ from plab.submissions.schema import (
     Entry,
     Submission,
 )
-from plab.suite import suite_tasks
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["encode", "inconsistency", "read", "write"]

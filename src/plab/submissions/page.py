@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from plab.config.suite import suite_tasks
 from plab.report.budgets import BUDGETS
 from plab.report.templates import asset, render
 from plab.submissions.board import Board
 from plab.submissions.verifying import TOLERANCE
-from plab.suite import suite_tasks
 
 __all__ = ["write_leaderboard"]
 

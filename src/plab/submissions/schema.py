@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from plab.config import Config, build_scene, load_config, variant_task
+from plab.config.suite import SUITE_VARIANTS
 from plab.submissions.card import Card
 from plab.submissions.members import SubmissionError
-from plab.suite import SUITE_VARIANTS
 from plab.targets import load_release_target
 
 __all__ = [

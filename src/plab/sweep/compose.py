@@ -17,9 +17,9 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.checks import check_sources
 from plab.config import Config, ConfigError, finish
-from plab.config_errors import COMPOSE_ERRORS, explain
+from plab.config.checks import check_sources
+from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.scene import SceneError
 from plab.targets import TargetError
 

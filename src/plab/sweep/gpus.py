@@ -12,8 +12,8 @@ from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any
 
 from plab import runners
-from plab.checks import cuda_devices
-from plab.config_errors import ConfigError
+from plab.config.checks import cuda_devices
+from plab.errors import ConfigError
 from plab.progress import forward_to, show_several
 from plab.reuse import SimulatorCache
 from plab.sweep.carry import Carrier, look_up

@@ -26,7 +26,7 @@ class TargetBody:
         center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
         size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
             its bounding box.
-        file: Mesh only: OBJ, STL or PLY file, as of :class:`plab.config_types.BodyConfig`.
+        file: Mesh only: OBJ, STL or PLY file, as of :class:`plab.config.BodyConfig`.
         sha256: Mesh only: SHA-256 of the file, likewise.
     """
 

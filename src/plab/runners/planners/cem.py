@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from plab.config_types import CemConfig
+from plab.config import CemConfig
 from plab.runners.planners.sampling import Sampler
 
 __all__ = ["Cem"]

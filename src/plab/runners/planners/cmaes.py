@@ -15,7 +15,7 @@ import torch
 from cmaes import CMA
 from torch import Tensor
 
-from plab.config_types import CmaesConfig
+from plab.config import CmaesConfig
 from plab.runners.planners.sampling import Sampler
 
 __all__ = ["Cmaes"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from plab.config_types import MppiConfig
+from plab.config import MppiConfig
 from plab.runners.planners.sampling import Sampler
 
 __all__ = ["Mppi"]

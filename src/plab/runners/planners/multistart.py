@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from plab.config_types import MultistartConfig
+from plab.config import MultistartConfig
 from plab.runners.model_state import alike, moments
 from plab.runners.planners.planner import Asking, Planner, Request, Start
 

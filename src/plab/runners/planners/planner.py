@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from plab.config_types import MethodConfig, PlannerConfig, StagesConfig
+from plab.config import MethodConfig, PlannerConfig, StagesConfig
 from plab.families import family
 from plab.problem import Episodes, build_scenes
 from plab.runners.common import shared_problem, torch_settings

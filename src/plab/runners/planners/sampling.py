@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from plab.config_types import SamplerConfig
+from plab.config import SamplerConfig
 from plab.runners.planners.planner import Asking, Planner, Request
 
 __all__ = ["Sampler", "actions_of", "knots_of"]

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from plab.config_types import StagesConfig
+from plab.config import StagesConfig
 from plab.runners.planners.planner import Asking, Planner, Start, make_planner
 
 __all__ = ["Stages"]

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 from torch.optim import Adam
 
-from plab.config_types import OffPolicyConfig, RlConfig
+from plab.config import OffPolicyConfig, RlConfig
 from plab.families import family
 from plab.runners.captured import CapturedUpdate
 from plab.runners.population.draws import Block, Draws

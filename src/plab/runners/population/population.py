@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from plab.config_types import RlConfig
+from plab.config import RlConfig
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
 from plab.runners.population.agents import Agents

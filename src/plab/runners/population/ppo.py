@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from plab.config_types import PpoConfig
+from plab.config import PpoConfig
 from plab.runners.captured import require_capturable
 from plab.runners.population.agents import Agents
 from plab.runners.population.networks import adam, descend, linear, mlp

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from plab.config_types import OffPolicyConfig
+from plab.config import OffPolicyConfig
 from plab.results import ResultsError
 from plab.results.files import cause
 

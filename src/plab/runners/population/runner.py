@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from plab.config import RlConfig
-from plab.config_types import OffPolicyConfig
+from plab.config import OffPolicyConfig, RlConfig
 from plab.envs.core import spaces
 from plab.problem import build_scenes
 from plab.results import ResultsError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 from torch import Tensor, nn
 
-from plab.config_types import Td3Config
+from plab.config import Td3Config
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.population.replay import Samples

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from plab.config_errors import ConfigError
-from plab.config_types.ranges import (
+from plab.config.ranges import (
     at_least,
     folder_name,
     fraction,
@@ -18,6 +17,7 @@ from plab.config_types.ranges import (
     vector,
     widths,
 )
+from plab.errors import ConfigError
 from plab.families import family
 from plab.losses.registry import check_terms
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
@@ -18,23 +17,12 @@ from omegaconf.errors import (
 )
 from yaml import MarkedYAMLError, YAMLError
 
-from plab.errors import PlabError
+from plab.errors import ConfigError, pick
 
-__all__ = ["COMPOSE_ERRORS", "ConfigError", "explain", "pick"]
+__all__ = ["COMPOSE_ERRORS", "explain"]
 
 COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
 """What composing a configuration raises where the configuration is wrong."""
-
-
-class ConfigError(PlabError, ValueError):
-    """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
-
-
-def pick(name: str, names: Sequence[str]) -> str:
-    """Return ``did you mean ...? choose from: ...`` for a name that is not among ``names``."""
-    close = difflib.get_close_matches(name.lower(), [n.lower() for n in names], n=1, cutoff=0.7)
-    guess = next((f"did you mean {n}? " for n in names if close and n.lower() == close[0]), "")
-    return f"{guess}choose from: {', '.join(names)}"
 
 
 LAUNCHER_EXTRAS = {

@@ -1,8 +1,9 @@
 """The configuration of a run: composed from files and overrides, checked, and turned into a scene.
 
-``conf/*.yaml`` holds every number, :mod:`plab.config_types` says which keys there are. Hydra composes the
-files, perhaps with a folder of the user's, and the overrides; :func:`finish` merges the chosen variant over
-the task and returns plain dataclasses, so that nothing that works with them knows Hydra or OmegaConf.
+``conf/*.yaml`` holds every number, the dataclasses beside this module say which keys there are. Hydra
+composes the files, perhaps with a folder of the user's, and the overrides; :func:`finish` merges the chosen
+variant over the task and returns plain dataclasses, so that nothing that works with them knows Hydra or
+OmegaConf.
 """
 
 from __future__ import annotations
@@ -19,59 +20,25 @@ from hydra.core.override_parser.types import OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.capacity import check_size
-from plab.config_errors import COMPOSE_ERRORS, ConfigError, explain, pick
-from plab.config_types import (
-    CONTACTS,
-    DEVICES,
-    PRECISIONS,
-    ApgConfig,
-    BodyConfig,
-    Config,
-    ManipulatorConfig,
-    MethodConfig,
-    PpoConfig,
-    ProtocolConfig,
-    RlConfig,
-    SacConfig,
-    SimConfig,
-    TaskConfig,
-    Td3Config,
-    TrajectoryConfig,
-)
+from plab.config.capacity import check_size
+from plab.config.errors import COMPOSE_ERRORS, explain
+from plab.config.run import Config
+from plab.config.suite import conf_folder
+from plab.config.task import TaskConfig
+from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
+from plab.config.words import parse, quote_folders, require_few, shortened, unusable, word_list
+from plab.config.yaml_files import require_plain
+from plab.errors import ConfigError, pick
 from plab.families import family, schemas
 from plab.plugins import search_in
-from plab.random_variant import draw_variant
 from plab.scene import Scene, vector3
-from plab.suite import conf_folder
-from plab.variants import RANDOM, merge_variant, undone_key, variant_changes
-from plab.words import parse, quote_folders, require_few, shortened, unusable, word_list
-from plab.yaml_files import require_plain
 
 __all__ = [
-    "CONTACTS",
-    "DEVICES",
     "EXPERIMENT",
     "GROUPS",
-    "PRECISIONS",
-    "ApgConfig",
-    "BodyConfig",
-    "Config",
-    "ConfigError",
-    "ManipulatorConfig",
-    "MethodConfig",
-    "PpoConfig",
-    "ProtocolConfig",
-    "RlConfig",
-    "SacConfig",
-    "SimConfig",
-    "TaskConfig",
-    "Td3Config",
-    "TrajectoryConfig",
     "build_scene",
     "check_overrides",
     "choices",
-    "conf_folder",
     "finish",
     "load_config",
     "variant_task",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+
+from plab.errors import ConfigError
 
 __all__ = [
     "PAPER_METHODS",
@@ -12,7 +13,6 @@ __all__ = [
     "conf_folder",
     "group_names",
     "suite_tasks",
-    "task_list",
 ]
 
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
@@ -31,14 +31,12 @@ def conf_folder() -> Path:
     Raises:
         plab.config.ConfigError: If the installation is incomplete.
     """
-    here = Path(__file__).resolve()
-    for folder in (here.parent / "conf", here.parents[2] / "conf"):
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "conf", package.parents[1] / "conf"):
         if (folder / "config.yaml").is_file():
             return folder
-    from plab.config_errors import ConfigError
-
     raise ConfigError(
-        f"no conf/config.yaml next to {here.parent}: the installation is incomplete, install plab again"
+        f"no conf/config.yaml next to {package}: the installation is incomplete, install plab again"
     )
 
 
@@ -50,18 +48,3 @@ def group_names(group: str) -> list[str]:
 def suite_tasks() -> list[str]:
     """Return the names of plab's own tasks, those of the files in ``conf/task``."""
     return group_names("task")
-
-
-def task_list(text: str) -> list[str]:
-    """Parse names of tasks with commas between them, for argparse.
-
-    Raises:
-        argparse.ArgumentTypeError: If there is no such task.
-    """
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in suite_tasks():
-            raise argparse.ArgumentTypeError(
-                f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}"
-            )
-    return names

@@ -1,15 +1,55 @@
-"""Arguments of command lines: numbers, words and files that are checked before anything is computed."""
+"""Arguments of command lines: a parser; numbers, words and files, checked before anything is computed."""
 
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
-from plab.errors import ArgumentError
+from plab.config.suite import suite_tasks
+from plab.errors import ArgumentError, pick
 
-__all__ = ["folder", "positive", "rates", "refuse_task", "seed", "sources_and_words", "to_write", "told"]
+__all__ = [
+    "Parser",
+    "folder",
+    "name_flag",
+    "positive",
+    "rates",
+    "refuse_task",
+    "seed",
+    "sources_and_words",
+    "task_list",
+    "to_write",
+    "told",
+]
+
+
+class Parser(ArgumentParser):
+    """The parser of a command line: a docstring is its help, a mistake an ArgumentError."""
+
+    def __init__(self, name: str, text: str) -> None:
+        """Make it without arguments.
+
+        Args:
+            name: Of the module that is run.
+            text: Docstring: a paragraph that says what it does, then whatever helps, such as examples.
+        """
+        what, _, more = text.partition("\n\n")
+        formed = RawDescriptionHelpFormatter
+        super().__init__(f"python -m {name}", description=what, epilog=more, formatter_class=formed)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what is wrong with the arguments, in one line; the usage is what ``--help`` is for."""
+        raise ArgumentError(name_flag(self, message))
+
+
+def name_flag(parser: ArgumentParser, message: str) -> str:
+    """Return a parser's message with the flags that there are, where it is about one that there is not."""
+    unknown = message.partition("unrecognized arguments: ")[2]
+    flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
+    return f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown.startswith("-") else message
 
 
 def positive(text: str) -> int:
@@ -50,6 +90,15 @@ def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         raise ArgumentError("the name of a folder is empty: give one, or . for this one")
     words = [argument for argument in arguments if "=" in argument and not os.path.exists(argument)]
     return [argument for argument in arguments if argument not in words], words
+
+
+def task_list(text: str) -> list[str]:
+    """Parse names of tasks with commas between them."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in suite_tasks():
+            raise ArgumentTypeError(f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}")
+    return names
 
 
 def folder(text: str) -> Path:

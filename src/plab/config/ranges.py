@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from plab.config_errors import ConfigError, pick
+from plab.errors import ConfigError, pick
 
 __all__ = [
     "at_least",

@@ -9,8 +9,8 @@ from dataclasses import asdict
 from typing import Any
 
 from plab.config import Config, ConfigError, load_config
+from plab.config.words import IDLE, parse
 from plab.results import result_path, row_count
-from plab.words import IDLE, parse
 
 __all__ = ["next_steps"]
 

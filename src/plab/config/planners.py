@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from plab.config_errors import ConfigError
-from plab.config_types.method import MethodConfig
-from plab.config_types.ranges import at_least, fraction, one_of, positive, unit, vector
+from plab.config.method import MethodConfig
+from plab.config.ranges import at_least, fraction, one_of, positive, unit, vector
+from plab.errors import ConfigError
 from plab.families import family
 
 __all__ = [

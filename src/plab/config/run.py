@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeVar
 
-from plab.config_errors import ConfigError
-from plab.config_types.method import DEVICES, MethodConfig
-from plab.config_types.ranges import at_least, folder_name, one_of, positive
-from plab.config_types.task import TaskConfig
+from plab.config.method import DEVICES, MethodConfig
+from plab.config.ranges import at_least, folder_name, one_of, positive
+from plab.config.task import TaskConfig
+from plab.errors import ConfigError
 from plab.losses.registry import check_terms
 from plab.scene import CHOICES
 

@@ -1,22 +1,37 @@
-"""Which runs are meant: the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
+"""Which runs are meant: the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``.
+
+What no run can be of is a mistake, not an empty table.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from plab.errors import PlabError
+from plab.config.suite import group_names, suite_tasks
+from plab.errors import ConfigError, PlabError
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
 
-__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "same", "select"]
+__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
 
 
 class SelectionError(PlabError, ValueError):
     """Words that select nothing meaningful; the message is one line that says what would do."""
+
+
+class _Run(Protocol):
+    """What is known of a run of the results: see :class:`plab.results.Row`."""
+
+    @property
+    def values(self) -> dict[str, Any]: ...
+
+    @property
+    def config(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
@@ -39,7 +54,7 @@ class Selection:
             config: Its configuration.
         """
         return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
-            any(same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
+            any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
         )
 
 
@@ -58,7 +73,7 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     # Imported here: without words nobody should have to wait for Hydra.
     from hydra.errors import HydraException
 
-    from plab.words import parse, shortened
+    from plab.config.words import parse, shortened
 
     choices: dict[str, list[str]] = {}
     keys: dict[str, list[str]] = {}
@@ -88,8 +103,7 @@ def _texts(override: Override) -> list[str]:
     """
     from hydra.core.override_parser.types import Glob, OverrideType
 
-    from plab.suite import group_names
-    from plab.words import require_few
+    from plab.config.words import require_few
 
     word, value = override.input_line, override.value()
     if override.type is not OverrideType.CHANGE or override.package is not None:
@@ -126,7 +140,7 @@ def lookup(config: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def same(value: Any, text: str) -> bool:
+def _same(value: Any, text: str) -> bool:
     """Return whether a configuration's value is what the text says: numbers by value, all else by letter."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower() == text.lower()
@@ -134,3 +148,75 @@ def same(value: Any, text: str) -> bool:
         return float(text) == value
     except ValueError:
         return False
+
+
+def require_possible(chosen: Selection, found: Iterable[_Run]) -> None:
+    """Refuse a choice as ``plab.run`` would refuse it.
+
+    What some run of the results has is possible, such as a task of somebody's own, which only the command
+    line of that run could compose.
+
+    Args:
+        chosen: The choice.
+        found: The runs of the results.
+
+    Raises:
+        ConfigError: If plab could compose no run with one of its values; says what would do.
+    """
+    runs = list(found) if chosen.choices or chosen.keys else []
+    for name, texts in chosen.choices.items():
+        present = {str(run.values[name]) for run in runs}
+        for text in texts:
+            if text not in present:
+                _require_composed(_attempts(name, text, chosen.choices))
+    for key, texts in chosen.keys.items():
+        for text in texts:
+            if not any(_same(lookup(run.config, key), text) for run in runs):
+                _require_composed(_attempts(key, text, chosen.choices))
+
+
+def _attempts(key: str, text: str, choices: Mapping[str, Sequence[str]]) -> list[list[str]]:
+    """Return overrides of which some have to compose; none where only the user's own files could say."""
+    # Imported here: who chooses nothing should not have to wait for Hydra.
+    from plab.config.variants import RANDOM
+
+    tasks, methods = choices.get("task", suite_tasks()), choices.get("method", group_names("method"))
+    word = _word(key, text)
+    if key == "variant" or key.startswith("task."):
+        drawn = re.fullmatch(rf"{RANDOM}(\d+)", text) if key == "variant" else None
+        words = [f"variant={RANDOM}", f"seed_scene={drawn[1]}"] if drawn else [word]
+        return [[f"task={task}", *words] for task in tasks] if {*tasks} <= {*suite_tasks()} else []
+    if key.startswith("method."):
+        return [[f"method={one}", word] for one in methods] if {*methods} <= {*group_names("method")} else []
+    return [[word]]
+
+
+def _word(key: str, text: str) -> str:
+    from hydra.errors import HydraException
+
+    from plab.config.words import parse, quoted
+
+    try:
+        (override,) = parse([f"{key}={text}"])
+    except HydraException:
+        return f"{key}={quoted(text)}"
+    return f"{key}={quoted(text)}" if override.is_sweep_override() else f"{key}={text}"
+
+
+def _require_composed(attempts: Sequence[list[str]]) -> None:
+    """Compose until one of the attempts succeeds.
+
+    Raises:
+        ConfigError: If none can: what is wrong with the one that came closest.
+    """
+    from plab.config.compose import load_config
+
+    errors = []
+    for words in attempts:
+        try:
+            load_config(words)
+            return
+        except ConfigError as error:
+            errors.append(error)
+    if errors:
+        raise next((error for error in errors if not str(error).startswith("unknown key")), errors[0])

@@ -1,13 +1,19 @@
-"""The table of a benchmark: rows printed, and written to a CSV file, as they come."""
+"""Tables: how all command lines print and write them."""
 
 from __future__ import annotations
 
 import csv
+import json
+import math
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-__all__ = ["markdown", "progress", "report"]
+__all__ = ["markdown", "print_table", "progress", "report"]
+
+_NUMBER = re.compile(r"([-+]?(\d[\d,]*(\.\d+)?(e[-+]\d+)?|inf))?")
 
 
 def report(
@@ -16,7 +22,7 @@ def report(
     path: Path | None,
     widths: Mapping[str, int] | None = None,
 ) -> list[Mapping[str, object]]:
-    """Print a table and write it to a file if there is one.
+    """Print a table, as its rows come, and write it to a file if there is one.
 
     Args:
         columns: Names of the columns, in order.
@@ -44,6 +50,41 @@ def report(
             _append(path, values, "a")
         table.append(row)
     return table
+
+
+def print_table(
+    columns: Sequence[str], rows: Iterable[Sequence[Any]], form: str = "text", digits: int = 6
+) -> None:
+    """Print a table; what there is no value of is empty, in JSON null.
+
+    Args:
+        columns: Names of the columns, in order.
+        rows: A value for each column.
+        form: ``text``, with columns of numbers aligned to the right, ``csv``, or ``json``, a list of objects.
+        digits: Digits of numbers with a fraction, as text.
+    """
+    cells = [[None if value is None or value != value else value for value in row] for row in rows]
+    if form == "json":
+        # JSON has no infinite numbers.
+        shown = [[str(value) if value in (math.inf, -math.inf) else value for value in row] for row in cells]
+        print(json.dumps([dict(zip(columns, row, strict=True)) for row in shown], indent=1))
+    elif form == "csv":
+        csv.writer(sys.stdout, lineterminator="\n").writerows([columns, *cells])
+    else:
+        texts = [[_text(value, digits) for value in row] for row in cells]
+        parts = []
+        for name, *column in zip(columns, *texts, strict=True):
+            width = max(map(len, (name, *column)))
+            right = bool(column) and all(map(_NUMBER.fullmatch, column))
+            parts.append([cell.rjust(width) if right else cell.ljust(width) for cell in (name, *column)])
+        for line in zip(*parts, strict=True):
+            print("  ".join(line).rstrip())
+
+
+def _text(value: Any, digits: int) -> str:
+    if value is None:
+        return ""
+    return f"{value:.{digits}g}" if isinstance(value, float) else " ".join(str(value).split())
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from plab.config_errors import ConfigError
+from plab.errors import ConfigError
 
 __all__ = ["require_plain"]
 

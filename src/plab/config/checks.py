@@ -6,7 +6,9 @@ import ctypes
 import sys
 from importlib.util import find_spec
 
-from plab.config import Config, ConfigError, build_scene
+from plab.config.compose import build_scene
+from plab.config.run import Config
+from plab.errors import ConfigError
 from plab.targets import check_target, load_release_target
 
 __all__ = ["check_device", "check_packages", "check_sources", "cuda_devices", "cuda_is_usable"]

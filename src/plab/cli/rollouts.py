@@ -5,20 +5,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plab.arguments import positive, sources_and_words, to_write
-from plab.checks import check_sources
+from plab.cli.arguments import Parser, positive, sources_and_words, to_write
 from plab.config import load_config
+from plab.config.checks import check_sources
+from plab.config.selection import one_protocol, select
+from plab.config.words import IDLE, require_effect
 from plab.examples import EXAMPLES, resolve
 from plab.render.graphics import RenderError
-from plab.selection import one_protocol, select
-from plab.words import IDLE, require_effect
 
 if TYPE_CHECKING:
-    from plab.config_types import Config
+    from plab.config import Config
 
 __all__ = ["WITHOUT_EFFECT", "make_parser", "require_writable", "rollout", "settle"]
 
@@ -26,28 +26,20 @@ WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
 """Keys of a configuration that change no picture."""
 
 
-def make_parser(usage: str, every: str) -> argparse.ArgumentParser:
-    """Return a parser with the arguments that choose a rollout; mistakes in them are RenderErrors.
+def make_parser(name: str, text: str, every: str) -> Parser:
+    """Return a parser with the arguments that choose a rollout.
 
     Args:
-        usage: What ``--help`` says first.
+        name: As :class:`plab.cli.arguments.Parser` takes it.
+        text: The same.
         every: What has a frame every K environment steps.
     """
-    parser = argparse.ArgumentParser(usage=usage, allow_abbrev=False)
-    parser.add_argument(
-        "what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run"
-    )
-    parser.add_argument(
-        "--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps"
-    )
-    parser.add_argument(
-        "--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for python -m plab.run"
-    )
-
-    def refuse(message: str) -> NoReturn:
-        raise RenderError(message)
-
-    parser.error = refuse  # type: ignore[method-assign]
+    parser = Parser(name, text)
+    add = parser.add_argument
+    add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run")
+    add("--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps")
+    what = "folder with tasks of your own, as for python -m plab.run"
+    add("--config-dir", metavar="FOLDER", help=what)
     return parser
 
 

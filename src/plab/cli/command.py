@@ -9,21 +9,17 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar, cast
 
-from plab.arguments import told
-from plab.errors import PlabError
+from plab.cli.arguments import told
+from plab.errors import TRACEBACK, PlabError, out_of_memory, tell, traceback_wanted
 
 __all__ = [
     "EXIT_BROKEN_PIPE",
     "EXIT_BUG",
     "EXIT_INTERRUPTED",
     "EXIT_USER_ERROR",
-    "TRACEBACK",
     "command_line",
     "complain",
-    "out_of_memory",
-    "traceback_wanted",
 ]
 
 EXIT_USER_ERROR = 2
@@ -33,18 +29,13 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 """What a shell says of a program that a closed pipe has ended."""
 
-TRACEBACK = "PLAB_TRACEBACK"
-"""Variable of the environment that lets a bug through with its traceback."""
 
-Main = TypeVar("Main", bound=Callable[..., int])
-
-
-def command_line(main: Main) -> Main:
+def command_line(main: Callable[[Sequence[str] | None], int | None]) -> Callable[..., int]:
     """Let a command line answer what goes wrong in one line.
 
     Args:
         main: Takes the arguments after the program's name, those of the process if None; returns the exit
-            code.
+            code, None for 0.
 
     Returns:
         The same; where it raises, it says in one line what, and returns 2 for what the user can put right,
@@ -75,29 +66,18 @@ def command_line(main: Main) -> Main:
                 raise
             return complain(_bug(error), EXIT_BUG)
 
-    return cast(Main, answered)
+    return answered
 
 
 def complain(message: str, code: int = EXIT_USER_ERROR) -> int:
     """Print a line on standard error; return the exit code."""
-    with suppress(BrokenPipeError):
-        print(f"plab: {' '.join(message.split())}", file=sys.stderr)
+    tell(message)
     return code
 
 
-def out_of_memory(error: MemoryError) -> str:
-    """Return one line about memory that is lacking; Python's own error says nothing."""
-    return str(error) or "this computer has too little memory for that: close something, or ask for less"
-
-
-def traceback_wanted() -> bool:
-    """Whether bugs are to be shown with their tracebacks."""
-    return bool(os.environ.get(TRACEBACK))
-
-
-def _exit_code(main: Callable[..., int], argv: Sequence[str] | None) -> int:
+def _exit_code(main: Callable[[Sequence[str] | None], int | None], argv: Sequence[str] | None) -> int:
     try:
-        return main(argv)
+        return main(argv) or 0
     except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):
             # Rich's answer to a closed pipe.

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any
 
-from plab.config_errors import ConfigError
-from plab.config_types import Config, MethodConfig, SimConfig
+from plab.config.method import MethodConfig
+from plab.config.run import Config, SimConfig
+from plab.errors import ConfigError
 from plab.scene import Scene
 from plab.sizes import OBSERVED, computer_bytes, gigabytes, largest, scene_bytes
 

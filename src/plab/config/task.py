@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from plab.config_errors import ConfigError
-from plab.config_types.ranges import at_least, folder_name, positive, vector
+from plab.config.ranges import at_least, folder_name, positive, vector
+from plab.errors import ConfigError
 from plab.scene import Body, Manipulator, SceneError, make_body
 from plab.shape_files import ShapeError, pinned
 from plab.targets import TargetError, make_recipe

@@ -19,7 +19,8 @@ from hydra.core.override_parser.types import (
 )
 from hydra.errors import HydraException
 
-from plab.config_errors import ConfigError, explain
+from plab.config.errors import explain
+from plab.errors import ConfigError
 from plab.tally import MOST_RUNS
 
 __all__ = [

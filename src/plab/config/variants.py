@@ -1,26 +1,39 @@
-"""``variant=random``: a start and a target drawn from the ranges in the task's section ``random``.
+"""Variants: the changes that make one particular start and target out of a task.
 
-What is drawn depends on the task and on ``seed_scene`` alone: not on the method's seed, the machine, the grid
-or the number of particles.
+Those of ``variant=random`` are drawn from the ranges in the task's section ``random``. What is drawn depends
+on the task and on ``seed_scene`` alone: not on the method's seed, the machine, the grid or the number of
+particles.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config_errors import ConfigError, explain, pick
-from plab.config_types import RandomConfig, RangeConfig, TaskConfig
+from plab.config.errors import explain
+from plab.config.task import RandomConfig, RangeConfig, TaskConfig
+from plab.config.words import parse
+from plab.errors import ConfigError, pick
 from plab.scene import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
-from plab.variants import variant_changes
 
-__all__ = ["ATTEMPTS", "FIRST_TARGET_SEED", "draw_variant"]
+__all__ = [
+    "ATTEMPTS",
+    "FIRST_TARGET_SEED",
+    "RANDOM",
+    "draw_variant",
+    "merge_variant",
+    "undone_key",
+    "variant_changes",
+]
+
+RANDOM = "random"
+"""The variant that is drawn, by :func:`draw_variant`, instead of looked up."""
 
 ATTEMPTS = 100
 """How often a scene is drawn until one is valid."""
@@ -33,6 +46,64 @@ FIRST_TARGET_SEED = 1000
 
 # Entropy besides seed_scene, one per purpose; 0 would be the same as none.
 _NUMBERS, _TARGET_SEED = 1, 2
+
+
+def variant_changes(task: DictConfig, name: str) -> DictConfig:
+    """Return what a variant changes.
+
+    Args:
+        task: A task, with all its variants.
+        name: Name of the variant.
+
+    Raises:
+        ConfigError: If the task has no such variant.
+    """
+    if name not in task.variants:
+        names = [*task.variants, *([RANDOM] if task.random else [])]
+        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
+        raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
+    changes = task.variants[name]
+    if not isinstance(changes, DictConfig):
+        expected = "a part of the task's structure, or {}"
+        raise ConfigError(f"variant {name} of task {task.name} must be {expected}, not {changes}")
+    return changes
+
+
+def merge_variant(task: DictConfig, name: str) -> DictConfig:
+    """Return the task with a variant merged over it, and no other variant.
+
+    Args:
+        task: A task, with all its variants.
+        name: Name of the variant.
+
+    Raises:
+        ConfigError: If the variant does not exist or does not fit the task.
+    """
+    changes = variant_changes(task, name)
+    try:
+        merged = OmegaConf.merge(task, changes)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
+    merged.variants = {name: changes}
+    merged.random = {}
+    return cast(DictConfig, merged)
+
+
+def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:
+    """Return the first key that an override sets and the variant sets again: the override has no effect.
+
+    Args:
+        changes: What the variant changes.
+        overrides: As on the command line.
+
+    Returns:
+        The key below ``task``, or None.
+    """
+    for override in parse(overrides):
+        group, _, key = override.key_or_group.partition(".")
+        if group == "task" and key and OmegaConf.select(changes, key) is not None:
+            return key
+    return None
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:

@@ -1,0 +1,53 @@
+"""One static page from a folder of submissions: tracks, equal budgets, one table for each protocol.
+
+python -m plab.leaderboard submissions
+python -m plab.leaderboard submissions --out public/leaderboard
+
+Run plab.verify on the folder before: what it has kept is shown. The page is index.html; it needs no server.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import plab
+from plab.cli.arguments import Parser, folder
+from plab.cli.command import command_line
+from plab.errors import tell
+from plab.submissions.board import board
+from plab.submissions.page import write_leaderboard
+from plab.targets.store import PHYSICS_VERSION
+
+__all__ = ["main"]
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    options = _parse(arguments)
+    origin = {
+        "command": shlex.join(["python", "-m", "plab.leaderboard", *arguments]),
+        "plab": plab.__version__,
+        "physics": PHYSICS_VERSION,
+        "overrides": options.overrides,
+    }
+    made = board(options.folder, options.overrides)
+    path = write_leaderboard(made, options.out, origin)
+    for line in made.left_out:
+        tell(f"left out: {line}")
+    print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("plab.leaderboard", __doc__)
+    parser.add_argument("folder", type=folder, help="folder of submissions")
+    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
+    parser.add_argument("overrides", nargs="*", help=what)
+    what = "folder to write to (default: reports/leaderboard)"
+    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
+    return parser.parse_intermixed_args(argv)

@@ -1,0 +1,161 @@
+"""The paper's tables and curves, notebooks and a page of all results, from result files alone.
+
+python -m plab.report tables --results results --out reports/tables
+python -m plab.report curves --results runs.plab.zip.xz task=Rope,Move seed=0,1,2
+python -m plab.report notebooks --results example
+python -m plab.report tables --results first second --split folder
+python -m plab.report html --results example         real runs that come with plab
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from plab.cli.arguments import Parser, folder, sources_and_words
+from plab.cli.command import command_line
+from plab.config.selection import select
+from plab.errors import tell
+from plab.examples import EXAMPLES, resolve
+from plab.progress import show_progress
+from plab.render import RenderError, require_graphics
+from plab.report.collect import NAMES, Runs, collect, collect_ablation
+from plab.report.measurements import ACCURACY, SPEED, measured
+from plab.report.media import lacking, remove_earlier
+from plab.report.notebooks import NOTEBOOKS, execute, require_packages
+from plab.report.page import Page
+from plab.report.writing import origin, write_curves, write_tables
+from plab.results import ResultsError
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["main"]
+
+YIELD_STRESS = "task.yield_stress"
+
+_PAUSE = 5.0
+"""How often ``--follow`` looks at the runs [s]."""
+
+_QUIET = 2
+"""Looks in a row at which no run is under way, until it ends: a sweep's next run may be about to begin."""
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    options = _parse(arguments)
+    command = shlex.join(["python", "-m", "plab.report", *arguments])
+    out = options.out or Path("reports") / options.what
+    before, quiet = None, 0
+    while True:
+        runs = collect(options.results, select(options.words, NAMES), options.split)
+        quiet = 0 if runs.under_way else quiet + 1
+        now = (runs.digest, quiet == 0)
+        if now != before and not (options.follow and runs.table.empty and not quiet):
+            made = _MAKERS[options.what](runs, options, out, command)
+            _tell(runs, made, out)
+            before = now
+        if not options.follow or quiet == _QUIET:
+            return
+        time.sleep(_PAUSE)
+
+
+def _make_tables(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    benchmark = None if options.speed is None else measured(options.speed, SPEED)
+    return f"{len(write_tables(runs, out, command, benchmark))} tables"
+
+
+def _make_curves(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    ablation = collect_ablation(options.results, select(options.words, NAMES), YIELD_STRESS)
+    errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
+    return f"{len(write_curves(runs, ablation, out, command, errors))} figures"
+
+
+def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    _require_runs(runs, options.results)
+    given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
+    given |= {"BENCH": str(options.bench), "COMMAND": command}
+    require_packages()
+    with show_progress("notebooks", 0, len(NOTEBOOKS), plain_every=1) as report:
+        return f"{len(execute(NOTEBOOKS, given, out, report))} notebooks"
+
+
+def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
+    _require_runs(runs, options.results)
+    page = Page(runs, out, origin(runs, command, deep=False), every_run=options.every_run)
+    wanted = lacking(page.shown, out) if options.pictures else {}
+    # It is complete but for pictures before the first of them is drawn.
+    page.write(drawing=bool(wanted))
+    if wanted:
+        try:
+            _draw(wanted, lambda: page.write(drawing=True))
+        except RenderError as error:
+            tell(f"without pictures: {error}")
+        finally:
+            remove_earlier(page.shown, out)
+            page.write()
+    return "index.html"
+
+
+def _draw(wanted: Mapping[Path, Mapping[str, tuple[Path, bool]]], drawn: Callable[[], None]) -> None:
+    require_graphics()
+    # Imported here: all else needs neither PyVista nor Taichi.
+    from plab.render.replays import draw_runs
+
+    draw_runs(wanted, drawn)
+
+
+_MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
+"""What can be made; each returns what it was in a word or two."""
+
+
+def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
+    if runs.table.empty:
+        where = ", ".join(map(str, sources))
+        raise ResultsError(
+            f"there are no finished runs to show in {where}: python -m plab.run task=Move makes one, "
+            "and --results example shows those that come with plab"
+        )
+
+
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("plab.report", __doc__)
+    parser.add_argument("what", choices=list(_MAKERS), help="what to make")
+    parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
+    what = f"folder of results, archive, or several; {', '.join(EXAMPLES)}: real runs (default: results)"
+    parser.add_argument("--results", nargs="+", default=["results"], help=what)
+    parser.add_argument("--out", type=folder, help="folder to write to (default: reports/<what>)")
+    what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
+    parser.add_argument("--speed", type=Path, help=what)
+    what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
+    parser.add_argument("--accuracy", type=Path, help=what)
+    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
+    parser.add_argument("--bench", type=folder, default=Path("reports/bench"), help=what)
+    what = "html: draw no pictures, which takes minutes; those that are there stay"
+    parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
+    what = "key whose values are put side by side as if they were methods: method.lr, or folder, or seed"
+    parser.add_argument("--split", default="", metavar="KEY", help=what)
+    what = "make it again whenever runs have ended, until none is under way"
+    parser.add_argument("--follow", action="store_true", help=what)
+    what = "html: picture and film of every method's best run, which takes several times as long"
+    parser.add_argument("--every-run", action="store_true", help=what)
+    options = parser.parse_intermixed_args(argv)
+    # Words after --results are taken for folders.
+    sources, words = sources_and_words(options.results)
+    options.words += words
+    options.results = [resolve(item) for item in sources or ["results"]]
+    return options
+
+
+def _tell(runs: Runs, what: str, out: Path) -> None:
+    expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
+    print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
+    for line in runs.left_out():
+        print(line)

@@ -1,0 +1,215 @@
+"""Show, query, check, pack and unpack result files.
+
+python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
+python -m plab.results sql "select ..." [results]             any question to the tables of docs/results.md
+python -m plab.results check [results ...]                    check every file against the schema
+python -m plab.results pack results --output runs.plab.zip.xz    put finished runs into one small file
+python -m plab.results unpack runs.plab.zip.xz --output folder   make files of them again
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from plab.cli.arguments import Parser, folder, positive, sources_and_words
+from plab.cli.command import command_line
+from plab.cli.tables import print_table
+from plab.config.selection import Selection, SelectionError, require_possible, select
+from plab.errors import tell
+from plab.examples import EXAMPLES, resolve
+from plab.results.archive import pack, unpack
+from plab.results.checking import check
+from plab.results.loading import readable_rows
+from plab.results.query import query, scores
+from plab.results.schema import STATUSES, ResultsError
+
+__all__ = ["main"]
+
+SELECTABLE = ("task", "variant", "method", "seed", "status")
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns:
+        Exit code: 0, 1 if ``check`` found something wrong, 2 for a mistake of the user's.
+    """
+    options = _parse(argv)
+    return options.run(options)
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser("plab.results", __doc__)
+    commands = {
+        "scores": _scores_arguments,
+        "sql": _sql_arguments,
+        "check": _check_arguments,
+        "pack": _pack_arguments,
+        "unpack": _unpack_arguments,
+    }
+    parser.add_argument("command", choices=commands, help="what to do; it has a --help of its own")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER)
+    first = parser.parse_args(argv)
+    arguments = commands[first.command]
+    # Not by subparsers: they cannot have words on both sides of an option.
+    command = Parser(f"plab.results {first.command}", arguments.__doc__ or "")
+    arguments(command)
+    return command.parse_intermixed_args(first.arguments)
+
+
+def _scores_arguments(parser: Parser) -> None:
+    """Print runs with their scores, a line each."""
+    what = f"{_SOURCES} (default: results), and runs: task=Rope,Move seed=0,1,2; by default those finished"
+    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
+    what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
+    parser.add_argument("--keys", type=_names, default=[], help=what)
+    parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
+    parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
+    parser.set_defaults(run=_scores)
+    _add_forms(parser)
+
+
+def _sql_arguments(parser: Parser) -> None:
+    """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
+    parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
+    parser.add_argument(
+        "source", nargs="?", type=_source, default=Path("results"), help=f"{_SOURCES} (default: results)"
+    )
+    parser.set_defaults(run=_sql)
+    _add_forms(parser)
+
+
+def _add_forms(parser: Parser) -> None:
+    form = parser.add_mutually_exclusive_group()
+    for name, what in (("csv", "CSV"), ("json", "a JSON list of objects")):
+        what = f"print {what} instead of a text"
+        form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
+    parser.set_defaults(form="text")
+
+
+def _source(text: str) -> Path:
+    return resolve(folder(text))
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+_SOURCES = f"folder, file, archive, or one of {', '.join(EXAMPLES)}"
+
+
+def _check_arguments(parser: Parser) -> None:
+    """Check every file against the schema; exit code 1 if anything is wrong."""
+    parser.add_argument(
+        "sources", nargs="*", type=_source, default=[Path("results")], help=f"each a {_SOURCES}"
+    )
+    parser.set_defaults(run=_check)
+
+
+def _pack_arguments(parser: Parser) -> None:
+    """Put runs into one small file."""
+    parser.add_argument("source", type=_source, help=_SOURCES)
+    what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
+    parser.add_argument("words", nargs="*", help=what)
+    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
+    parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
+    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
+    parser.add_argument("--digits", type=positive, help=what)
+    parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
+    parser.set_defaults(run=_pack)
+
+
+def _unpack_arguments(parser: Parser) -> None:
+    """Make files of the runs of an archive; files that are there stay."""
+    parser.add_argument("archive", type=_source, help="archive to read")
+    parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
+    parser.set_defaults(run=_unpack)
+
+
+def _scores(options: argparse.Namespace) -> int:
+    sources, words = sources_and_words(options.arguments)
+    chosen = _finished_unless_said(select(words, SELECTABLE))
+    table, unreadable = scores(
+        list(map(resolve, sources or ["results"])),
+        chosen,
+        options.keys,
+        options.sort,
+        descending=options.descending,
+    )
+    _tell_left_out(unreadable)
+    print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
+    return 0
+
+
+def _sql(options: argparse.Namespace) -> int:
+    columns, rows, unreadable = query(options.source, options.query)
+    _tell_left_out(unreadable)
+    print_table(columns, rows, options.form)
+    return 0
+
+
+def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
+    for error in unreadable:
+        tell(f"left out: {error}")
+
+
+def _check(options: argparse.Namespace) -> int:
+    count = wrong = 0
+    for source in options.sources:
+        for _, problem in check(source):
+            count += 1
+            if problem is not None:
+                wrong += 1
+                print(f"{problem.path}: {problem.reason}: {problem.advice}", flush=True)
+    print(
+        f"{count} run(s) checked, {wrong} with something wrong"
+        if wrong
+        else f"{count} run(s) checked, all well"
+    )
+    return 1 if wrong else 0
+
+
+def _pack(options: argparse.Namespace) -> int:
+    chosen = select(options.words, SELECTABLE)
+    _require_statuses(chosen.choices.get("status", ()))
+    if options.words:
+        others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
+        require_possible(Selection(others, chosen.keys), readable_rows(options.source)[0])
+    chosen = _finished_unless_said(chosen)
+    done = pack(
+        options.source,
+        options.output,
+        wanted=lambda row: chosen(row.values, row.config),
+        keep_masses=options.masses,
+        keep_resume=options.resume,
+        digits=options.digits,
+    )
+    _tell_left_out(done.unreadable)
+    size = f"{done.archive_bytes / 1e3:.1f} kB, {done.archive_bytes / done.runs / 1e3:.1f} kB per run"
+    before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
+    print(f"{options.output}: {done.runs} run(s), {size}{before}")
+    return 0
+
+
+def _require_statuses(texts: Sequence[str]) -> None:
+    for text in texts:
+        if text not in (*STATUSES, "all"):
+            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
+
+
+def _finished_unless_said(chosen: Selection) -> Selection:
+    """Take finished runs unless the words say something about the status."""
+    statuses = chosen.choices.setdefault("status", ["finished"])
+    if statuses == ["all"]:
+        del chosen.choices["status"]
+    return chosen
+
+
+def _unpack(options: argparse.Namespace) -> int:
+    written, kept = unpack(options.archive, options.output)
+    there = f", {kept} there already" if kept else ""
+    print(f"{options.output}: {written} run(s) written{there}")
+    return 0

@@ -1,0 +1,104 @@
+"""The configuration of a run: its types, how it is composed and checked, and which runs words choose.
+
+:func:`load_config` composes what ``conf/*.yaml`` and overrides say into a :class:`Config`. What it offers is
+imported when it is asked for: readers of results do without Hydra.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from plab.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plab.config.compose import (
+        EXPERIMENT,
+        GROUPS,
+        build_scene,
+        check_overrides,
+        choices,
+        finish,
+        load_config,
+        variant_task,
+    )
+    from plab.config.method import (
+        CONTACTS,
+        DEVICES,
+        ApgConfig,
+        MethodConfig,
+        OffPolicyConfig,
+        PpoConfig,
+        RlConfig,
+        SacConfig,
+        Td3Config,
+        TrajectoryConfig,
+    )
+    from plab.config.planners import (
+        CemConfig,
+        CmaesConfig,
+        MppiConfig,
+        MultistartConfig,
+        PlannerConfig,
+        SamplerConfig,
+        StagesConfig,
+    )
+    from plab.config.run import PRECISIONS, Config, ProtocolConfig, SimConfig, TargetsConfig
+    from plab.config.suite import conf_folder
+    from plab.config.task import (
+        BodyConfig,
+        DrawConfig,
+        ManipulatorConfig,
+        RandomConfig,
+        RangeConfig,
+        TaskConfig,
+    )
+
+__all__ = [
+    "CONTACTS",
+    "DEVICES",
+    "EXPERIMENT",
+    "GROUPS",
+    "PRECISIONS",
+    "ApgConfig",
+    "BodyConfig",
+    "CemConfig",
+    "CmaesConfig",
+    "Config",
+    "ConfigError",
+    "DrawConfig",
+    "ManipulatorConfig",
+    "MethodConfig",
+    "MppiConfig",
+    "MultistartConfig",
+    "OffPolicyConfig",
+    "PlannerConfig",
+    "PpoConfig",
+    "ProtocolConfig",
+    "RandomConfig",
+    "RangeConfig",
+    "RlConfig",
+    "SacConfig",
+    "SamplerConfig",
+    "SimConfig",
+    "StagesConfig",
+    "TargetsConfig",
+    "TaskConfig",
+    "Td3Config",
+    "TrajectoryConfig",
+    "build_scene",
+    "check_overrides",
+    "choices",
+    "conf_folder",
+    "finish",
+    "load_config",
+    "variant_task",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a part of the configuration when it is asked for."""
+    # The types first: composing needs them while it is imported.
+    for part in ("method", "planners", "task", "run", "suite", "compose") if name in __all__ else ():
+        module = import_module(f"{__name__}.{part}")
+        if name in module.__all__:
+            return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
