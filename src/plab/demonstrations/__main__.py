@@ -38,10 +38,9 @@ from plab.words import IDLE, require_effect
 HEADING = """\
 # Demonstrations
 
-The best actions known for each configuration, replayed in the hard contact model; made by `python -m
-plab.demonstrations --markdown docs/demonstrations.md`. [suite.md](suite.md) explains them. "Steps" counts up
-to the last motion, "score at rest" is what doing nothing reaches, the IoUs are soft: of the start and the
-target, and of the target and itself.
+Look up what the best actions known reach, in the hard contact model, and what there is to gain; made by `python -m
+plab.demonstrations --markdown docs/demonstrations.md`, which prints more columns. [suite.md](suite.md#demonstrations)
+explains them. A cell has variants 1 to 5; the IoUs are soft: of the start and the target, of the target and itself.
 
 """
 
@@ -185,10 +184,17 @@ def _show(table: pd.DataFrame, markdown: Path | None) -> None:
         printed.add_row(*row)
     Console().print(printed)
     if markdown is not None:
-        lines = [list(table.columns), ["---"] * len(table.columns), *cells]
-        table_text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
         markdown.parent.mkdir(parents=True, exist_ok=True)
-        markdown.write_text(HEADING + table_text, encoding="utf-8")
+        markdown.write_text(HEADING + _by_task(table), encoding="utf-8")
+
+
+def _by_task(table: pd.DataFrame) -> str:
+    """Return a line per task as Markdown, with a number per variant in a cell."""
+    names = ["score", "IoU at start", "IoU of target"]
+    lines = [["task", "target", *names], ["---"] * (2 + len(names))]
+    for (task, target), rows in table.groupby(["task", "target"], sort=False):
+        lines.append([task, target, *(", ".join(f"{value:.3f}" for value in rows[name]) for name in names)])
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
