@@ -38,9 +38,8 @@ from plab.words import IDLE, require_effect
 HEADING = """\
 # Demonstrations
 
-Look up what the best actions known reach, in the hard contact model, and what there is to gain; made by `python -m
-plab.demonstrations --markdown docs/demonstrations.md`, which prints more columns. [suite.md](suite.md#demonstrations)
-explains them. A cell has variants 1 to 5; the IoUs are soft: of the start and the target, of the target and itself.
+Look up what the best actions known score in each variant, in the hard contact model; made by `python -m
+plab.demonstrations --markdown docs/demonstrations.md`, which prints more. [suite.md](suite.md#demonstrations) explains.
 
 """
 
@@ -189,11 +188,11 @@ def _show(table: pd.DataFrame, markdown: Path | None) -> None:
 
 
 def _by_task(table: pd.DataFrame) -> str:
-    """Return a line per task as Markdown, with a number per variant in a cell."""
-    names = ["score", "IoU at start", "IoU of target"]
-    lines = [["task", "target", *names], ["---"] * (2 + len(names))]
+    """Return the scores as Markdown, a line per task and a column per variant."""
+    variants = list(dict.fromkeys(table["variant"]))
+    lines = [["task", "target", *variants], ["---"] * (2 + len(variants))]
     for (task, target), rows in table.groupby(["task", "target"], sort=False):
-        lines.append([task, target, *(", ".join(f"{value:.3f}" for value in rows[name]) for name in names)])
+        lines.append([task, target, *(f"{score:.3f}" for score in rows["score"])])
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
