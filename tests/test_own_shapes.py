@@ -34,7 +34,7 @@ CONF = EXAMPLE / "conf"
 STAR = (CONF / "task" / "Star.yaml").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "own_shapes.md").read_text(encoding="utf-8")
 MISTAKES_PAGE = (ROOT / "docs" / "developers" / "mistakes.md").read_text(encoding="utf-8")
-ANSWERED = MISTAKES_PAGE[MISTAKES_PAGE.index("## Shapes of one's own") :]
+ANSWERED = MISTAKES_PAGE.partition("## Shapes of one's own")[2].partition("\n## ")[0]
 QUICK = ("sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2", "sim.particles_scale=0.1")
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)

@@ -20,7 +20,7 @@ OWN = ROOT / "examples" / "own_task" / "conf"
 DUMBBELL = (OWN / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "own_task.md").read_text(encoding="utf-8")
 MISTAKES_PAGE = (ROOT / "docs" / "developers" / "mistakes.md").read_text(encoding="utf-8")
-ANSWERED = MISTAKES_PAGE[MISTAKES_PAGE.index("## A task of one's own") : MISTAKES_PAGE.index("## Shapes of one's own")]
+ANSWERED = MISTAKES_PAGE.partition("## A task of one's own")[2].partition("\n## ")[0]
 COARSE = ("sim.grid_size=16", "sim.dt=4e-4", "sim.horizon=3", "method.iterations=2", "progress=false")
 
 

@@ -39,7 +39,8 @@ HEADING = """\
 # Demonstrations
 
 Look up what the best actions known score in each variant, in the hard contact model; made by `python -m
-plab.demonstrations --markdown docs/demonstrations.md`, which prints more. [suite.md](suite.md#demonstrations) explains.
+plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
+[suite.md](suite.md#demonstrations) explains.
 
 """
 
