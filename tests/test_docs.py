@@ -187,6 +187,31 @@ def test_python_that_is_shown_parses_and_imports_what_there_is(code):
                 importlib.import_module(f"{node.module}.{name}")
 
 
+USERS = sorted((ROOT / "docs").glob("*.md"))
+"""Pages for users; what was measured on which day, and what was tried, is in docs/developers."""
+
+
+def words(page: Path) -> int:
+    return len(page.read_text(encoding="utf-8").split())
+
+
+def test_pages_for_users_are_short():
+    assert words(ROOT / "README.md") <= 1400
+    assert words(ROOT / "docs" / "performance.md") <= 1000
+    assert sum(map(words, USERS)) <= 16_000, {page.name: words(page) for page in USERS}
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *USERS], ids=lambda page: page.stem)
+def test_pages_for_users_say_what_holds(page):
+    text = page.read_text(encoding="utf-8")
+    diary = r"\b(earlier|formerly|now|nowadays|(another|that) day|that time|aims? (was|were)|we tried)\b"
+    assert [match[0] for match in re.finditer(diary, text, re.IGNORECASE)] == []
+    # A page opens with what its reader can do with it: words, before any table, picture or command.
+    title, _, rest = text.partition("\n")
+    assert title.startswith("# ")
+    assert page.stem == "README" or re.match(r"\n[A-Z]", rest)
+
+
 def test_the_curves_that_are_shown_have_the_colours_of_the_methods():
     with Image.open(ROOT / "docs" / "images" / "reward_per_task.png") as picture:
         seen = {color for _, color in picture.convert("RGB").getcolors(picture.width * picture.height)}

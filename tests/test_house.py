@@ -145,7 +145,7 @@ def test_hooks_have_the_versions_of_the_constraints():
 def test_every_dependency_has_its_reason_and_its_pin():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     wanted = names(text[text.index("dependencies = [") : text.index("[tool.hatch")]) - {"plab"}
-    reasons = (ROOT / "docs" / "dependencies.md").read_text(encoding="utf-8")
+    reasons = (ROOT / "docs" / "developers" / "dependencies.md").read_text(encoding="utf-8")
     explained = {name.lower() for name in re.findall(r"^\| `([^`\[]+)", reasons, re.MULTILINE)}
     assert wanted == explained
     pins = {line.partition("==")[0].lower().replace("_", "-") for line in open(ROOT / "constraints.txt")}

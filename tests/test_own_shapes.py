@@ -33,6 +33,8 @@ EXAMPLE = ROOT / "examples" / "own_shapes"
 CONF = EXAMPLE / "conf"
 STAR = (CONF / "task" / "Star.yaml").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "own_shapes.md").read_text(encoding="utf-8")
+MISTAKES_PAGE = (ROOT / "docs" / "developers" / "mistakes.md").read_text(encoding="utf-8")
+ANSWERED = MISTAKES_PAGE.partition("## Shapes of one's own")[2].partition("\n## ")[0]
 QUICK = ("sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2", "sim.particles_scale=0.1")
 
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
@@ -88,8 +90,8 @@ def example(*overrides: str) -> Config:
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+def blocks(language: str, text: str = PAGE) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def arguments(line: str) -> list[str]:
@@ -149,7 +151,7 @@ def test_a_run_of_each_kind_is_recorded_and_read_without_the_files(files, tmp_pa
     assert stored(tmp_path / path)[1].shape == (2, 3)
 
 
-CONSOLE = re.findall(r"^\$ (.*)\n(plab: .*)$", "\n".join(blocks("console")), re.MULTILINE)
+CONSOLE = re.findall(r"^\$ (.*)\n(plab: .*)$", "\n".join(blocks("console", ANSWERED)), re.MULTILINE)
 
 
 @pytest.mark.parametrize(("command", "answer"), CONSOLE, ids=[command[90:] for command, _ in CONSOLE])
@@ -161,7 +163,7 @@ def test_answers_to_commands(capsys, files, monkeypatch, command, answer):
     assert re.fullmatch(re.escape(answer).replace(r"\.\.\.", ".*"), line)
 
 
-ANSWERS = dict(re.findall(r"^\| (.*) \| `(plab: .*)` \|$", PAGE, re.MULTILINE))
+ANSWERS = dict(re.findall(r"^\| (.*) \| `(plab: .*)` \|$", ANSWERED, re.MULTILINE))
 MISTAKES = {
     "a mesh with a hole": obj(BOX, SIDES[1:]),
     "one face turned round": obj(BOX, [SIDES[0][::-1], *SIDES[1:]]),

@@ -19,11 +19,13 @@ ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "examples" / "own_task" / "conf"
 DUMBBELL = (OWN / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "own_task.md").read_text(encoding="utf-8")
+MISTAKES_PAGE = (ROOT / "docs" / "developers" / "mistakes.md").read_text(encoding="utf-8")
+ANSWERED = MISTAKES_PAGE.partition("## A task of one's own")[2].partition("\n## ")[0]
 COARSE = ("sim.grid_size=16", "sim.dt=4e-4", "sim.horizon=3", "method.iterations=2", "progress=false")
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+def blocks(language: str, text: str = PAGE) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def arguments(line: str) -> list[str]:
@@ -96,7 +98,7 @@ def test_python_as_on_the_page(monkeypatch):
     assert names["scene"].name == "Dumbbell"
 
 
-CONSOLE = re.findall(r"^\$ (.*)\n(plab: .*)$", "\n".join(blocks("console")), re.MULTILINE)
+CONSOLE = re.findall(r"^\$ (.*)\n(plab: .*)$", "\n".join(blocks("console", PAGE + ANSWERED)), re.MULTILINE)
 
 
 @pytest.mark.parametrize(("command", "answer"), CONSOLE, ids=[command for command, _ in CONSOLE])
@@ -106,7 +108,7 @@ def test_answers_to_commands(capsys, command, answer):
     assert re.fullmatch(re.escape(answer).replace(r"\.\.\.", ".*"), line)
 
 
-ANSWERS = dict(re.findall(r"^\| (.*) \| `(plab: .*)` \|$", PAGE, re.MULTILINE))
+ANSWERS = dict(re.findall(r"^\| (.*) \| `(plab: .*)` \|$", ANSWERED, re.MULTILINE))
 MISTAKES = {
     "`sise: [0.06]` instead of `size`": ("    size: [0.06]        # sphere", "    sise: [0.06]  # sphere"),
     "no `yield_stress`": ("yield_stress: 200.0", "#"),

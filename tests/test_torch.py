@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from same_runs import assert_same_numbers, stopped_at
 
 pytestmark = pytest.mark.physics
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "rl.md"
 HORIZON = 3
 COARSE = [
     "task=Rope",
@@ -126,20 +124,6 @@ def test_there_is_no_second_derivative(problem: Problem) -> None:
     (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.sum().backward()
-
-
-def test_example_of_the_page_runs(capsys) -> None:
-    (example,) = (
-        block
-        for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-        if "plab.torch" in block
-    )
-    coarse = '"sim.grid_size=32", "sim.substeps=5", "sim.particles_scale=0.03"'
-    shorter = example.replace('["task=Move"]', f'["task=Move", {coarse}]').replace("50, 6", f"{HORIZON}, 6")
-    assert shorter != example and len(example.splitlines()) <= 15
-    exec(compile(shorter, str(PAGE), "exec"), {})
-    losses = [float(line) for line in capsys.readouterr().out.split()]
-    assert len(losses) > 1 and losses[-1] < losses[0]
 
 
 # ---------------------------------------------------------------- method=apg

@@ -177,7 +177,7 @@ def apply(page: str, root: Path) -> None:
 def copy_with_the_disc(folder: Path) -> Path:
     shutil.copytree(SRC, folder / "src", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "conf", folder / "conf")
-    apply("own_manipulator.md", folder)
+    apply("developers/own_manipulator.md", folder)
     return folder / "src"
 
 

@@ -42,6 +42,11 @@ PYTHON = {
         "Usable alone.",
         ("plab.sim.simulator", "plab.sim.forward", "plab.sim.recording", "plab.sim.state", "plab.sim.skips"),
     ),
+    "methods": (
+        "Methods",
+        "What a method outside plab fills in.",
+        ("plab.families", "plab.runners.runner"),
+    ),
     "environments": (
         "Environments",
         "",

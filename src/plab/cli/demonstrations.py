@@ -36,10 +36,9 @@ __all__ = ["Replay", "main", "replay"]
 HEADING = """\
 # Demonstrations
 
-The best actions known for each configuration, replayed in the hard contact model; made by `python -m
-plab.demonstrations --markdown docs/demonstrations.md`. [suite.md](suite.md) explains them. "Steps" counts up
-to the last motion, "score at rest" is what doing nothing reaches, the IoUs are soft: of the start and the
-target, and of the target and itself.
+Look up what the best actions known score in each variant, in the hard contact model; made by `python -m
+plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
+[suite.md](suite.md#demonstrations) explains.
 
 """
 
@@ -169,12 +168,19 @@ def _row(item: Replay) -> dict[str, object]:
 
 
 def _show(rows: Sequence[dict[str, object]], path: Path | None) -> None:
-    """Print a table, and write it as Markdown if asked to."""
+    """Print a table; if asked to, write its scores as Markdown, a line per task and a column per variant."""
     shown = [{k: f"{v:.3f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     print_table(list(shown[0]), [list(row.values()) for row in shown])
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(HEADING + markdown(list(shown[0]), shown), encoding="utf-8")
+        by_task: dict[object, dict[str, object]] = {}
+        for row in shown:
+            line = by_task.setdefault(row["task"], {"task": row["task"], "target": row["target"]})
+            line[str(row["variant"])] = row["score"]
+        columns = list(dict.fromkeys(name for line in by_task.values() for name in line))
+        # Of fewer variants, a cell stays empty.
+        lines = [dict.fromkeys(columns, "") | line for line in by_task.values()]
+        path.write_text(HEADING + markdown(columns, lines), encoding="utf-8")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

@@ -1,11 +1,11 @@
 """Result files: one HDF5 file per run, replaced atomically while it runs, loaded into pandas afterwards.
 
-The layout is described in docs/results.md. A run that is under way keeps its state in ``<name>.partial.h5``,
-rewritten as a whole now and then: a process killed at any moment leaves the previous, readable version
-behind, from which the same command resumes. Finished runs can be packed into archives, which load like
-folders; ``python -m plab.results`` packs, checks and shows scores. What is loaded is kept in a database
-(``database.py``), for the next time and for SQL. This package imports neither torch nor taichi, so that
-reading results is quick.
+The layout is described in docs/developers/format.md. A run that is under way keeps its state in
+``<name>.partial.h5``, rewritten as a whole now and then: a process killed at any moment leaves the previous,
+readable version behind, from which the same command resumes. Finished runs can be packed into archives, which
+load like folders; ``python -m plab.results`` packs, checks and shows scores. What is loaded is kept in a
+database (``database.py``), for the next time and for SQL. This package imports neither torch nor taichi, so
+that reading results is quick.
 """
 
 from plab.config.selection import lookup
