@@ -48,6 +48,9 @@ OPTIONAL = {
     "release",
     "file",
     "sha256",
+    "youngs_modulus",
+    "poisson_ratio",
+    "yield_stress",
 }
 """Fields that a YAML may leave out: those of chopsticks, and what variant=random draws, and
 what the release has in other numbers."""

@@ -265,7 +265,12 @@ class Scene:
         is faster, because the grid's mass is that of the particles, summed (Irons and Treharne, 1971), and
         symplectic Euler is stable while omega dt < 2. Of several materials the stiffest counts.
         """
-        return self.dx / math.sqrt(max((m.stiffness for m in self.materials), default=self.material.stiffness))
+        return self.dx / math.sqrt(self._stiffest.stiffness)
+
+    @property
+    def _stiffest(self) -> Material:
+        """Material of the body that limits the time step."""
+        return max(self.materials, key=lambda m: m.stiffness, default=self.material)
 
     def facts(self) -> dict[str, Any]:
         """Return everything in it as plain data, meshes excepted; what a body shares with the scene is left
@@ -289,11 +294,11 @@ class Scene:
             material.validate(f"bodies[{number}]: ")
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
-        stiffest = max(self.materials, key=lambda m: m.stiffness, default=self.material)
+        stiffest = self._stiffest
+        young, nu = stiffest.youngs_modulus, stiffest.poisson_ratio
         _require(
             self.stable_dt > STIFFEST,
-            f"youngs_modulus {stiffest.youngs_modulus:g} and poisson_ratio {stiffest.poisson_ratio:g} are too "
-            "stiff for any time step: lower them",
+            f"youngs_modulus {young:g} and poisson_ratio {nu:g} are too stiff for any time step: lower them",
         )
         if self.dt > self.stable_dt:
             steps = math.ceil(self.substeps * self.dt / self.stable_dt)

@@ -65,8 +65,8 @@ class CudaEngine(ThreadPhases):
     @property
     def sorts(self) -> bool:
         """Whether particles are put into the order of their cells before each step: where there are so many
-        that atomics, not launches, take the time. Not where bodies have materials of their own: whose particle
-        is where does not follow them."""
+        that atomics, not launches, take the time. Not where bodies have materials of their own, which are
+        looked up by place."""
         return not self.resident and not self.mixed
 
     # -- public methods -----------------------------------------------------------------------------
