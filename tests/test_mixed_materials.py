@@ -262,6 +262,12 @@ def test_torch_differentiates_by_the_materials(simulator):
     states = simulate(simulator, u, material=material, every_step=False)
     (gradient,) = torch.autograd.grad(states.x[..., 1].square().sum(), material)
     assert gradient.shape == (len(SCENES), 2, 3)
+    shared = torch.tensor([[4000.0, 0.2, 30.0]] * len(SCENES), dtype=torch.float64, requires_grad=True)
+    sums = []
+    for given in (shared, shared[:, None].expand(-1, 2, -1)):
+        states = simulate(simulator, u, material=given, every_step=False)
+        sums += torch.autograd.grad(states.x[..., 1].square().sum(), shared)
+    assert torch.equal(*sums) and (sums[0] != 0).any()
     step = np.zeros_like(table)
     step[0, 1, 0] = 1.0
 

@@ -176,7 +176,11 @@ class _States(torch.autograd.Function):
         actions, material, *initial = ctx.likes
         gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions)]
         if ctx.needs_input_grad[4]:
-            gradients.append(torch.as_tensor(ctx.simulator.material_gradient()).to(material))
+            by_material = ctx.simulator.material_gradient()
+            if by_material.ndim > material.ndim:
+                # One for all bodies.
+                by_material = by_material.sum(axis=1)
+            gradients.append(torch.as_tensor(by_material).to(material))
         else:
             gradients.append(None)
         wanted = ctx.needs_input_grad[5:]

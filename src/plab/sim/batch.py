@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -94,12 +95,15 @@ def with_material(
     )
 
 
-def _with_own(scene: Scene, values: dict[str, list[float]]) -> Scene:
+def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
     """Return a scene whose bodies have these values, by name and body."""
     if scene.material_count == 1:
         # The one material is the scene's, and no body's own.
-        bodies = tuple(replace(body, **dict.fromkeys(values)) for body in scene.bodies)
-        return replace(scene, bodies=bodies, **{name: column[0] for name, column in values.items()})
-    columns = [{name: column[b] for name, column in values.items()} for b in range(len(scene.bodies))]
+        none: dict[str, Any] = dict.fromkeys(values)
+        shared: dict[str, Any] = {name: column[0] for name, column in values.items()}
+        return replace(scene, bodies=tuple(replace(body, **none) for body in scene.bodies), **shared)
+    columns: list[dict[str, Any]] = [
+        {name: column[b] for name, column in values.items()} for b in range(len(scene.bodies))
+    ]
     bodies = tuple(replace(body, **own) for body, own in zip(scene.bodies, columns, strict=True))
     return replace(scene, bodies=bodies)
