@@ -137,7 +137,7 @@ def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
     """Return mapping of von Mises plasticity in Hencky strain.
 
     Args:
-        scene: The scene, for the yield stress and the shear modulus.
+        scene: The scene, for the yield stresses and the shear moduli.
         F_trial: Trial deformation gradients, shape [particle, 3, 3].
 
     Returns:
@@ -147,7 +147,9 @@ def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
     e = S.clamp(min=MIN_SINGULAR_VALUE).log()
     e_dev = e - e.mean(dim=-1, keepdim=True)
     length = ((e_dev * e_dev).sum(dim=-1, keepdim=True) + 1e-8).sqrt()
-    dg = length - scene.yield_stress / (2.0 * scene.shear_modulus)
+    yield_stress = _of_particles(scene, len(F_trial), [m.yield_stress for m in scene.materials])
+    mu = _of_particles(scene, len(F_trial), [m.shear_modulus for m in scene.materials])
+    dg = length - yield_stress / (2.0 * mu)
     yields = dg > 0
     dg = torch.where(yields, dg, 0.0)  # an infinite yield stress must not reach the other branch's derivative
     F_yield = (U * (e - dg / length * e_dev).exp()[..., None, :]) @ Vt
@@ -157,7 +159,17 @@ def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
 def kirchhoff_stress(scene: Scene, F: Tensor, R: Tensor) -> Tensor:
     """Fixed-corotated stress tau = 2 mu (F - R) F^T + lambda J (J - 1) I (Kirchhoff), [particle, 3, 3]."""
     J = torch.linalg.det(F)[:, None, None]
-    return 2.0 * scene.shear_modulus * (F - R) @ F.mT + scene.lame_lambda * J * (J - 1.0) * _identity()
+    mu = _of_particles(scene, len(F), [m.shear_modulus for m in scene.materials])[..., None]
+    lam = _of_particles(scene, len(F), [m.lame_lambda for m in scene.materials])[..., None]
+    return 2.0 * mu * (F - R) @ F.mT + lam * J * (J - 1.0) * _identity()
+
+
+def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:
+    """One value per body as one per particle, shape [particle, 1]; any count is of a scene's only body."""
+    table = torch.tensor(values, dtype=torch.float64)
+    if len(table) == 1:
+        return table.expand(count)[:, None]
+    return torch.cat([v.expand(b.particles) for v, b in zip(table, scene.bodies, strict=True)])[:, None]
 
 
 # -------------------------------------------------------------------------------------------------- transfers

@@ -1,20 +1,33 @@
-"""Bodies of plasticine: spheres, boxes, and what a mesh bounds."""
+"""Bodies of plasticine: spheres, boxes, and what a mesh bounds; and what they are made of."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from plab.errors import PlabError
 from plab.mesh import Mesh, load_mesh
 
-__all__ = ["BODY_SHAPES", "Body", "MeshBody", "SceneError", "Vec3", "make_body", "vector3"]
+__all__ = [
+    "BODY_SHAPES",
+    "MATERIAL_KEYS",
+    "Body",
+    "Material",
+    "MeshBody",
+    "SceneError",
+    "Vec3",
+    "make_body",
+    "vector3",
+]
 
 BODY_SHAPES = ("sphere", "box", "mesh")
 """What :attr:`Body.shape` may be."""
+
+MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
+"""Fields of a :class:`Material`, in the order in which gradients have them."""
 
 Vec3 = tuple[float, float, float]
 
@@ -34,6 +47,54 @@ class SceneError(PlabError, ValueError):
 
 
 @dataclass(frozen=True)
+class Material:
+    """What a body is made of.
+
+    Attributes:
+        youngs_modulus: Young's modulus E.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
+    """
+
+    youngs_modulus: float
+    poisson_ratio: float
+    yield_stress: float
+
+    @property
+    def shear_modulus(self) -> float:
+        """Lame parameter mu."""
+        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """Lame parameter lambda."""
+        nu = self.poisson_ratio
+        return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+    @property
+    def stiffness(self) -> float:
+        """3 lambda + 2 mu, which limits the time step."""
+        return 3.0 * self.lame_lambda + 2.0 * self.shear_modulus
+
+    def validate(self, label: str = "") -> None:
+        """Check that it can be simulated.
+
+        Args:
+            label: What begins the message.
+
+        Raises:
+            SceneError: If a value is out of range.
+        """
+        young, nu = self.youngs_modulus, self.poisson_ratio
+        if not 0 < young < math.inf:
+            raise SceneError(f"{label}youngs_modulus {young:g} must be positive and finite")
+        if not 0 <= nu < 0.5:
+            raise SceneError(f"{label}poisson_ratio {nu:g} is outside [0, 0.5)")
+        if not self.yield_stress >= 0:
+            raise SceneError(f"{label}yield_stress {self.yield_stress:g} must not be negative")
+
+
+@dataclass(frozen=True)
 class Body:
     """One body of plasticine, filled with particles at t = 0.
 
@@ -42,12 +103,24 @@ class Body:
         center: Centre [domain units].
         size: Sphere: ``(radius,)``. Box: full edge lengths ``(x, y, z)``.
         particles: Number of particles drawn uniformly inside.
+        youngs_modulus: Young's modulus E; the scene's if None.
+        poisson_ratio: Poisson ratio nu; the scene's if None.
+        yield_stress: von Mises yield stress; the scene's if None.
     """
 
     shape: str
     center: Vec3
     size: tuple[float, ...]
     particles: int
+    youngs_modulus: float | None = field(default=None, kw_only=True)
+    poisson_ratio: float | None = field(default=None, kw_only=True)
+    yield_stress: float | None = field(default=None, kw_only=True)
+
+    @property
+    def own_material(self) -> dict[str, float]:
+        """What it does not share with the scene, by the names of :data:`MATERIAL_KEYS`."""
+        values = {key: getattr(self, key) for key in MATERIAL_KEYS}
+        return {key: value for key, value in values.items() if value is not None}
 
     def half_extent(self) -> np.ndarray:
         """Half of the bounding box's edges, shape [3]."""
@@ -87,6 +160,7 @@ def make_body(
     particles: int,
     file: str | None = None,
     sha256: str | None = None,
+    **material: float | None,
 ) -> Body:
     """Make a body of what a configuration says, reading the file of a mesh.
 
@@ -98,6 +172,7 @@ def make_body(
         particles: Number of particles.
         file: Mesh only: OBJ, STL or PLY file, see :func:`plab.shape_files.pinned`.
         sha256: What the file has to hold, likewise.
+        **material: What it does not share with the scene, by the names of :data:`MATERIAL_KEYS`.
 
     Raises:
         SceneError: If a mesh has no file, or something else has one.
@@ -106,7 +181,7 @@ def make_body(
     if shape != "mesh":
         if file is not None:
             raise SceneError(f"file has no effect with shape {shape}: leave it out, or use shape mesh")
-        return Body(shape, vector3(center), tuple(size), particles)
+        return Body(shape, vector3(center), tuple(size), particles, **material)
     if file is None:
         raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
-    return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256))
+    return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256), **material)

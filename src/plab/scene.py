@@ -8,19 +8,32 @@ from it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from plab.bodies import BODY_SHAPES, Body, MeshBody, SceneError, Vec3, make_body, vector3
+from plab.bodies import (
+    BODY_SHAPES,
+    MATERIAL_KEYS,
+    Body,
+    Material,
+    MeshBody,
+    SceneError,
+    Vec3,
+    make_body,
+    vector3,
+)
 
 __all__ = [
     "CHOICES",
     "MANIPULATOR_SHAPES",
+    "MATERIAL_KEYS",
     "ROLL_RADIUS",
     "Body",
     "Manipulator",
     "ManipulatorShape",
+    "Material",
     "MeshBody",
     "Scene",
     "SceneError",
@@ -149,9 +162,9 @@ class Scene:
         name: Task name, for messages.
         bodies: Bodies of plasticine.
         manipulators: Manipulators, in the order in which they act on the grid and in the action vector.
-        youngs_modulus: Young's modulus E.
-        poisson_ratio: Poisson ratio nu.
-        yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
+        youngs_modulus: Young's modulus E of bodies that have none of their own.
+        poisson_ratio: Their Poisson ratio nu.
+        yield_stress: Their von Mises yield stress; ``inf`` for purely elastic bodies.
         floor_friction: Floor friction: 0 slips, 10 and more sticks, Coulomb-like in between.
         gravity: Acceleration added to every grid node; the suite's is (0, -30, 0).
         grid_size: Grid nodes per axis; node i is at i / grid_size.
@@ -203,15 +216,35 @@ class Scene:
         return self.particle_volume
 
     @property
+    def material(self) -> Material:
+        """Material of bodies that have none of their own."""
+        return Material(self.youngs_modulus, self.poisson_ratio, self.yield_stress)
+
+    @property
     def shear_modulus(self) -> float:
-        """Lame parameter mu."""
-        return self.youngs_modulus / (2.0 * (1.0 + self.poisson_ratio))
+        """Lame parameter mu of :attr:`material`."""
+        return self.material.shear_modulus
 
     @property
     def lame_lambda(self) -> float:
-        """Lame parameter lambda."""
-        nu = self.poisson_ratio
-        return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+        """Lame parameter lambda of :attr:`material`."""
+        return self.material.lame_lambda
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """Materials of the bodies, one for each, whether they differ or not."""
+        return tuple(replace(self.material, **body.own_material) for body in self.bodies)
+
+    @property
+    def material_count(self) -> int:
+        """How many materials the simulator tells apart: one per body where one of several bodies has a
+        material of its own, else 1."""
+        return len(self.bodies) if any(body.own_material for body in self.bodies) else 1
+
+    @property
+    def particle_bodies(self) -> np.ndarray:
+        """Number of each particle's body, shape [particle]."""
+        return np.repeat(np.arange(len(self.bodies)), [body.particles for body in self.bodies])
 
     @property
     def action_dim(self) -> int:
@@ -230,9 +263,24 @@ class Scene:
         A lone particle that swells and shrinks has the frequency omega = 2 sqrt(3 lambda + 2 mu) / dx: the
         kernel's second moment is dx^2 / 4 wherever the particle is, and the density is 1. No mode of a body
         is faster, because the grid's mass is that of the particles, summed (Irons and Treharne, 1971), and
-        symplectic Euler is stable while omega dt < 2.
+        symplectic Euler is stable while omega dt < 2. Of several materials the stiffest counts.
         """
-        return self.dx / math.sqrt(3.0 * self.lame_lambda + 2.0 * self.shear_modulus)
+        return self.dx / math.sqrt(self._stiffest.stiffness)
+
+    @property
+    def _stiffest(self) -> Material:
+        """Material of the body that limits the time step."""
+        return max(self.materials, key=lambda m: m.stiffness, default=self.material)
+
+    def facts(self) -> dict[str, Any]:
+        """Return everything in it as plain data, meshes excepted; what a body shares with the scene is left
+        out."""
+        facts = asdict(self)
+        for body in facts["bodies"]:
+            for key in MATERIAL_KEYS:
+                if body[key] is None:
+                    del body[key]
+        return facts
 
     def validate(self) -> None:
         """Check that the scene can be simulated.
@@ -241,26 +289,23 @@ class Scene:
             SceneError: With the reason and a value that would do.
         """
         _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
-        _require(
-            0 < self.youngs_modulus < math.inf,
-            f"youngs_modulus {self.youngs_modulus:g} must be positive and finite",
-        )
-        _require(
-            0 <= self.poisson_ratio < 0.5,
-            f"poisson_ratio {self.poisson_ratio:g} is outside [0, 0.5)",
-        )
-        _require(self.yield_stress >= 0, f"yield_stress {self.yield_stress:g} must not be negative")
+        self.material.validate()
+        for number, material in enumerate(self.materials):
+            material.validate(f"bodies[{number}]: ")
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
+        stiffest = self._stiffest
+        young, nu = stiffest.youngs_modulus, stiffest.poisson_ratio
         _require(
             self.stable_dt > STIFFEST,
-            f"youngs_modulus {self.youngs_modulus:g} and poisson_ratio {self.poisson_ratio:g} are too stiff "
-            "for any time step: lower them",
+            f"youngs_modulus {young:g} and poisson_ratio {nu:g} are too stiff for any time step: lower them",
         )
         if self.dt > self.stable_dt:
             steps = math.ceil(self.substeps * self.dt / self.stable_dt)
+            one = self.material_count == 1
+            what = "material" if one else f"bodies[{self.materials.index(stiffest)}]"
             raise SceneError(
-                f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of material and grid: "
+                f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of {what} and grid: "
                 f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
             )
         # What is hardly stiff at all is stable with steps of any length.

@@ -109,7 +109,8 @@ def simulate(
         actions: Actions, shape [batch, T, A], of any floating-point type and on any device.
         every_step: Whether to return the state after every environment step, or the last one alone.
         mass: Whether to return mass tensors.
-        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3]; as they are if None.
+        material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] where
+            bodies have materials of their own; as they are if None.
         **initial: What the initial state is to have: any of the fields of :class:`plab.sim.State`. The
             simulator keeps it, as it does the material.
 
@@ -146,7 +147,7 @@ class _States(torch.autograd.Function):
         *initial: torch.Tensor | None,
     ) -> tuple[torch.Tensor, ...]:
         if material is not None:
-            simulator.set_material(*_numbers(material).T)
+            simulator.set_material(*np.moveaxis(_numbers(material), -1, 0))
         _start(simulator, {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None})
         given = actions.detach()
         if not (given.is_cuda and simulator.device == "cuda"):
@@ -175,7 +176,11 @@ class _States(torch.autograd.Function):
         actions, material, *initial = ctx.likes
         gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions)]
         if ctx.needs_input_grad[4]:
-            gradients.append(torch.as_tensor(ctx.simulator.material_gradient()).to(material))
+            by_material = ctx.simulator.material_gradient()
+            if by_material.ndim > material.ndim:
+                # One for all bodies.
+                by_material = by_material.sum(axis=1)
+            gradients.append(torch.as_tensor(by_material).to(material))
         else:
             gradients.append(None)
         wanted = ctx.needs_input_grad[5:]

@@ -7,7 +7,7 @@ from typing import Any
 
 from plab.config.ranges import at_least, folder_name, positive, vector
 from plab.errors import ConfigError
-from plab.scene import Body, Manipulator, SceneError, make_body
+from plab.scene import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
 from plab.shape_files import ShapeError, pinned
 from plab.targets import TargetError, make_recipe
 
@@ -27,6 +27,9 @@ class BodyConfig:
         file: Mesh only: OBJ, STL or PLY file, y up. A relative one is looked for in the working directory, in
             the config folder and in the folder above it.
         sha256: Mesh only: SHA-256 of the file. Found out where it is not given; refused if it is another one.
+        youngs_modulus: Young's modulus E; the task's where it is not given, and so on.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress; ``inf`` never yields.
     """
 
     shape: str
@@ -35,11 +38,18 @@ class BodyConfig:
     particles: int
     file: str | None = None
     sha256: str | None = None
+    youngs_modulus: float | None = None
+    poisson_ratio: float | None = None
+    yield_stress: float | None = None
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
         vector(f"{path}.center", self.center, 3)
         at_least(f"{path}.particles", self.particles, 1)
+        if self.youngs_modulus is not None:
+            positive(f"{path}.youngs_modulus", self.youngs_modulus)
+        if self.yield_stress is not None:
+            at_least(f"{path}.yield_stress", self.yield_stress, 0)
 
     def build(self, particles_scale: float = 1.0) -> Body:
         """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
@@ -49,7 +59,8 @@ class BodyConfig:
             plab.shape_files.ShapeError: If the file does not do.
         """
         particles = max(1, round(self.particles * particles_scale))
-        return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
+        material = {key: getattr(self, key) for key in MATERIAL_KEYS}
+        return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256, **material)
 
 
 @dataclass

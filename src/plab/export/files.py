@@ -120,14 +120,15 @@ def quantities(recording: Recording, step: int) -> dict[str, np.ndarray]:
     hencky = np.log(np.linalg.svd(F, compute_uv=False))
     strain = np.linalg.norm(hencky - hencky.mean(axis=1, keepdims=True), axis=1)
     # A yield stress of 0 is that of a fluid: everything yields.
-    limit = max(scene.yield_stress / (2.0 * scene.shear_modulus), np.finfo(float).tiny)
+    limits = [max(m.yield_stress / (2.0 * m.shear_modulus), np.finfo(float).tiny) for m in scene.materials]
+    body = scene.particle_bodies
     return {
-        "body": np.repeat(np.arange(len(scene.bodies)), [body.particles for body in scene.bodies]),
+        "body": body,
         "displacement": recording.x[step] - recording.x[0],
         "velocity": recording.v[step],
         "volume_ratio": np.linalg.det(F),
         "elastic_strain": strain,
-        "yielding": np.minimum(strain / limit, 1.0),
+        "yielding": np.minimum(strain / np.array(limits)[body], 1.0),
     }
 
 

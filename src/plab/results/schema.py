@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from plab.bodies import MATERIAL_KEYS
 from plab.config.selection import lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
@@ -166,12 +167,12 @@ class RunResult:
 def config_dict(cfg: Any) -> dict[str, Any]:
     """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists.
 
-    Bodies without a file have no keys of one, as before there were any.
+    Bodies without a file or a material of their own have no keys of one, as before there were any.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
     bodies = lookup(plain, "task.bodies")
     for body in bodies.values() if isinstance(bodies, dict) else ():
-        for key in ("file", "sha256"):
+        for key in ("file", "sha256", *MATERIAL_KEYS):
             if isinstance(body, dict) and body.get(key, "") is None:
                 del body[key]
     return plain

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +26,7 @@ def require_alike(scenes: Sequence[Scene]) -> None:
             raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
         scene.validate()
     for number, scene in enumerate(scenes[1:], start=1):
-        for name in ("particle_count", "grid_size", "dt", "substeps", "numbers", "floor"):
+        for name in ("particle_count", "material_count", "grid_size", "dt", "substeps", "numbers", "floor"):
             if getattr(scene, name) != getattr(first, name):
                 raise SceneError(
                     f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
@@ -63,21 +64,46 @@ def with_material(
 
     Args:
         scenes: One scene per environment.
-        youngs_modulus: Young's modulus, one for all scenes or shape [batch]; as it is if None.
+        youngs_modulus: Young's modulus, one for all scenes or shape [batch]; as it is if None. Where bodies
+            have materials of their own, it is that of all, or of each if the shape is [batch, body].
         poisson_ratio: Poisson ratio, likewise.
         yield_stress: von Mises yield stress, likewise.
+
+    Raises:
+        SceneError: If bodies of one material are given one each.
     """
     given = {
         "youngs_modulus": youngs_modulus,
         "poisson_ratio": poisson_ratio,
         "yield_stress": yield_stress,
     }
-    values = {
-        name: np.broadcast_to(np.asarray(value, float), len(scenes)).tolist()
-        for name, value in given.items()
-        if value is not None
-    }
+    counts = len(scenes), len(scenes[0].bodies)
+    values = {}
+    for name, value in given.items():
+        if value is None:
+            continue
+        numbers = np.asarray(value, float)
+        if numbers.ndim > 1 and scenes[0].material_count == 1:
+            raise SceneError(
+                f"{name} has shape {numbers.shape}, but all bodies are of one material: give a body of the "
+                "scene one of its own"
+            )
+        values[name] = np.broadcast_to(numbers if numbers.ndim > 1 else numbers.reshape(-1, 1), counts)
     return tuple(
-        replace(scene, **{name: column[e] for name, column in values.items()})
+        _with_own(scene, {name: table[e].tolist() for name, table in values.items()})
         for e, scene in enumerate(scenes)
     )
+
+
+def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
+    """Return a scene whose bodies have these values, by name and body."""
+    if scene.material_count == 1:
+        # The one material is the scene's, and no body's own.
+        none: dict[str, Any] = dict.fromkeys(values)
+        shared: dict[str, Any] = {name: column[0] for name, column in values.items()}
+        return replace(scene, bodies=tuple(replace(body, **none) for body in scene.bodies), **shared)
+    columns: list[dict[str, Any]] = [
+        {name: column[b] for name, column in values.items()} for b in range(len(scene.bodies))
+    ]
+    bodies = tuple(replace(body, **own) for body, own in zip(scene.bodies, columns, strict=True))
+    return replace(scene, bodies=bodies)

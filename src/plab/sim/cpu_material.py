@@ -20,7 +20,7 @@ from plab.sim.material import (
     yield_factor,
 )
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import STAGE
+from plab.sim.storage import STAGE, STATE
 
 __all__ = ["MaterialTiles"]
 
@@ -61,7 +61,7 @@ class MaterialTiles(ParticlePhases):
             at: First entry of the thread's share of ``stage``.
             update: Whether the new F is stored.
         """
-        p = self.material[e]
+        p = self.parameters_of_tile(e, entry9)
         c = [state[source + 6 + i] for i in range(9)]
         f = [state[source + 15 + i] for i in range(9)]
         g = trial_gradient(c, f, self.dt)
@@ -96,7 +96,7 @@ class MaterialTiles(ParticlePhases):
     @ti.func
     def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
-        p = self.material[e]
+        p = self.parameters_of_tile(e, entry9)
         served = self.strain_tile(state, source, at)
         if served:
             yields = self.stress_tile_adjoint(entry9, p[0], p[1], p[2], at)
@@ -185,15 +185,21 @@ class MaterialTiles(ParticlePhases):
             yield_strain,
             self.series,
         )
-        self.accumulate_material(at // STAGE, mu_bar.sum(), lam_bar.sum(), yield_bar.sum())
+        if ti.static(self.mixed):
+            for lane in range(self.lanes):
+                self.accumulate_particle(
+                    at // STAGE, entry9 // 9 * STATE, lane, mu_bar[lane], lam_bar[lane], yield_bar[lane]
+                )
+        else:
+            self.accumulate_material(at // STAGE, mu_bar.sum(), lam_bar.sum(), yield_bar.sum())
 
     @ti.func
-    def accumulate_material(self, grid_index, mu_bar, lam_bar, yield_bar):
-        """Add to the material's adjoint, where one thread owns it."""
+    def accumulate_material(self, row, mu_bar, lam_bar, yield_bar):
+        """Add to a material's adjoint, where one thread owns it."""
         bars = (mu_bar, lam_bar, yield_bar)
         for i in ti.static(range(3)):
             wide = ti.cast(bars[i], ti.f64)
-            self.material_bar[grid_index, i] = self.material_bar[grid_index, i] + wide
+            self.material_bar[row, i] = self.material_bar[row, i] + wide
 
     @ti.func
     def strain_tile_adjoint(

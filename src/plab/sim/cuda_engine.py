@@ -65,8 +65,9 @@ class CudaEngine(ThreadPhases):
     @property
     def sorts(self) -> bool:
         """Whether particles are put into the order of their cells before each step: where there are so many
-        that atomics, not launches, take the time."""
-        return not self.resident
+        that atomics, not launches, take the time. Not where bodies have materials of their own, which are
+        looked up by place."""
+        return not self.resident and not self.mixed
 
     # -- public methods -----------------------------------------------------------------------------
 

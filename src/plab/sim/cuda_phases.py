@@ -209,7 +209,7 @@ class CudaPhases(OrderPhases, PosePhases):
     def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle; returns A, row by row."""
         out = ti.Vector.zero(self.real, 9)
-        p = self.material[e]
+        p = self.parameters_of_particle(e, source, lane)
         c = self.load(state, source + 6, lane, 9)
         f = self.load(state, source + 15, lane, 9)
         g = trial_gradient(c, f, self.dt)
@@ -238,7 +238,7 @@ class CudaPhases(OrderPhases, PosePhases):
         self, state: ti.template(), source, bar: ti.template(), target, a_bar: ti.template(), lane, e
     ):
         """:meth:`material_tile_adjoint` for one particle, given the adjoint of A."""
-        p = self.material[e]
+        p = self.parameters_of_particle(e, source, lane)
         c = self.load(state, source + 6, lane, 9)
         f = self.load(state, source + 15, lane, 9)
         g_bar = self.load(bar, target + 15, lane, 9)
@@ -258,7 +258,10 @@ class CudaPhases(OrderPhases, PosePhases):
                     g_bar[i] = g_flow[i]
             if ti.static(self.full_gradient):
                 mu_bar, lam_bar, yield_bar = parameter_adjoint(d, j, c2, tau_bar, k_bar, p[2], self.series)
-                self.accumulate_material(e, mu_bar, lam_bar, yield_bar)
+                if ti.static(self.mixed):
+                    self.accumulate_particle(e, source, lane, mu_bar, lam_bar, yield_bar)
+                else:
+                    self.accumulate_material(e, mu_bar, lam_bar, yield_bar)
             z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
             c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
             for i in ti.static(range(9)):
@@ -268,11 +271,11 @@ class CudaPhases(OrderPhases, PosePhases):
             self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     @ti.func
-    def accumulate_material(self, grid_index, mu_bar, lam_bar, yield_bar):
-        """Add to the material's adjoint, which all threads of an environment share."""
+    def accumulate_material(self, row, mu_bar, lam_bar, yield_bar):
+        """Add to a material's adjoint, which all threads of an environment share."""
         bars = (mu_bar, lam_bar, yield_bar)
         for i in ti.static(range(3)):
-            ti.atomic_add(self.material_bar[grid_index, i], ti.cast(bars[i], ti.f64))
+            ti.atomic_add(self.material_bar[row, i], ti.cast(bars[i], ti.f64))
 
     # -- grid ---------------------------------------------------------------------------------------
 

@@ -212,12 +212,15 @@ class ForwardSimulator:
         """Change the material; nothing is compiled anew.
 
         Args:
-            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None.
+            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None. It
+                is that of all bodies; with shape [batch, body], where bodies have materials of their own, of
+                each.
             poisson_ratio: Poisson ratio, likewise.
             yield_stress: von Mises yield stress, likewise.
 
         Raises:
-            SceneError: If a scene could not be simulated with it; nothing is changed then.
+            SceneError: If a scene could not be simulated with it, or a simulator of one material is given
+                one for each body; nothing is changed then.
         """
         scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
         for scene in scenes:
@@ -396,6 +399,7 @@ class ForwardSimulator:
         """Make the scenes' start the initial state."""
         positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
         self._particles.order.start_from(positions)
+        self._engine.fill_bodies(self.scenes, self._particles.order.initial)
         self._initial_poses = initial_poses(self.scenes)
         start = rest_state(np.stack(positions), self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plab.scene import Scene
+from plab.scene import Material
 
 __all__ = ["YIELD_STRAIN_MAX", "material_parameters", "parameter_gradient"]
 
@@ -12,24 +12,24 @@ YIELD_STRAIN_MAX = 1e30
 """Stands for infinity, which would turn the unused branch into infinity times zero."""
 
 
-def material_parameters(scene: Scene) -> tuple[float, float, float]:
+def material_parameters(material: Material) -> tuple[float, float, float]:
     """Shear modulus mu, Lame's lambda, and yield strain (yield stress / 2 mu)."""
-    mu = scene.shear_modulus
-    return mu, scene.lame_lambda, min(scene.yield_stress / (2.0 * mu), YIELD_STRAIN_MAX)
+    mu = material.shear_modulus
+    return mu, material.lame_lambda, min(material.yield_stress / (2.0 * mu), YIELD_STRAIN_MAX)
 
 
-def parameter_gradient(scene: Scene, bars: np.ndarray) -> np.ndarray:
-    """Turn derivatives with respect to :func:`material_parameters` into those with respect to the scene's.
+def parameter_gradient(material: Material, bars: np.ndarray) -> np.ndarray:
+    """Turn derivatives with respect to :func:`material_parameters` into those with respect to the material's.
 
     Args:
-        scene: The scene.
+        material: The material.
         bars: Derivatives with respect to mu, lambda and yield strain, shape [3].
 
     Returns:
         Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [3].
     """
-    young, nu = scene.youngs_modulus, scene.poisson_ratio
-    mu, lam, strain = material_parameters(scene)
+    young, nu = material.youngs_modulus, material.poisson_ratio
+    mu, lam, strain = material_parameters(material)
     by_young = np.array([mu, lam, -strain]) / young
     lam_by_nu = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
     by_nu = np.array([-mu / (1.0 + nu), lam_by_nu, strain / (1.0 + nu)])

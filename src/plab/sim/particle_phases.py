@@ -157,6 +157,39 @@ class ParticlePhases(Storage):
     # -- material -----------------------------------------------------------------------------------
 
     @ti.func
+    def parameters_of_tile(self, e: ti.template(), entry9: ti.template()):
+        """mu, lambda and yield strain of a tile's particles, which are numbers, or lanes where bodies differ.
+
+        Args:
+            e: Environment.
+            entry9: Entry of the tile in ``affine``.
+        """
+        if ti.static(self.mixed):
+            return [self.place_material[entry9 // 3 + i] for i in range(3)]
+        else:
+            return self.material[e]
+
+    @ti.func
+    def parameters_of_particle(self, e: ti.template(), entry: ti.template(), lane: ti.template()):
+        """mu, lambda and yield strain of one particle; ``entry`` is its tile's, of any time slot."""
+        if ti.static(self.mixed):
+            return [self.place_material[self.place_of(entry) * 3 + i][lane] for i in range(3)]
+        else:
+            return self.material[e]
+
+    @ti.func
+    def place_of(self, entry):
+        """Number of a tile among those of all environments, from its first entry in a state of any time
+        slot."""
+        return entry // STATE % (self.batch * self.tiles)
+
+    @ti.func
+    def accumulate_particle(self, grid_index, entry, lane, mu_bar, lam_bar, yield_bar):
+        """Add one particle's share to the adjoint of its body's material."""
+        body = self.place_body[self.place_of(entry)][lane]
+        self.accumulate_material(grid_index * self.materials + body, mu_bar, lam_bar, yield_bar)
+
+    @ti.func
     def served(self, z_squared, j):
         """Whether the series served a single particle; not for NaN."""
         return z_squared <= self.series.z_squared_max and j >= self.series.j_min and j <= self.series.j_max
@@ -191,7 +224,7 @@ class ParticlePhases(Storage):
     @ti.func
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
-        p = self.material[e]
+        p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
@@ -215,7 +248,7 @@ class ParticlePhases(Storage):
         grid_index,
     ):
         """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
-        p = self.material[e]
+        p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + 6, lane, 9))
         f = as_matrix(self.load(state, source + 15, lane, 9))
         f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
@@ -226,7 +259,10 @@ class ParticlePhases(Storage):
         g_bar = spectral_return_map_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
         if ti.static(self.full_gradient):
             mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
-            self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
+            if ti.static(self.mixed):
+                self.accumulate_particle(grid_index, target, lane, mu_bar, lam_bar, yield_bar)
+            else:
+                self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
         c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
         f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
         for i in ti.static(range(9)):

@@ -149,15 +149,24 @@ class Simulator(ForwardSimulator):
         """Gradient of the last :meth:`rollout`'s loss with respect to the material.
 
         Returns:
-            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3].
+            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3];
+            where bodies have materials of their own, with respect to those of each body, shape [batch, body,
+            3].
 
         Raises:
             RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
                 rollout with a gradient.
         """
         self._require_gradient()
-        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, 3).sum(axis=1)
-        return np.stack([parameter_gradient(s, bar) for s, bar in zip(self.scenes, bars, strict=True)])
+        materials = self._engine.materials
+        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, materials, 3).sum(axis=1)
+        gradient = np.array(
+            [
+                [parameter_gradient(m, bar) for m, bar in zip(scene.materials[:materials], rows, strict=True)]
+                for scene, rows in zip(self.scenes, bars, strict=True)
+            ]
+        )
+        return gradient if materials > 1 else gradient[:, 0]
 
     def loss_gradient(self) -> State:
         """Gradient of the weighted loss of the current state by this very state: nothing is simulated.

@@ -133,6 +133,9 @@ class Storage:
         series = Series.for_precision(precision)
         if not self.skips.singular_values:
             series = replace(series, z_squared_max=-1.0)
+        # Materials of an environment: 1, or one per body.
+        self.materials = scenes[0].material_count
+        self.mixed = self.materials > 1
         self.series = series
 
     def _set_threads(self, threads: int) -> None:
@@ -180,9 +183,13 @@ class Storage:
         # cache lines, which costs the CPU 7 % of a step.
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
+        if self.mixed:
+            # Each particle's mu, lambda and yield strain, and the number of its body.
+            self.place_material = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 3)
+            self.place_body = ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles)
         self.momentum = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
-        # Material per environment: mu, lambda, yield strain, floor friction, gravity (3).
+        # Material per environment: mu, lambda, yield strain (of its first body), floor friction, gravity (3).
         self.material = ti.Vector.field(7, real, shape=b)
         self.size = ti.Vector.field(3, real, shape=(b, m))
         self.friction = ti.field(real, shape=(b, m))
@@ -222,8 +229,9 @@ class Storage:
         self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, max(1, self.manipulators)))
-        # Adjoints of mu, lambda and yield strain.
-        self.material_bar = ti.field(ti.f64, shape=(b * self.chunks if self.full_gradient else 1, 3))
+        # Adjoints of mu, lambda and yield strain, material by material.
+        rows = b * self.chunks * self.materials if self.full_gradient else 1
+        self.material_bar = ti.field(ti.f64, shape=(rows, 3))
 
     def clear_adjoint(self) -> None:
         """Begin a gradient: clear the adjoints that are sums over its steps."""
@@ -232,8 +240,30 @@ class Storage:
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""
-        rows = [[*material_parameters(s), s.floor_friction, *s.gravity] for s in scenes]
-        self.material.from_numpy(np.array(rows, np.float32 if self.real == ti.f32 else np.float64))
+        numpy_real = np.float32 if self.real == ti.f32 else np.float64
+        rows = [[*material_parameters(s.materials[0]), s.floor_friction, *s.gravity] for s in scenes]
+        self.material.from_numpy(np.array(rows, numpy_real))
+        if self.mixed:
+            by_body = np.array([[material_parameters(m) for m in s.materials] for s in scenes], numpy_real)
+            bodies = self.place_body.to_numpy().reshape(self.batch, self.tiles, 1, self.lanes)
+            columns = np.arange(3).reshape(1, 1, 3, 1)
+            environments = np.arange(self.batch).reshape(-1, 1, 1, 1)
+            values = by_body[environments, bodies, columns]
+            self.place_material.from_numpy(values.reshape(-1, self.lanes))
+
+    def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:
+        """Write whose particles are where, and what they are made of; nothing where all are of one material.
+
+        Args:
+            scenes: One scene per environment.
+            order: Number of the particle at each place, shape [batch, particle].
+        """
+        if not self.mixed:
+            return
+        bodies = np.zeros((self.batch, self.tiles * self.lanes), np.int32)
+        bodies[:, : self.particles] = [s.particle_bodies[row] for s, row in zip(scenes, order, strict=True)]
+        self.place_body.from_numpy(bodies.reshape(-1, self.lanes))
+        self.fill_material(scenes)
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
         """Write everything in which environments may differ, terms of the loss excepted."""

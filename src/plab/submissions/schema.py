@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
@@ -142,7 +142,7 @@ class Digests:
             target = json.dumps(variant_task(cfg).target, sort_keys=True).encode()
         else:
             target = load_release_target(cfg.targets.source, scene, cfg.variant).astype("<f8").tobytes()
-        facts = json.dumps(asdict(scene), sort_keys=True, default=attrgetter("sha256")).encode()
+        facts = json.dumps(scene.facts(), sort_keys=True, default=attrgetter("sha256")).encode()
         return cls(hashlib.sha256(facts).hexdigest(), hashlib.sha256(target).hexdigest())
 
 

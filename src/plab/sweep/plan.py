@@ -58,7 +58,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other, and agents learn in step.
     alike = row_count(method) if own.batching else method
-    return [*kind, alike, scene.particle_count, [m.shape for m in scene.manipulators]]
+    return [*kind, alike, scene.particle_count, scene.material_count, [m.shape for m in scene.manipulators]]
 
 
 def _limit(cfg: Config, scene: Scene, size: int | None) -> int:

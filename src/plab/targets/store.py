@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from dataclasses import asdict, replace
+from dataclasses import replace
 from json import dumps
 from operator import attrgetter
 from pathlib import Path
@@ -55,7 +55,7 @@ class TargetStore:
             actions: The demonstration, shape [T, A].
         """
         # The length of later episodes has no part in it; a mesh is what its file holds.
-        facts = asdict(replace(scene, horizon=0)) | {"by": self._made_by, "physics": PHYSICS_VERSION}
+        facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
         text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
         digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
         return cache_dir() / "targets" / f"{scene.name}-{digest.hexdigest()[:16]}.npz"
