@@ -81,7 +81,8 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
         raise ResultsError(f"{path} lacks {', '.join(missing)}: {advice}")
     if table.empty:
         raise ResultsError(f"{path} has no rows: {advice}")
-    said = [line[1:].strip() for line in content.decode(errors="replace").splitlines() if line.startswith("#")]
+    lines = content.decode(errors="replace").splitlines()
+    said = [line[1:].strip() for line in lines if line.startswith("#")]
     table.attrs["origin"] = [f"Measured: {path}, SHA-256 {hashlib.sha256(content).hexdigest()}", *said]
     return table
 

@@ -220,6 +220,7 @@ class ForwardSimulator:
         Raises:
             SceneError: If a scene could not be simulated with it; nothing is changed then.
         """
+        self._require_runtime()
         scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
         for scene in scenes:
             scene.validate()
@@ -238,6 +239,7 @@ class ForwardSimulator:
         Raises:
             ValueError: If a shape is wrong.
         """
+        self._require_runtime()
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
         for name, value in (("mass", mass), ("sdf", sdf)):
             if np.shape(value) != expected:

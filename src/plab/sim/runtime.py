@@ -233,6 +233,11 @@ def remember_source_positions() -> None:
     context.get_pos_info = get_pos_info
 
 
+def in_use() -> Runtime | None:
+    """Return the runtime that simulators depend on which are still there; None without any."""
+    return _current if len(_users) > 0 else None
+
+
 def register_user(user: object) -> None:
     """Note that an object holds memory of the runtime, for as long as it lives."""
     _users.add(user)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 from dataclasses import dataclass, field
 from os import PathLike
@@ -35,7 +36,7 @@ class View:
     height: int = _HEIGHT
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame of its own, so that its styles and scripts do not meet the notebook's."""
+        """Return the page in a frame of its own, apart from the notebook's styles and scripts."""
         style = f"width: 100%; height: {self.height}px; border: 0"
         return f'<iframe title="rollout in 3-D" style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
@@ -49,6 +50,9 @@ def show(
 ) -> View:
     """Simulate a rollout in the hard contact model, and return it for a notebook to show in 3-D.
 
+    Beside simulators that are there already it runs on their device and in their precision, whatever the
+    configuration says: Taichi has one of each at a time, and with another they would lose their memory.
+
     Args:
         what: A result file, whose best actions are played; or a configuration.
         actions: Actions in [-1, 1] for the configuration, shape [T, A]; None: the best that are known for its
@@ -58,13 +62,14 @@ def show(
         height: Height of the viewer [pixels].
 
     Raises:
-        RenderError: If K3D-jupyter or PyVista is not installed, the file has no actions yet, or the actions do
-            not fit the scene.
+        RenderError: If K3D-jupyter or PyVista is not installed, the file has no actions yet or is given
+            others, or the actions do not fit the scene.
         plab.results.ResultsError: If the file cannot be read.
     """
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     # Imported here: they load the simulator, for which no mistake above should have to wait.
     from plab.render import recording
+    from plab.sim.runtime import in_use
     from plab.view.page import page
 
     if isinstance(what, str | PathLike):
@@ -75,5 +80,8 @@ def show(
         cfg = what
         if actions is None:
             actions = recording.demonstration(cfg)
+    if runtime := in_use():
+        sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
+        cfg = dataclasses.replace(cfg, sim=sim)
     rollout = recording.record_with_motion(cfg, actions)
     return View(page(rollout, every), rollout.score, height)
