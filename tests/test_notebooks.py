@@ -60,8 +60,6 @@ def execute(name: str, folder: Path) -> Outputs:
     client = nbclient.NotebookClient(
         notebook, timeout=None, kernel_name="python3", resources={"metadata": {"path": str(place)}}
     )
-    client.create_kernel_manager()
-    client.km.transport = "ipc"
     client.execute()
     return Outputs(notebook)
 
