@@ -19,7 +19,7 @@
 # %% tags=["parameters"]
 RESULTS = ["results"]  # folders or archives; "example" is the archive that comes with plab
 WORDS = []  # which runs: ["task=Move", "seed=0,1,2"]
-BENCH = "reports/bench"  # folder of the benchmarks' CSV files
+BENCH = "reports/bench"  # folder of the benchmarks' CSV files; "example" has those that come with plab
 COMMAND = "Jupyter"  # what is given as the command that made this
 
 # %%

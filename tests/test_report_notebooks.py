@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 import synthetic
-from plab.cli.report import main
+from plab.cli.report import _parse, main
 from plab.config.selection import select
-from plab.examples import example_archive
+from plab.examples import measurements
 from plab.report.collect import NAMES, collect
 from plab.report.costs import precision_summary, work_precision
 from plab.report.figures import style
@@ -135,6 +135,41 @@ def test_curves_of_run_time_against_error(results: Path, bench: Path, tmp_path: 
     assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0)}
 
 
+def test_without_run_times_errors_are_drawn_against_substeps() -> None:
+    with style():
+        drawing = work_precision(accuracy_rows().assign(ms_per_step=math.nan))
+    lines = [line for axes in drawing.figure.axes for line in axes.get_lines()]
+    assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0)}
+    assert {axes.get_xlabel() for axes in drawing.figure.axes} == {"substeps per environment step"}
+    assert any("no run times" in note for note in drawing.notes)
+
+
+@pytest.mark.parametrize("benchmark", [ACCURACY, PRECISION, SPEED], ids=lambda benchmark: benchmark.file)
+def test_measurements_come_with_plab(benchmark: Benchmark) -> None:
+    table = measured(measurements("example") / benchmark.file, benchmark)
+    file, command, *_ = origin(table)
+    assert file.startswith("Measured: ") and command.startswith(benchmark.command.split(" -")[0])
+    expected = {"speed.csv": 2 * 10, "precision.csv": 2 * 10}
+    assert len(table) == expected.get(benchmark.file, len(table))
+    if benchmark is ACCURACY:
+        with style():
+            assert len(work_precision(table).figure.axes) == 3 * 2 * 2
+
+
+@pytest.mark.parametrize(
+    ("words", "folder"),
+    [
+        (["--results", "example"], measurements("example")),
+        (["--results", "example", "--bench", "mine"], Path("mine")),
+        (["--results", "example", "runs"], Path("reports/bench")),
+        (["--bench", "example"], measurements("example")),
+        ([], Path("reports/bench")),
+    ],
+)
+def test_results_that_come_with_plab_are_shown_with_its_measurements(words: list[str], folder: Path) -> None:
+    assert _parse(["notebooks", *words]).bench == folder
+
+
 @pytest.mark.parametrize("benchmark", [ACCURACY, PRECISION, SPEED], ids=lambda benchmark: benchmark.file)
 def test_files_of_benchmarks_are_checked(bench: Path, benchmark: Benchmark) -> None:
     path = bench / benchmark.file
@@ -228,14 +263,11 @@ def test_missing_packages_are_named(results: Path, tmp_path: Path, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_notebooks_become_pages(bench: Path, tmp_path: Path) -> None:
-    """Execute all four in Jupyter's own way on the example archive."""
+def test_notebooks_become_pages(tmp_path: Path) -> None:
+    """Execute all four in Jupyter's own way on what comes with plab."""
     pytest.importorskip("nbclient")
     out = tmp_path / "out"
-    assert (
-        main(["notebooks", "--results", str(example_archive()), "--out", str(out), "--bench", str(bench)])
-        == 0
-    )
+    assert main(["notebooks", "--results", "example", "--out", str(out)]) == 0
     for name in NOTEBOOKS:
         page = (out / f"{name}.html").read_text()
         assert "data:image/png;base64" in page and "python -m plab.report notebooks" in page
@@ -244,3 +276,4 @@ def test_notebooks_become_pages(bench: Path, tmp_path: Path) -> None:
         notebook = json.loads((out / f"{name}.ipynb").read_text())
         kinds = {output["output_type"] for cell in notebook["cells"] for output in cell.get("outputs", [])}
         assert "error" not in kinds and "display_data" in kinds
+        assert "There is no " not in page

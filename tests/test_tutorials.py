@@ -80,18 +80,6 @@ def test_quick_start():
     assert run_page("index.md")["result"].gradient.shape == (4, 10, 6)
 
 
-@pytest.mark.physics
-def test_a_differentiable_policy_improves():
-    losses = run_page("policy.md")["losses"]
-    assert losses[-1] < losses[0] - 0.5
-
-
-@pytest.mark.slow
-def test_the_yield_stress_is_found_again():
-    names = run_page("identification.md")
-    assert abs(names["found"] - names["TRUTH"]) < 0.02 * names["TRUTH"]
-
-
 # -------------------------------------------------------------------------------------------- own method
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import html
 import io
 import json
 import re
@@ -21,11 +22,14 @@ from PIL import Image
 
 from plab import results
 from plab.cli.view import main
-from plab.config import load_config
+from plab.config import build_scene, load_config
+from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.render import graphics
 from plab.render.recording import Recording, record, record_with_motion
 from plab.render.shapes import manipulator_parts, pose_matrix
+from plab.sim import Simulator
+from plab.view import View, show
 
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
@@ -289,3 +293,54 @@ def test_the_page_plays_in_a_browser(browser, page, tmp_path):
     sent = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [one["params"]["request"]["url"] for one in sent if one["method"] == "Network.requestWillBeSent"]
     assert asked and {urllib.parse.urlsplit(url).scheme for url in asked} <= {"file", "data", "blob"}
+
+
+# ------------------------------------------------------------------------------------------ in a notebook
+
+
+def test_a_notebook_shows_the_page_in_a_frame(recording, page, monkeypatch):
+    monkeypatch.setattr("plab.render.recording.record_with_motion", lambda cfg, actions: recording)
+    view = show(load_config(["task=Rope", *COARSE]), ACTIONS, height=300)
+    assert (view.page, view.score) == (page, recording.score)
+    (shown,) = re.findall('<iframe [^>]*height: 300px[^>]* srcdoc="([^"]*)"></iframe>', view._repr_html_())
+    assert html.unescape(shown) == page
+    assert len(repr(view)) < 100
+
+
+def test_actions_of_a_result_and_of_a_task_are_shown(simulated):
+    cfg = load_config(["task=Rope", "variant=2", *COARSE])
+    found = results.RunResult(results.config_dict(cfg), results.config_hash(cfg), best_actions=ACTIONS)
+    results.write(found, Path("seed0.h5"))
+    show("seed0.h5")
+    show(cfg)
+    (replay, played), (known, demonstrated) = simulated
+    assert replay.variant == known.variant == "2"
+    assert np.array_equal(played, ACTIONS)
+    assert np.array_equal(demonstrated, known_actions(cfg))
+    with pytest.raises(graphics.RenderError, match="a result file has its own actions"):
+        show("seed0.h5", ACTIONS)
+
+
+def test_simulators_stay_usable_beside_the_viewer(simulated):
+    cfg = load_config(["task=Rope", *COARSE])
+    assert cfg.sim.precision == "float32"
+    # Whatever was started by the other tests: nobody uses it but this.
+    simulator = Simulator([build_scene(cfg)], precision="float64")
+    show(cfg, ACTIONS)
+    assert simulated[0][0].sim.precision == "float64" and cfg.sim.precision == "float32"
+    simulator.reset()
+    assert simulator.state().x.dtype == np.float64
+
+
+@browsing
+def test_the_viewer_plays_in_a_notebooks_frame(browser, page, recording, tmp_path):
+    frame = View(page, recording.score)._repr_html_()
+    (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><body>{frame}</body>", encoding="utf-8")
+    browser.get((tmp_path / "notebook.html").as_uri())
+    browser.switch_to.frame(browser.find_element("tag name", "iframe"))
+    told = browser.find_element("id", "told")
+    until(lambda: told.text == "step 0 of 3, score 0.00")
+    until(lambda: any(map(is_red, colors(browser))))
+    browser.find_element("id", "play").click()
+    until(lambda: told.text.startswith("step 3 of 3, score"))
+    browser.switch_to.default_content()

@@ -1,4 +1,4 @@
-"""Roles of docstrings, such as :func:`plab.config.load_config`, as links of the site."""
+"""Roles, such as :func:`plab.config.load_config`, and links to notebooks, as links of the site."""
 
 from __future__ import annotations
 
@@ -6,6 +6,13 @@ import re
 from typing import Any
 
 _ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?([\w.]+)</code>")
+
+_NOTEBOOK = re.compile(r"\]\(\.\./examples/notebooks/(\w+)\.ipynb")
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Let links to notebooks lead to the pages that tools/docs_pages.py makes of them."""
+    return _NOTEBOOK.sub(r"](notebooks/\1.md", markdown)
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -1,12 +1,13 @@
 """Pages of the documentation that are made when it is built; run by mkdocs-gen-files.
 
 The reference of the configuration comes from the dataclasses and the YAML files, the reference of Python from
-docstrings, two pages from files of the repository's root.
+docstrings, two pages from files of the repository's root, and a page from each notebook of the examples.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,6 +103,20 @@ def main() -> None:
     for name in ("CONTRIBUTING.md", "CHANGELOG.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         _write(name.lower(), re.sub(r"\]\(docs/", "](", text))
+    for path in (ROOT / "examples" / "notebooks").glob("*.ipynb"):
+        _write(f"notebooks/{path.stem}.md", "\n\n".join(_notebook(path)) + "\n")
+
+
+def _notebook(path: Path) -> Iterator[str]:
+    """Yield text and code of a notebook, with links as the site has them."""
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            yield f"```python\n{text}\n```"
+        else:
+            text = re.sub(r"\]\((\w+)\.ipynb", r"](\1.md", text)
+            yield re.sub(r"\]\(\.\./\.\./docs/", "](../", text)
+    yield f"To run it, and to see the rollouts in 3-D: `examples/notebooks/{path.name}`, in Jupyter."
 
 
 def _write(path: str, text: str) -> None:

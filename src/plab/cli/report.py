@@ -21,7 +21,7 @@ from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.errors import tell
-from plab.examples import EXAMPLES, resolve
+from plab.examples import EXAMPLES, measurements, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
@@ -136,8 +136,9 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--speed", type=Path, help=what)
     what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
     parser.add_argument("--accuracy", type=Path, help=what)
-    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv (default: reports/bench)"
-    parser.add_argument("--bench", type=folder, default=Path("reports/bench"), help=what)
+    what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv; example: those that come with "
+    what += "plab (default: reports/bench; example where the results come with plab)"
+    parser.add_argument("--bench", type=_bench, help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     what = "key whose values are put side by side as if they were methods: method.lr, or folder, or seed"
@@ -150,8 +151,16 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     # Words after --results are taken for folders.
     sources, words = sources_and_words(options.results)
     options.words += words
-    options.results = [resolve(item) for item in sources or ["results"]]
+    sources = sources or ["results"]
+    if options.bench is None:
+        options.bench = measurements("reports/bench" if set(sources) - set(EXAMPLES) else EXAMPLES[0])
+    options.results = [resolve(item) for item in sources]
     return options
+
+
+def _bench(text: str) -> Path:
+    """Read the name of a folder with files of benchmarks."""
+    return measurements(text) if text in EXAMPLES else folder(text)
 
 
 def _tell(runs: Runs, what: str, out: Path) -> None:

@@ -88,6 +88,8 @@ def phases(runs: Runs) -> Drawing | None:
 def work_precision(table: pd.DataFrame) -> Drawing | None:
     """Draw run time against error, per task and contact model; None where nothing was varied.
 
+    Without run times, which a busy machine cannot measure, errors are drawn against substeps.
+
     Args:
         table: What ``python -m plab.bench.accuracy`` wrote, see :func:`plab.report.measurements.measured`.
     """
@@ -95,33 +97,35 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
     if table.empty:
         return None
     tasks, contacts = list(dict.fromkeys(table["task"])), list(dict.fromkeys(table["contact"]))
-    shown = {"positions": "final positions, RMS", "gradient": "norm of the gradient, relative"}
+    shown = {"positions": "final positions, RMS", "gradient": "norm of gradient, relative"}
     columns = [(column, text, contact) for column, text in shown.items() for contact in contacts]
+    timed = bool(table["ms_per_step"].notna().any())
     figure, axes = grid(len(tasks), len(columns), width=2.2, height=1.9)
     for line, task in zip(axes, tasks, strict=True):
         for panel, (column, text, contact) in zip(line, columns, strict=True):
             own = table[(table["task"] == task) & (table["contact"] == contact)]
-            _errors(panel, own, column)
+            _errors(panel, own, "ms_per_step" if timed else "substeps", column)
             panel.set_title(f"{task}, {contact} contact")
-            log_axis(panel, "ms per step with gradient")
+            log_axis(panel, "ms per step with gradient" if timed else "substeps per environment step")
             log_axis(panel, text, vertical=True)
     legend(figure)
     notes = [
         "Error against a reference in float64 with many more substeps; numbers: substeps per environment "
         "step. Settings that diverge are left out.",
+        *([] if timed else ["There are no run times in the file: errors are drawn against substeps."]),
         *origin(table),
     ]
     return Drawing("run_time_against_error", figure, notes)
 
 
-def _errors(panel: Axes, own: pd.DataFrame, column: str) -> None:
-    """Draw a line per precision, each point with its number of substeps."""
+def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str) -> None:
+    """Draw a line per precision: a column of errors against one of costs, with the numbers of substeps."""
     for precision, rows in own.groupby("precision", sort=False):
         stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
         colour, mark = _PRECISIONS.get(precision, ("#777777", "x"))
-        times, error = stable["ms_per_step"], stable[column].astype(float).clip(lower=_FLOOR)
-        panel.plot(times, error, f"{mark}-", color=colour, markersize=3.5, label=precision)
-        for x, y, steps in zip(times, error, stable["substeps"], strict=True):
+        costs, error = stable[cost], stable[column].astype(float).clip(lower=_FLOOR)
+        panel.plot(costs, error, f"{mark}-", color=colour, markersize=3.5, label=precision)
+        for x, y, steps in zip(costs, error, stable["substeps"], strict=True):
             panel.annotate(str(steps), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
 
 

@@ -63,7 +63,7 @@ PRECISION = Benchmark(
 
 
 def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
-    """Read a benchmark's file.
+    """Read a benchmark's file; lines that begin with ``#`` say how it was made.
 
     Raises:
         plab.results.ResultsError: If it is missing or not what it should be; the message says what makes it.
@@ -81,11 +81,12 @@ def measured(path: Path, benchmark: Benchmark) -> pd.DataFrame:
         raise ResultsError(f"{path} lacks {', '.join(missing)}: {advice}")
     if table.empty:
         raise ResultsError(f"{path} has no rows: {advice}")
-    table.attrs["origin"] = f"{path}, SHA-256 {hashlib.sha256(content).hexdigest()}"
+    lines = content.decode(errors="replace").splitlines()
+    said = [line[1:].strip() for line in lines if line.startswith("#")]
+    table.attrs["origin"] = [f"Measured: {path}, SHA-256 {hashlib.sha256(content).hexdigest()}", *said]
     return table
 
 
 def origin(table: pd.DataFrame | None) -> list[str]:
-    """Return a sentence on the file that a table was read from; none where it was not."""
-    known = None if table is None else table.attrs.get("origin")
-    return [f"Measured: {known}."] if known else []
+    """Return sentences on the file that a table was read from; none where it was not."""
+    return [] if table is None else [f"{line}." for line in table.attrs.get("origin", [])]

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from html import escape
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from IPython.display import HTML, Image, Markdown, display
 
 from plab.config.selection import select
-from plab.examples import resolve
+from plab.examples import measurements, resolve
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
 from plab.report.measurements import Benchmark, measured
@@ -110,14 +109,14 @@ def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
     """Return what a benchmark measured, or say what makes its file.
 
     Args:
-        folder: Folder of the benchmarks' files.
+        folder: Folder of the benchmarks' files; ``example`` is that which comes with plab.
         which: The benchmark.
 
     Returns:
         Its rows; None where the file is missing or not what it should be.
     """
     try:
-        return measured(Path(folder) / which.file, which)
+        return measured(measurements(folder) / which.file, which)
     except ResultsError as error:
         text = str(error)
         say(f"{text[0].upper()}{text[1:]}.")

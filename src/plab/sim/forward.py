@@ -222,6 +222,7 @@ class ForwardSimulator:
             SceneError: If a scene could not be simulated with it, or a simulator of one material is given
                 one for each body; nothing is changed then.
         """
+        self._require_runtime()
         scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
         for scene in scenes:
             scene.validate()
@@ -239,6 +240,7 @@ class ForwardSimulator:
         Raises:
             ValueError: If a shape is wrong.
         """
+        self._require_runtime()
         expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
         for name, value in (("mass", mass), ("sdf", sdf)):
             if np.shape(value) != expected:

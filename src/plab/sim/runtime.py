@@ -226,6 +226,11 @@ def _position(context: Any, node: Any) -> str:
     return f"{place}:\n{line}\n{' ' * begins}{'^' * (ends - begins)}\n"
 
 
+def in_use() -> Runtime | None:
+    """Return the runtime that simulators depend on which are still there; None without any."""
+    return _current if len(_users) > 0 else None
+
+
 def register_user(user: object) -> None:
     """Note that an object holds memory of the runtime, for as long as it lives."""
     _users.add(user)

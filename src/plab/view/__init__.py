@@ -1,5 +1,9 @@
-"""A page that plays a rollout in 3-D: ``python -m plab.view``, and :func:`plab.view.page.page` from Python.
+"""A page that plays a rollout in 3-D: ``python -m plab.view``, and :func:`plab.view.show` in a notebook.
 
 K3D-jupyter, which draws with three.js, is optional: ``pip install 'plab[view]'``. docs/rendering.md has the
 details.
 """
+
+from plab.view.inline import View, show
+
+__all__ = ["View", "show"]

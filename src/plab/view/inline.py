@@ -1,0 +1,87 @@
+"""The page inside a notebook: an object that Jupyter shows as the viewer itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from plab.render.graphics import RenderError, require_packages
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from plab.config import Config
+
+__all__ = ["View", "show"]
+
+_HEIGHT = 480
+
+
+@dataclass(frozen=True)
+class View:
+    """A rollout in 3-D; a notebook whose cell ends with it shows the viewer.
+
+    Attributes:
+        page: The page, HTML; written to a file it is what ``python -m plab.view`` writes.
+        score: Score of the last state, NaN without a target.
+        height: Height of the viewer in a notebook [pixels].
+    """
+
+    page: str = field(repr=False)
+    score: float
+    height: int = _HEIGHT
+
+    def _repr_html_(self) -> str:
+        """Return the page in a frame of its own, apart from the notebook's styles and scripts."""
+        style = f"width: 100%; height: {self.height}px; border: 0"
+        return f'<iframe title="rollout in 3-D" style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
+
+
+def show(
+    what: str | PathLike[str] | Config,
+    actions: np.ndarray | None = None,
+    *,
+    every: int | None = None,
+    height: int = _HEIGHT,
+) -> View:
+    """Simulate a rollout in the hard contact model, and return it for a notebook to show in 3-D.
+
+    Beside simulators that are there already it runs on their device and in their precision, whatever the
+    configuration says: Taichi has one of each at a time, and with another they would lose their memory.
+
+    Args:
+        what: A result file, whose best actions are played; or a configuration.
+        actions: Actions in [-1, 1] for the configuration, shape [T, A]; None: the best that are known for its
+            task, or an episode of zeros where none are.
+        every: Environment steps from one frame to the next, between which the viewer interpolates; None: so
+            many that there are no more than 60 frames.
+        height: Height of the viewer [pixels].
+
+    Raises:
+        RenderError: If K3D-jupyter or PyVista is not installed, the file has no actions yet or is given
+            others, or the actions do not fit the scene.
+        plab.results.ResultsError: If the file cannot be read.
+    """
+    require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
+    # Imported here: they load the simulator, for which no mistake above should have to wait.
+    from plab.render import recording
+    from plab.sim.runtime import in_use
+    from plab.view.page import page
+
+    if isinstance(what, str | PathLike):
+        if actions is not None:
+            raise RenderError("a result file has its own actions: give actions with a configuration only")
+        cfg, actions = recording.result(Path(what))
+    else:
+        cfg = what
+        if actions is None:
+            actions = recording.demonstration(cfg)
+    if runtime := in_use():
+        sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
+        cfg = dataclasses.replace(cfg, sim=sim)
+    rollout = recording.record_with_motion(cfg, actions)
+    return View(page(rollout, every), rollout.score, height)
