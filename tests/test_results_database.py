@@ -523,8 +523,8 @@ def test_scores(folder: Path, capsys) -> None:
     assert main(["scores", *words]) == 0
     assert capsys.readouterr().out == (
         "task  variant  method  seed  protocol  targets  status    score  method.lr  iterations\n"
-        "Rope  1        adam       1  plab               finished   0.75        0.1           4\n"
-        "Rope  1        adam       0  plab               finished    0.5        0.1           4\n"
+        "Rope        1  adam       1  plab               finished   0.75        0.1           4\n"
+        "Rope        1  adam       0  plab               finished    0.5        0.1           4\n"
     )
     assert main(["scores", str(folder), "status=all", "--csv"]) == 0
     read = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))

@@ -305,7 +305,7 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
         (run.main, ["--mutlirun"], "multirun"),
         (status.main, ["--missing-runs"], "missing"),
         (results.main, ["scores", "--descendign"], "descending"),
-        (render.main, ["task=Rope", "--film-srtip", "a.jpg"], "film-strip"),
+        (render.main, ["task=Rope", "--film-strp", "a.jpg"], "film-strip"),
         (stability.main, ["--qiuck"], "quick"),
     ],
 )
@@ -313,8 +313,8 @@ def test_an_unknown_flag_is_answered_by_those_that_there_are(capsys, entry, argv
     assert entry(argv) == 2
     line = capsys.readouterr().err
     wrong = next(word for word in argv if word.startswith("--"))
-    assert line.startswith(f"plab: unknown flag {wrong}")
-    assert f"; did you mean --{flag}? choose from: --help, " in line and line.count("\n") == 1
+    assert line.startswith(f"plab: unknown flag {wrong}; did you mean --{flag}? choose from: --help, ")
+    assert line.count("\n") == 1
 
 
 # ------------------------------------------------------------------------------------------------ rights

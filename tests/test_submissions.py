@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import re
 import shutil
 import struct
@@ -449,7 +450,11 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
     assert found.entries[0].digests == Digests.of(load_config(["task=Move"]))
 
 
-def test_mistakes_of_submit(tmp_path: Path, card: Path, told: Callable[..., str]) -> None:
+def test_mistakes_of_submit(
+    tmp_path: Path, card: Path, told: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # However slow this computer is, the results have changed just now: no database is made of them.
+    monkeypatch.setattr("plab.results.store._SETTLED", math.inf)
     folder, out = tmp_path / "results", str(tmp_path / "out.plabsub.zip")
     first, second = result(folder), result(folder, seed=1)
     usual = ["--card", str(card), "--output", out]
@@ -464,12 +469,12 @@ def test_mistakes_of_submit(tmp_path: Path, card: Path, told: Callable[..., str]
     missing = tmp_path / "no.yaml"
     cannot = f"cannot read {missing}: No such file or directory"
     assert line(str(folder), "--card", str(missing), "--output", out) == cannot
-    apart = "plab: give either recordings or results, or --policy"
+    apart = "give either recordings or results, or --policy"
     assert line(*usual) == apart
     assert line(str(folder), "--policy", "Move=a.pt", "--steps", "1", *usual) == apart
-    assert line("--policy", "Move=a.pt", *usual) == "plab: --policy and --steps go together"
-    assert line(str(folder), "--unseen", *usual) == "plab: --unseen is for --policy"
-    kinds = "plab: argument --policy: 'Move=a.bin' is not like Move=move.pt or Move=move.onnx"
+    assert line("--policy", "Move=a.pt", *usual) == "--policy and --steps go together"
+    assert line(str(folder), "--unseen", *usual) == "--unseen is for --policy"
+    kinds = "argument --policy: 'Move=a.bin' is not like Move=move.pt or Move=move.onnx"
     assert line("--policy", "Move=a.bin", "--steps", "1", *usual) == kinds
     absent = f"cannot read {tmp_path / 'a.pt'}: No such file or directory"
     assert line("--policy", f"Move={tmp_path / 'a.pt'}", "--steps", "1", *usual) == absent

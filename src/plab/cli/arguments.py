@@ -47,7 +47,7 @@ class Parser(ArgumentParser):
 
 def name_flag(parser: ArgumentParser, message: str) -> str:
     """Return a parser's message with the flags that there are, where it is about one that there is not."""
-    unknown = message.partition("unrecognized arguments: ")[2]
+    unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
     flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
     return f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown.startswith("-") else message
 
