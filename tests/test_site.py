@@ -47,7 +47,7 @@ def test_search_works_from_files(browser, site: Path) -> None:
         "field.value = 'interquartile'; field.dispatchEvent(new Event('keyup'))"
     )
     until(browser, "document.querySelector('.md-search-result__item')")
-    assert "Reports" in browser.execute_script(
+    assert "Statistics of reports" in browser.execute_script(
         "return document.querySelector('.md-search-result__item').textContent"
     )
     assert browser.get_log("browser") == []
