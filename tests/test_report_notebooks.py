@@ -123,6 +123,11 @@ def test_precision_is_summed_up_by_its_worst() -> None:
     assert row["largest difference of scores"] == "2.0e-05" and row["failures"] == 1
 
 
+def test_without_a_gradient_there_is_no_angle() -> None:
+    (row,) = precision_summary(precision_rows().assign(angle_deg=math.nan)).to_dict("records")
+    assert row["largest angle of gradients [deg]"] == row["median angle [deg]"] == "no gradient"
+
+
 def test_curves_of_run_time_against_error(results: Path, bench: Path, tmp_path: Path) -> None:
     words = ["task=Rope", "variant=1", "--results", str(results), "--out", str(tmp_path / "out")]
     assert main(["curves", *words, "--accuracy", str(bench / "accuracy.csv")]) == 0

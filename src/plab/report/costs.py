@@ -148,12 +148,16 @@ def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
                 "configurations": len(own),
                 "largest difference of scores": f"{score.max():.1e}",
                 "median": f"{score.median():.1e}",
-                "largest angle of gradients [deg]": f"{turn.max():.2g}",
-                "median angle [deg]": f"{turn.median():.2g}",
+                "largest angle of gradients [deg]": _degrees(turn.max()),
+                "median angle [deg]": _degrees(turn.median()),
                 "failures": int(own["failures"].fillna("").ne("").sum()),
             }
         )
     return pd.DataFrame(rows)
+
+
+def _degrees(angle: float) -> str:
+    return "no gradient" if np.isnan(angle) else f"{angle:.2g}"
 
 
 # --------------------------------------------------------------------------------------------- contact models
