@@ -19,7 +19,7 @@ from plab.report.costs import precision_summary, work_precision
 from plab.report.figures import style
 from plab.report.measurements import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
-from plab.report.table import MINUS
+from plab.report.table import MINUS, NOTHING
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
 
@@ -123,6 +123,11 @@ def test_precision_is_summed_up_by_its_worst() -> None:
     assert row["largest difference of scores"] == "2.0e-05" and row["failures"] == 1
 
 
+def test_without_a_gradient_there_is_no_angle() -> None:
+    (row,) = precision_summary(precision_rows().assign(angle_deg=math.nan)).to_dict("records")
+    assert row["largest angle of gradients [deg]"] == row["median angle [deg]"] == NOTHING
+
+
 def test_curves_of_run_time_against_error(results: Path, bench: Path, tmp_path: Path) -> None:
     words = ["task=Rope", "variant=1", "--results", str(results), "--out", str(tmp_path / "out")]
     assert main(["curves", *words, "--accuracy", str(bench / "accuracy.csv")]) == 0
@@ -140,7 +145,7 @@ def test_without_run_times_errors_are_drawn_against_substeps() -> None:
         drawing = work_precision(accuracy_rows().assign(ms_per_step=math.nan))
     lines = [line for axes in drawing.figure.axes for line in axes.get_lines()]
     assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0)}
-    assert {axes.get_xlabel() for axes in drawing.figure.axes} == {"substeps per environment step"}
+    assert {axes.get_xlabel() for axes in drawing.figure.axes} == {"substeps per step"}
     assert any("no run times" in note for note in drawing.notes)
 
 

@@ -321,7 +321,7 @@ def test_actions_of_a_result_and_of_a_task_are_shown(simulated):
         show("seed0.h5", ACTIONS)
 
 
-def test_simulators_stay_usable_beside_the_viewer(simulated):
+def test_simulators_stay_usable_beside_the_viewer(simulated, monkeypatch):
     cfg = load_config(["task=Rope", *COARSE])
     assert cfg.sim.precision == "float32"
     # Whatever was started by the other tests: nobody uses it but this.
@@ -330,6 +330,15 @@ def test_simulators_stay_usable_beside_the_viewer(simulated):
     assert simulated[0][0].sim.precision == "float64" and cfg.sim.precision == "float32"
     simulator.reset()
     assert simulator.state().x.dtype == np.float64
+    # Without that it would say so, also where memory that is gone would end the process.
+    monkeypatch.setattr("plab.sim.forward.is_current", lambda runtime: False)
+    mass = np.zeros((1, 16, 16, 16))
+    for change in (
+        lambda: simulator.set_material(yield_stress=50.0),
+        lambda: simulator.set_target(mass, mass),
+    ):
+        with pytest.raises(RuntimeError, match="this simulator's memory is gone"):
+            change()
 
 
 @browsing

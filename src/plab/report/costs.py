@@ -13,6 +13,7 @@ from plab.report.curves import Series
 from plab.report.figures import Drawing, grid, legend, legend_of_methods, log_axis
 from plab.report.measurements import origin
 from plab.report.methods import method
+from plab.report.table import NOTHING
 from plab.report.tables import ordered_tasks
 
 __all__ = [
@@ -106,7 +107,7 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
             own = table[(table["task"] == task) & (table["contact"] == contact)]
             _errors(panel, own, "ms_per_step" if timed else "substeps", column)
             panel.set_title(f"{task}, {contact} contact")
-            log_axis(panel, "ms per step with gradient" if timed else "substeps per environment step")
+            log_axis(panel, "ms per step with gradient" if timed else "substeps per step")
             log_axis(panel, text, vertical=True)
     legend(figure)
     notes = [
@@ -148,12 +149,16 @@ def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
                 "configurations": len(own),
                 "largest difference of scores": f"{score.max():.1e}",
                 "median": f"{score.median():.1e}",
-                "largest angle of gradients [deg]": f"{turn.max():.2g}",
-                "median angle [deg]": f"{turn.median():.2g}",
+                "largest angle of gradients [deg]": _degrees(turn.max()),
+                "median angle [deg]": _degrees(turn.median()),
                 "failures": int(own["failures"].fillna("").ne("").sum()),
             }
         )
     return pd.DataFrame(rows)
+
+
+def _degrees(angle: float) -> str:
+    return NOTHING if np.isnan(angle) else f"{angle:.2g}"
 
 
 # --------------------------------------------------------------------------------------------- contact models
