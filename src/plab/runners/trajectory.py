@@ -110,7 +110,7 @@ class Rule:
 
 
 class Adam(Rule):
-    """Adam (Kingma and Ba, 2015), in the order of ``torch.optim.Adam``'s operations, which gives its bits."""
+    """Adam (arXiv:1412.6980), in the order of ``torch.optim.Adam``'s operations, which gives its bits."""
 
     def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
         """Change the tensor, and what is kept, in place."""
