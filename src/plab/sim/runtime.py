@@ -216,19 +216,15 @@ def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _position(context: Any, node: Any) -> str:
-    """Return place and first line of an AST node, marked, for Taichi's messages."""
+    """Return place and first line of an AST node, marked, for a message of Taichi's; nothing before there is one."""
+    if not context.raised:
+        return ""
     line = context.src[node.lineno - 1]
     begins = context.indent + node.col_offset
     ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
-    place = (
-        f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {context.func.func.__name__}'
-    )
-    return f"{place}:\n{line}\n{' ' * begins}{'^' * (ends - begins)}\n"
-
-
-def in_use() -> Runtime | None:
-    """Return the runtime that simulators depend on which are still there; None without any."""
-    return _current if len(_users) > 0 else None
+    number, name = node.lineno + context.lineno_offset, context.func.func.__name__
+    mark = " " * begins + "^" * (ends - begins)
+    return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
 
 
 def register_user(user: object) -> None:
