@@ -127,6 +127,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     with contextlib.redirect_stdout(io.StringIO()):
         free_abandoned_cache()
         _start_taichi(device, precision, wanted)
+    _forget_arguments()
     hasten_tracing()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
@@ -171,6 +172,16 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         # Its warnings are of a cache that another process is writing; these kernels are then not kept.
         log_level=ti.ERROR,
     )
+
+
+def _forget_arguments() -> None:
+    """Let kernels forget what they were called with before Taichi started anew, as they forget their code.
+
+    Else Taichi's own kernels hold all fields that they have ever filled or read, some 100 kB of a simulator.
+    """
+    for kernel in getattr(impl.get_runtime(), "kernels", ()):
+        if hasattr(kernel, "mapper"):
+            kernel.mapper.mapping.clear()
 
 
 def cuda_available() -> bool:
