@@ -227,7 +227,7 @@ def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _position(context: Any, node: Any) -> str:
-    """Return place and first line of an AST node, marked, for a message of Taichi's; nothing before there is one."""
+    """Return place and first line of an AST node, marked, for a message; nothing before there is one."""
     if not context.raised:
         return ""
     line = context.src[node.lineno - 1]
