@@ -14,7 +14,7 @@ import reference_mpm as reference
 import suite
 from plab.losses import make_terms
 from plab.scene import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
-from plab.sim import Simulator, Skips, State
+from plab.sim import Simulator, State
 from plab.torch import simulate
 
 pytestmark = pytest.mark.physics
@@ -304,14 +304,19 @@ def test_simulators_of_one_material_have_one(device):
     assert simulator.scenes[0].materials[0].youngs_modulus == 800.0
 
 
-def test_what_cannot_yield_was_left_out(device):
-    simulator = built([halves(ELASTIC, ELASTIC, (77, 73))], device)
-    with pytest.raises(SceneError, match="built for scenes without plasticity"):
-        simulator.set_material(yield_stress=[[math.inf, 10.0]])
-    assert math.isinf(simulator.scenes[0].materials[1].yield_stress)
-    built([halves(ELASTIC, ELASTIC, (77, 73))], device, skips=Skips(plasticity=False)).set_material(
-        yield_stress=9.0
-    )
+def test_what_is_elastic_may_be_made_to_yield(simulator):
+    simulator.set_scenes([halves(ELASTIC, ELASTIC, (77, 73))] * len(SCENES))
+    state, u = start(simulator, 0.02), actions()
+    ends = []
+    for stress in (math.inf, 10.0):
+        simulator.set_material(yield_stress=[[math.inf, stress]] * len(SCENES))
+        simulator.set_state(state)
+        simulator.step(u[:, 0])
+        ends.append(simulator.state().F[0])
+    assert np.abs(ends[1] - ends[0]).max() > 1e-3
+    scene = halves(ELASTIC, ELASTIC | {"yield_stress": 10.0}, (77, 73))
+    want = reference.env_step(scene, plain(state, 0), torch.tensor(u[0, 0]), 666.0).F.numpy()
+    assert np.abs(ends[1] - want).max() < 1e-9 * max(1.0, np.abs(want).max())
 
 
 # What follows builds simulators of its own: of another precision or number of threads they end the one above.
