@@ -337,6 +337,7 @@ def test_equal_materials_are_one_material(simulator, device):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
 
+@pytest.mark.slow  # compiles three simulators
 def test_float32_is_float64_to_rounding_with_the_same_bits_for_any_batch_and_threads(simulator, device):
     start_at, u = start(simulator, 0.02), actions()
     found = []
