@@ -238,6 +238,11 @@ def _position(context: Any, node: Any) -> str:
     return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
 
 
+def in_use() -> Runtime | None:
+    """Return the runtime that simulators depend on which are still there; None without any."""
+    return _current if len(_users) > 0 else None
+
+
 def register_user(user: object) -> None:
     """Note that an object holds memory of the runtime, for as long as it lives."""
     _users.add(user)
