@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import math
 import os
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
 from plab.losses.term import ParticleTerm
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+from plab.sim import State
+
+if TYPE_CHECKING:
+    import reference_mpm as reference
 
 DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
 """Device on which the simulator's tests run."""
@@ -109,3 +114,11 @@ class Kinetic(ParticleTerm):
     def gradient(self, e, x, v):
         """By position and velocity."""
         return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
+
+
+def assert_same_state(got: State, e: int, want: reference.State) -> None:
+    """Compare an environment's state with the plain reference's, to 1e-9 of the largest number, or of 1."""
+    for name in ("x", "v", "C", "F", "poses"):
+        a, b = getattr(got, name)[e], getattr(want, name).numpy()
+        error = np.abs(a - b).max() / max(1.0, np.abs(b).max())
+        assert error < 1e-9, f"environment {e}, {name}: {error:.2e}"

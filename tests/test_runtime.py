@@ -3,6 +3,8 @@
 import gc
 import inspect
 import os
+import subprocess
+import sys
 import time
 import weakref
 
@@ -30,6 +32,15 @@ def test_a_killed_process_leaves_no_lock_on_compiled_kernels(tmp_path, monkeypat
     free_abandoned_cache()
     assert lock.exists() == left
     free_abandoned_cache()
+
+
+@pytest.mark.parametrize("module", ["plab.sim", "plab.bench.speed", "plab.losses.density"])
+def test_standard_output_belongs_to_the_caller(module) -> None:
+    """Taichi would print a banner there."""
+    given = {name: value for name, value in os.environ.items() if name != "ENABLE_TAICHI_HEADER_PRINT"}
+    command = [sys.executable, "-c", f"import {module}, sys; assert 'taichi' in sys.modules"]
+    done = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+    assert done.stdout == ""
 
 
 @pytest.mark.physics

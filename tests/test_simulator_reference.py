@@ -12,7 +12,7 @@ import reference_mpm as reference
 from plab.losses import make_terms
 from plab.scene import sample_particles
 from plab.sim import Simulator, State
-from suite import batch
+from suite import assert_same_state, batch
 
 pytestmark = pytest.mark.physics
 
@@ -107,11 +107,7 @@ def test_states_agree(simulator: Simulator, contact: str, start: str) -> None:
     for e, scene in enumerate(SCENES):
         alpha = 666.0 if contact == "soft" else 0.0
         want = reference.env_step(scene, reference_state(state, e), torch.tensor(u[e, 0]), alpha)
-        for name in ("x", "v", "C", "F", "poses"):
-            a = getattr(got, name)[e]
-            b = getattr(want, name).numpy()
-            error = np.abs(a - b).max() / max(1.0, np.abs(b).max())
-            assert error < 1e-9, f"environment {e}, {name}: {error:.2e}"
+        assert_same_state(got, e, want)
 
 
 def test_loss_terms_and_mass_agree(simulator: Simulator) -> None:

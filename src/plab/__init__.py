@@ -1,5 +1,10 @@
 """plab: PlasticineLab rebuilt as an experiment harness, from one command line to the result file."""
 
+import os
+
+# Taichi prints a banner on standard output unless told so before it is imported, by whichever part of plab.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+
 from plab.envs import register_suite
 
 __version__ = "0.1.0"

@@ -17,9 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# Taichi prints a banner on standard output unless told so before it is imported.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-
 import taichi as ti
 from taichi.lang import impl
 
