@@ -149,7 +149,8 @@ def test_sim_keys_are_the_fields():
 def test_method_keys_are_the_fields(name):
     method = raw(f"method/{name}.yaml")
     assert keys(method) == names(METHOD_KINDS[name])
-    assert method["loss_weights"] == {"density": 10.0, "sdf": 10.0, "contact": 1.0}
+    assert {**method["loss_weights"], "contact": 1.0} == {"density": 10.0, "sdf": 10.0, "contact": 1.0}
+    assert (method["loss_weights"]["contact"] == 1.0) == (name != "adam")
     assert method["loss_terms"] == {"contact": "${protocol.contact}"}
 
 
@@ -346,6 +347,27 @@ def test_a_variant_may_have_any_name():
 def test_adam_has_a_learning_rate_by_task(overrides: list[str], lr: float):
     method = load_config(overrides).method
     assert method.lr == lr and method.lr_by_task == {}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "weight"),
+    [
+        (["task=Assembly"], 200.0),
+        (["task=Move"], 1.0),
+        (["task=Assembly", "method=gd"], 1.0),
+        (["task=Assembly", "method=adam_h"], 1.0),
+        (["task=Assembly", "method=solve"], 1.0),
+        (["task=Assembly", "protocol=release"], 1.0),
+        (["task=Assembly", "protocol.contact=soft"], 1.0),
+        (["task=Assembly", "method.loss_weights.contact=2"], 2.0),
+        (["task=Assembly", "method.contact_by_task.nearest.Assembly=3"], 3.0),
+        (["task=Move", "+method.contact_by_task.nearest.Move=3"], 3.0),
+    ],
+)
+def test_adam_has_a_contact_weight_by_task(overrides: list[str], weight: float):
+    method = load_config(overrides).method
+    assert method.loss_weights == {"density": 10.0, "sdf": 10.0, "contact": weight}
+    assert getattr(method, "contact_by_task", {}) == {}
 
 
 def test_load_config_leaves_a_surrounding_hydra_alone():

@@ -176,7 +176,9 @@ def test_the_gradient_of_each_body_is_that_of_central_differences(simulator, str
             # Wide steps cross kinks, of yielding and of contact; narrow ones drown in rounding.
             widths = (1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
             errors = [np.abs(differences(simulator, u, key, body, h) - slope) for h in widths]
-            assert (np.min(errors, axis=0) <= 1e-6 * np.abs(slope)).all(), (key, body)
+            # On CUDA a loss differs by rounding from run to run, by elastic bodies' yield stress, too.
+            noise = 0.0 if suite.DEVICE == "cpu" else 1e-14
+            assert (np.min(errors, axis=0) <= 1e-6 * np.abs(slope) + noise).all(), (key, body)
 
 
 def test_an_elastic_body_keeps_a_strain_at_which_its_neighbour_flows(simulator):
@@ -264,7 +266,9 @@ def test_torch_differentiates_by_the_materials(simulator):
     for given in (shared, shared[:, None].expand(-1, 2, -1)):
         states = simulate(simulator, u, material=given, every_step=False)
         sums += torch.autograd.grad(states.x[..., 1].square().sum(), shared)
-    assert torch.equal(*sums) and (sums[0] != 0).any()
+    rounding = 0.0 if suite.DEVICE == "cpu" else 1e-11
+    torch.testing.assert_close(*sums, rtol=rounding, atol=0.0)
+    assert (sums[0] != 0).any()
     step = np.zeros_like(table)
     step[0, 1, 0] = 1.0
 

@@ -30,7 +30,7 @@ from plab.report.table import NOTHING, Table, aligned, number, write_table
 from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.report.writing import write_tables
-from plab.results import check, load, pack
+from plab.results import check, config_dict, load, pack
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -247,6 +247,16 @@ def test_runs_from_before_the_contact_term_had_variants_had_the_nearest(tmp_path
     assert len(gather(tmp_path, "method.loss_terms.contact=nearest").table) == 2
 
 
+def test_a_value_by_task_is_plabs_own_on_that_task() -> None:
+    for words, changed in (
+        (["task=Assembly"], {}),
+        (["task=Assembly", "protocol=release"], {}),
+        (["task=Assembly", "method.loss_weights.contact=1"], {"method.loss_weights.contact": 1.0}),
+        (["task=Chopsticks", "method.loss_weights.contact=30"], {"method.loss_weights.contact": 30.0}),
+    ):
+        assert changed_settings(config_dict(load_config(words))) == changed
+
+
 def test_runs_from_before_a_setting_existed_did_without(tmp_path: Path) -> None:
     for seed in range(2):
         older = synthetic.config(tmp_path, seed=seed)
@@ -432,7 +442,7 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("name", "correlation", "share"), [("release", "0.94", "90 %"), ("targets", "0.47", "46 %")]
+    ("name", "correlation", "share"), [("release", "0.93", "87 %"), ("targets", "0.47", "46 %")]
 )
 def test_agreement_of_the_runs_that_come_with_plab(name: str, correlation: str, share: str) -> None:
     """What README and docs/reproduction.md say."""

@@ -47,6 +47,7 @@ def make_config(folder: Path, **changes) -> dict:
         },
         "sim": {"device": "cpu", "precision": "float64"},
         "seed": 3,
+        "seed_particles": 0,
         "results_dir": str(folder),
         "force": False,
         "progress": False,
@@ -63,6 +64,7 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
     assert config_hash(config | {"sim": config["sim"] | {"memory_mb": 7.0}}) == hash_
     assert config_hash(config | {"sim": config["sim"] | {"precision": "float32"}}) != hash_
     assert config_hash(config | {"seed": 4}) != hash_
+    assert config_hash(config | {"seed_particles": 3}) != config_hash(config | {"seed_particles": 0}) == hash_
 
 
 def test_hash_of_protocols(tmp_path: Path) -> None:
@@ -89,11 +91,11 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
-def test_runs_from_before_protocols_are_of_plabs_own(tmp_path: Path) -> None:
+def test_runs_from_before_protocols_are_of_plabs_own_and_of_the_first_draw(tmp_path: Path) -> None:
     config = make_config(tmp_path)
-    run = RunFile({key: value for key, value in config.items() if key != "protocol"})
+    run = RunFile({key: value for key, value in config.items() if key not in ("protocol", "seed_particles")})
     run.finish({}, {})
-    assert read(run.path).config == config | {"protocol": config["protocol"]}
+    assert read(run.path).config == config
     (row,), _ = rows(tmp_path)
     assert row.config["protocol"] == config["protocol"]
 

@@ -92,6 +92,7 @@ def misspelt() -> Iterator[list[str]]:
 OUT_OF_RANGE = {
     "seed": ("-1", "4294967296", "1.5", "nan"),
     "seed_scene": ("-1", "x"),
+    "seed_particles": ("-1", "x", "4294967296"),
     "checkpoint_seconds": ("-1", "nan", "inf"),
     "results_dir": ("''", "'  '"),
     "sim.precision": ("float16", "double", "''"),

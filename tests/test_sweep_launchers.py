@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,9 +112,37 @@ def test_bars_of_several_processes_on_a_terminal(monkeypatch) -> None:
     screen = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda: Console(file=screen, force_terminal=True, width=120))
     with progress.show_several(["GPU 0", "GPU 1"]) as report:
-        report("GPU 1", "Rope, 2 runs", 0, 8, 10, 3, "loss 2")
+        report("GPU 1", "compiling", "substep")
+        assert "compiling substep, 0 s" in screen.getvalue().rsplit("GPU 1", 1)[1]
+        report("GPU 1", "compiling", "")
+        report("GPU 1", "progress", "Rope, 2 runs", 0, 8, 10, 3, "loss 2")
     last = screen.getvalue().rsplit("GPU 0", 1)[1]
-    assert "GPU 1 Rope, 2 runs" in last and "3/8" in last and "loss 2" in last
+    assert "GPU 1 Rope, 2 runs" in last and "3/8" in last and "loss 2" in last and "compiling" not in last
+
+
+def test_a_process_forwards_which_kernel_it_compiles(monkeypatch) -> None:
+    told: list[tuple] = []
+    monkeypatch.setattr(progress, "_forward", None)
+    progress.forward_to(lambda *content: told.append(content))
+
+    @contextmanager
+    def compiler(note: Callable[[str], None]) -> Iterator[None]:
+        note("substep")
+        yield
+        note("")
+
+    with progress.show_waiting("Rope build", compiler):
+        assert told == [("compiling", "substep")]
+    with progress.show_progress("Rope", 0, 8, compiling=compiler) as report:
+        report(3, "loss 2")
+    said = ("progress", "Rope", 0, 8, progress.PLAIN_EVERY, 3, "loss 2")
+    assert told == [
+        ("compiling", "substep"),
+        ("compiling", ""),
+        ("compiling", "substep"),
+        said,
+        ("compiling", ""),
+    ]
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -243,6 +243,18 @@ def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, 
     np.testing.assert_allclose(reached, problem.target_mass[0], atol=1e-5 * reached.max())
 
 
+def test_another_draw_of_the_particles_has_the_same_target(tmp_path, monkeypatch, device):
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
+    overrides = ("task=RollingPin", "variant=2", *COARSE, f"sim.device={device}")
+    problem = Problem([load_config([*overrides, f"seed_particles={k}"]) for k in (3, 0)])
+    assert np.array_equal(*problem.target_mass)
+    assert len(list(tmp_path.glob("targets/RollingPin-*.npz"))) == 1
+    for scene, x in zip(problem.scenes, problem.simulator.state().x, strict=True):
+        np.testing.assert_allclose(x, sample_particles(scene), atol=1e-6)
+    assert [scene.particle_seed for scene in problem.scenes] == [3, 0]
+    assert not np.array_equal(*problem.initial_mass)
+
+
 def test_a_simulated_target_needs_a_simulator():
     scene, target = load("task=Torus")
     check_target(scene, target)

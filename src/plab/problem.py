@@ -113,7 +113,9 @@ def _kinds(cfgs: Sequence[Config]) -> list[str]:
     """Return texts that are equal where configurations differ in method, seed and files only."""
     # A planner's batch has each configuration many times.
     texts = {
-        id(cfg): json.dumps([cfg.variant, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)])
+        id(cfg): json.dumps(
+            [cfg.variant, cfg.seed_particles, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)]
+        )
         for cfg in {id(cfg): cfg for cfg in cfgs}.values()
     }
     return [texts[id(cfg)] for cfg in cfgs]

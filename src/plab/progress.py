@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import timedelta
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -14,6 +15,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -29,8 +31,9 @@ Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
 """Takes what is to be called with the name of what is waited for, or nothing, while its block lasts; such as
 :func:`plab.sim.compiling.watch_compiling`."""
 
-Forward = Callable[[str, int, int, int, int, str], None]
-"""Takes title, first step, steps to do, steps between two plain lines, steps done, and text."""
+Forward = Callable[..., None]
+"""Takes ``"progress"`` with title, first step, steps to do, steps between two plain lines, steps done and
+text; or ``"compiling"`` with the name of a kernel, empty when it is done."""
 
 _forward: Forward | None = None
 
@@ -71,13 +74,14 @@ def show_progress(
     if not enabled:
         yield lambda done, text: None
     elif (forward := _forward) is not None:
-        yield lambda done, text: forward(title, start, total, plain_every, done, text)
+        with _watched(compiling, lambda kernel: forward("compiling", kernel)):
+            yield lambda done, text: forward("progress", title, start, total, plain_every, done, text)
     elif not console.is_terminal:
         yield _plain(title, start, total, plain_every)
     else:
         with Progress(*_columns(), console=console, expand=True) as progress:
             task = progress.add_task(title, total=total, completed=start, text="")
-            with _noted(progress, compiling):
+            with _watched(compiling, lambda kernel: _note(progress, task, kernel)):
                 yield lambda done, text: progress.update(task, completed=done, text=text)
 
 
@@ -92,30 +96,28 @@ def show_waiting(title: str, compiling: Watcher, *, enabled: bool = True) -> Ite
         enabled: Whether to show anything.
     """
     console = Console()
-    if not enabled or _forward is not None or not console.is_terminal:
-        yield
-        return
-    columns = TextColumn("{task.description}"), _TextColumn()
-    with Progress(*columns, console=console, transient=True) as progress:
-        progress.add_task(title, total=None, text="")
-        with _noted(progress, compiling):
+    if enabled and (forward := _forward) is not None:
+        with _watched(compiling, lambda kernel: forward("compiling", kernel)):
             yield
-
-
-@contextmanager
-def _noted(progress: Progress, compiling: Watcher | None) -> Iterator[None]:
-    """Have a bar's text say which kernel is being compiled, and for how long, while it is."""
-    if compiling is None:
+    elif not enabled or not console.is_terminal:
         yield
-        return
-    (task,) = progress.task_ids
+    else:
+        columns = TextColumn("{task.description}"), _TextColumn()
+        with Progress(*columns, console=console, transient=True) as progress:
+            task = progress.add_task(title, total=None, text="")
+            with _watched(compiling, lambda kernel: _note(progress, task, kernel)):
+                yield
 
-    def note(kernel: str) -> None:
-        # At once: the compiler may keep the thread that draws from running for seconds.
-        progress.update(task, kernel=kernel, since=time.monotonic(), refresh=bool(kernel))
 
-    with compiling(note):
-        yield
+def _watched(compiling: Watcher | None, note: Callable[[str], None]) -> AbstractContextManager[None]:
+    """Have a function told which kernel is being compiled while the block lasts."""
+    return nullcontext() if compiling is None else compiling(note)
+
+
+def _note(progress: Progress, task: TaskID, kernel: str) -> None:
+    """Have a bar's text say which kernel is being compiled, and for how long."""
+    # At once: the compiler may keep the thread that draws from running for seconds.
+    progress.update(task, kernel=kernel, since=time.monotonic(), refresh=bool(kernel))
 
 
 class _TextColumn(ProgressColumn):
@@ -132,9 +134,7 @@ class _TextColumn(ProgressColumn):
 
 
 @contextmanager
-def show_several(
-    names: Sequence[str], *, enabled: bool = True
-) -> Iterator[Callable[[str, str, int, int, int, int, str], None]]:
+def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Callable[..., None]]:
     """Show how far several processes have come while the ``with`` block lasts, a bar each.
 
     Args:
@@ -148,8 +148,9 @@ def show_several(
     if not (enabled and console.is_terminal):
         lines: dict[tuple[str, str], Report] = {}
 
-        def say(name: str, title: str, start: int, total: int, every: int, done: int, text: str) -> None:
-            if enabled:
+        def say(name: str, kind: str, *content: Any) -> None:
+            if enabled and kind == "progress":
+                title, start, total, every, done, text = content
                 key = name, title
                 lines.setdefault(key, _plain(f"{name} {title}", start, total, every))(done, text)
 
@@ -158,7 +159,11 @@ def show_several(
     with Progress(*_columns(), console=console, expand=True) as progress:
         tasks = {name: progress.add_task(name, total=None, text="") for name in names}
 
-        def draw(name: str, title: str, _start: int, total: int, _every: int, done: int, text: str) -> None:
+        def draw(name: str, kind: str, *content: Any) -> None:
+            if kind == "compiling":
+                _note(progress, tasks[name], *content)
+                return
+            title, _start, total, _every, done, text = content
             progress.update(
                 tasks[name], description=f"{name} {title}", total=total, completed=done, text=text
             )

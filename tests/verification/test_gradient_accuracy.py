@@ -22,8 +22,8 @@ from touched_bodies import ACTIONS, MATERIAL, TOUCHING, Point, X, components, di
 pytestmark = pytest.mark.physics
 
 SIZES = 10.0 ** -np.arange(2.0, 7.1, 0.5)
-BOTTOM = 1e-6
-"""Largest relative error at the bottom of the V."""
+BOTTOM = 1e-6 if DEVICE == "cpu" else 2e-6
+"""Largest relative error at the bottom of the V; on CUDA losses differ by rounding from run to run."""
 
 COUNT = len(X)
 YIELD_STRAIN = MATERIAL[2] * (1.0 + MATERIAL[1]) / MATERIAL[0]

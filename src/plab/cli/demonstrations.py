@@ -46,7 +46,16 @@ plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
 SEARCH: dict[str, Any] = {"lr": [0.1, 0.03, 0.01], "iterations": 200, "every": 10, "seed": 0}
 """What ``--search`` does unless told otherwise."""
 
-_NOT_SEARCHED = ("name", "optimizer", "lr", "lr_by_task", "momentum", "max_gradient_norm", "iterations")
+_NOT_SEARCHED = (
+    "name",
+    "optimizer",
+    "lr",
+    "lr_by_task",
+    "contact_by_task",
+    "momentum",
+    "max_gradient_norm",
+    "iterations",
+)
 """Settings of the method that ``--search`` has flags of its own for, or does not use."""
 
 

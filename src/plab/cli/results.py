@@ -111,9 +111,10 @@ def _check_arguments(parser: Parser) -> None:
 
 def _pack_arguments(parser: Parser) -> None:
     """Put runs into one small file."""
-    parser.add_argument("source", type=_source, help=_SOURCES)
-    what = "runs to take, e.g. task=Rope,Move method=adam status=all; by default those that are finished"
-    parser.add_argument("words", nargs="*", help=what)
+    what = (
+        f"each a {_SOURCES} (default: results); runs to take: task=Rope,Move status=all (default: finished)"
+    )
+    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
     what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
@@ -173,14 +174,15 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _pack(options: argparse.Namespace) -> int:
-    chosen = select(options.words, SELECTABLE)
+    names, words = sources_and_words(options.arguments)
+    sources, chosen = list(map(resolve, names or ["results"])), select(words, SELECTABLE)
     _require_statuses(chosen.choices.get("status", ()))
-    if options.words:
+    if words:
         others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
-        require_possible(Selection(others, chosen.keys), readable_rows(options.source)[0])
+        require_possible(Selection(others, chosen.keys), readable_rows(sources)[0])
     chosen = _finished_unless_said(chosen)
     done = pack(
-        options.source,
+        sources,
         options.output,
         wanted=lambda row: chosen(row.values, row.config),
         keep_masses=options.masses,

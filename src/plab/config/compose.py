@@ -222,7 +222,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool =
         OmegaConf.set_struct(composed, None)
         _require_effect(composed, overrides, alone)
         _choose_profile(composed.method)
-        _choose_learning_rate(composed.method)
+        _choose_by_task(composed.method)
         _choose_numbers(composed, overrides)
         _choose_variant(composed, overrides)
         composed.task = merge_variant(composed.task, composed.variant)
@@ -285,6 +285,7 @@ def build_scene(cfg: Config) -> Scene:
         dt=sim.dt,
         substeps=sim.substeps,
         horizon=sim.horizon,
+        particle_seed=cfg.seed_particles,
         start=protocol.start,
         numbers=protocol.numbers,
         floor=protocol.floor,
@@ -327,6 +328,11 @@ def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool)
         rates = method.get("lr_by_task") or {}
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
         used["method.lr_by_task."] = f"task={task.name}", task.name if task.name in rates else "default"
+        used["method.contact_by_task."] = (
+            f"protocol.contact={composed.protocol.contact}",
+            composed.protocol.contact,
+        )
+        used[f"method.contact_by_task.{composed.protocol.contact}."] = f"task={task.name}", task.name
     if alone or variant == RANDOM:
         # Of the variants a random one uses that which gives what is not drawn, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant
@@ -353,11 +359,11 @@ def _choose_profile(method: DictConfig) -> None:
     method.profiles = {}
 
 
-def _choose_learning_rate(method: DictConfig) -> None:
-    """Put the task's learning rate where it is referred to, and forget those of the others."""
+def _choose_by_task(method: DictConfig) -> None:
+    """Put the task's learning rate and contact weight where they are referred to, and forget the others'."""
     if "lr_by_task" in method:
         OmegaConf.resolve(method)
-        method.lr_by_task = {}
+        method.lr_by_task = method.contact_by_task = {}
 
 
 def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:

@@ -121,6 +121,7 @@ class Config:
         targets: Where the targets come from.
         variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
         seed_scene: Which random variant was drawn; None of other variants.
+        seed_particles: Which draw of the particles the start is. Simulated targets are made from draw 0.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
@@ -136,6 +137,7 @@ class Config:
     targets: TargetsConfig
     variant: str
     seed_scene: int | None
+    seed_particles: int
     seed: int
     results_dir: str
     force: bool
@@ -145,9 +147,10 @@ class Config:
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        if self.seed >= 2**32:
-            raise ConfigError(f"seed must be below 2^32 = {2**32}, not {self.seed}")
-        at_least("seed", self.seed, 0)
+        for key in ("seed", "seed_particles"):
+            if (seed := getattr(self, key)) >= 2**32:
+                raise ConfigError(f"{key} must be below 2^32 = {2**32}, not {seed}")
+            at_least(key, seed, 0)
         at_least("seed_scene", self.seed_scene or 0, 0)
         one_of("logger", self.logger, LOGGERS)
         at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)

@@ -96,6 +96,7 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
         cfg = dataclasses.replace(
             _defaults(),
             variant=str(run.config["variant"]),
+            seed_particles=run.config["seed_particles"],
             task=_section(run.config["task"], TaskConfig),
             protocol=_section(run.config["protocol"], ProtocolConfig),
             sim=_section(run.config["sim"], SimConfig),

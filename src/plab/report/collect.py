@@ -52,6 +52,7 @@ _HARMLESS = (
     "sim.memory_mb",
     "method.tensorboard",
     "method.lr_by_task",
+    "method.contact_by_task",
     "method.torch_device",
     "method.torch_threads",
     # Acts where method.loss_terms.contact says so.
@@ -417,7 +418,8 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     """Return what a method and a task have in plab's files under a protocol, by dotted key, but for what does
     not matter."""
-    usual = _usual(method, protocol) | _usual_rate(method, task)
+    usual = _usual(method, protocol)
+    usual = usual | _usual_by_task(method, task, usual["protocol.contact"])
     exact = usual["protocol.numbers"] == "release"
     usual |= {f"task.{key}": value for key, value in _usual_task(task, exact).items()}
     return {key: value for key, value in usual.items() if key not in _HARMLESS}
@@ -442,13 +444,15 @@ def _usual(method: str, protocol: str) -> dict[str, Any]:
     words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
     config = config_dict(load_config(words))
     sections = ("protocol", "sim", "method") if known else ("protocol", "sim")
-    return dict(_leaves({name: config[name] for name in sections}))
+    return dict(_leaves({name: config[name] for name in (*sections, "seed_particles")}))
 
 
-def _usual_rate(method: str, task: str) -> dict[str, float]:
-    """Return the learning rate of a method that has one of its own for the task."""
-    rates = _own_file("method", method).get("lr_by_task", {})
-    return {"method.lr": rates.get(task, rates["default"])} if rates else {}
+def _usual_by_task(method: str, task: str, contact: str) -> dict[str, float]:
+    """Return learning rate and contact weight of a method that has some of its own for the task."""
+    own = _own_file("method", method)
+    rates, weights = own.get("lr_by_task", {}), own.get("contact_by_task", {}).get(contact, {})
+    found = {"method.lr": rates.get(task, rates["default"])} if rates else {}
+    return found | ({"method.loss_weights.contact": weights[task]} if task in weights else {})
 
 
 def _usual_task(task: str, exact: bool) -> dict[str, Any]:

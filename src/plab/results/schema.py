@@ -78,10 +78,11 @@ _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds"
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
 
-_BEFORE_PROTOCOLS = {
-    "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"}
+_BEFORE: dict[str, Any] = {
+    "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"},
+    "seed_particles": 0,
 }
-"""What the configurations of runs say that are older than protocols."""
+"""What the configurations of runs would say that are older than these choices."""
 
 
 _SECTIONS = ("task", "method", "sim", "protocol")
@@ -94,6 +95,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "protocol.name": str,
     "sim.device": str,
     "seed": int,
+    "seed_particles": int,
 }
 """What every configuration says, and the types of it."""
 
@@ -187,7 +189,7 @@ def stored_config(text: str) -> dict[str, Any]:
     loaded = json.loads(text)
     if not isinstance(loaded, dict):
         raise ValueError(f"config is a {type(loaded).__name__}, not sections and values")
-    config = _BEFORE_PROTOCOLS | loaded
+    config = _BEFORE | loaded
     if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
         raise ValueError(f"config has no section {strange[0]}")
     for key, kind in _NEEDED.items():
@@ -241,7 +243,11 @@ def config_hash(cfg: Any) -> str:
     chosen = {key: protocol[key] for key in protocol if key not in ("name", "score", "contact")}
     if any(choice != "plab" for choice in chosen.values()):
         plain["protocol"] = chosen
+    # Runs of the first draw keep the hashes that they had before there was another.
+    if not plain.get("seed_particles"):
+        plain.pop("seed_particles", None)
     # Always empty.
+    plain["method"].pop("contact_by_task", None)
     plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
     # What a file holds counts, not where it is.
     plain["task"] = _without_places(plain["task"])

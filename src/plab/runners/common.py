@@ -119,7 +119,7 @@ def environment_key(cfg: Config) -> str:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    return json.dumps([*sections, loss, cfg.variant])
+    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles])
 
 
 def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:

@@ -145,7 +145,7 @@ def _varying_keys(jobs: Sequence[Sequence[str]]) -> set[str]:
     return {key for key in keys if key in _TOP_LEVEL or "." in key}
 
 
-_TOP_LEVEL = {"variant", "seed_scene"}
+_TOP_LEVEL = {"variant", "seed_scene", "seed_particles"}
 
 
 def _lines(parsed: Sequence[Override]) -> tuple[str, ...]:

@@ -63,10 +63,10 @@ def carry_on(names: Sequence[str]) -> Carrier:
                             worker.give(waiting.pop(), progress())
                     for worker in _heard([worker for worker in workers if worker.batch]):
                         for kind, *content in worker.messages():
-                            if kind == "progress":
-                                report(f"GPU {worker.name}", *content)
-                            else:
+                            if kind == "ended":
                                 yield from _told(*content)
+                            else:
+                                report(f"GPU {worker.name}", kind, *content)
         finally:
             for worker in workers:
                 worker.end()
@@ -148,7 +148,7 @@ def _work(name: str, connection: Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # What is to be seen is shown by the process that has started this one.
     sys.stdout = open(os.devnull, "w")
-    forward_to(lambda *content: connection.send(("progress", *content)))
+    forward_to(lambda *content: connection.send(content))
     cache = SimulatorCache()
     try:
         while True:

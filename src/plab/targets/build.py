@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -159,7 +159,11 @@ def build_targets(
         TargetError: See :func:`build_target`.
         plab.sim.SimulationError: If a demonstration makes the state not finite.
     """
-    store, scenes = TargetStore(simulator), simulator.scenes
+    store, own = TargetStore(simulator), simulator.scenes
+    # The start may be another draw of the particles than the one that targets are made from.
+    others = {id(scene): replace(scene, particle_seed=0) for scene in own if scene.particle_seed}
+    scenes = [others.get(id(scene), scene) for scene in own]
+    scenes = [scenes[scenes.index(scene)] for scene in scenes]
     # Vectorised environments are many of one kind: each kind is built once.
     kinds = [(id(scene), id(target)) for scene, target in zip(scenes, targets, strict=True)]
     first = {kind: kinds.index(kind) for kind in kinds}
@@ -176,9 +180,11 @@ def build_targets(
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
         simulator.set_contact("hard")
+        if others:
+            simulator.set_scenes(scenes)
         simulator.rollout(np.stack([missing.get(kind, still) for kind in kinds]), gradient=False)
         made = simulator.mass_tensor()
-        simulator.reset()
+        simulator.set_scenes(own) if others else simulator.reset()
         for kind, script in missing.items():
             masses[kind] = made[first[kind]]
             store.save(scenes[first[kind]], script, masses[kind])

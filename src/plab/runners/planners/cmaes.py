@@ -50,6 +50,8 @@ class Cmaes(Sampler):
         """Tell the library what each of them costs."""
         pairs = zip(points.flatten(1).cpu().numpy(), cost.tolist(), strict=True)
         self._search.tell(list(pairs))
+        # What the library keeps of its covariance is one triangle: a run that goes on has to have just that.
+        self._search.__setstate__(self._search.__getstate__())
 
     def state(self) -> dict[str, Any]:
         """Return everything that the next iterations depend on, that of the library included."""
