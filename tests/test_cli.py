@@ -36,7 +36,7 @@ REFUSED = [
     (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks,"),
     (
         ["method=a2c"],
-        "choose from: adam, adam_h, apg, cem, cmaes, gd, hybrid, mppi, multistart, ppo, sac, solve,",
+        "choose from: adam, adam_h, apg, cem, cmaes, gd, hybrid, mppi, multistart, ppo, sac, shac, solve,",
     ),
     (
         ["+experiment=yield_ablatoin"],

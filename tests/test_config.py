@@ -25,6 +25,7 @@ from plab.config import (
     ProtocolConfig,
     RandomConfig,
     SacConfig,
+    ShacConfig,
     SimConfig,
     TaskConfig,
     Td3Config,
@@ -68,6 +69,7 @@ DOCUMENTED = (
     TrajectoryConfig,
     ApgConfig,
     SacConfig,
+    ShacConfig,
     Td3Config,
     PpoConfig,
     ProtocolConfig,
@@ -78,6 +80,7 @@ METHOD_KINDS = {
     "adam": TrajectoryConfig,
     "apg": ApgConfig,
     "sac": SacConfig,
+    "shac": ShacConfig,
     "td3": Td3Config,
     "ppo": PpoConfig,
 }

@@ -44,7 +44,7 @@ def _leaves(node: Any, path: str) -> Iterator[str]:
 def _keys() -> list[str]:
     """Keys of all kinds of methods and of some tasks, and what looks like one."""
     composed = [
-        load_config([f"method={one}"]) for one in ("adam", "sac", "td3", "ppo", "cem", "solve", "apg")
+        load_config([f"method={one}"]) for one in ("adam", "sac", "td3", "ppo", "cem", "solve", "apg", "shac")
     ]
     composed += [load_config([f"task={one}", "variant=3"]) for one in ("Move", "Torus")]
     known = dict.fromkeys(key for cfg in composed for key in _leaves(asdict(cfg), ""))
@@ -216,6 +216,23 @@ def assert_helpful(error: PlabError) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ overrides
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        f"task=[#,{'[' * 2000}]",
+        f"task={'a' * 3000}",
+        f"variant={'a' * 3000}",
+        f"task.bodies.rope={'a' * 3000}",
+        f"method.contact={'a ' * 1500}",
+    ],
+    ids=lambda word: word[:20],
+)
+def test_long_values_are_cut_short(word: str) -> None:
+    with pytest.raises(PlabError) as caught:
+        load_config([word])
+    assert_helpful(caught.value)
 
 
 @cases

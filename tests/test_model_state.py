@@ -142,13 +142,15 @@ def test_a_state_of_something_else_is_refused(trained, change: Callable[[dict[st
 
 def test_a_policy_trained_by_gradient_has_arrays_too() -> None:
     method = load_config(["task=Move", "method=apg", "method.hidden=[4]"]).method
-    first, second = (PolicyTraining(method, 3, 2, seed) for seed in (0, 1))
+    first, second = (PolicyTraining(method, 3, 2, seed, torch.device("cpu")) for seed in (0, 1))
     x = torch.ones(5, 3)
-    first.step(first.policy(x).square().sum())
+    first.policy(x).square().sum().backward()
+    first.improve()
     second.restore(copy.deepcopy(first.state()))
     assert_same(second.state(), first.state())
     for training in (first, second):
-        training.step(training.policy(x).square().sum())
+        training.policy(x).square().sum().backward()
+        training.improve()
     assert_same(second.state(), first.state())
     with pytest.raises(ValueError, match="its network is pickled, as by earlier versions of plab"):
         second.restore({"training": np.zeros(8, np.uint8)})

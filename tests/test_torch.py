@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
@@ -15,7 +16,7 @@ from plab.problem import Problem
 from plab.results import BUDGETS, RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
-from plab.torch import TensorEnv, rollout
+from plab.torch import TensorEnv, policy_gradient, rollout
 from same_runs import assert_same_numbers, stopped_at
 
 pytestmark = pytest.mark.physics
@@ -34,10 +35,16 @@ COARSE = [
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
+def episodes() -> EpisodeBatch:
     """Two environments of which the second has a softer rope."""
     first = load_config([*COARSE, "sim=reference"])
-    return Problem([first, load_config([*COARSE, "sim=reference", "task.yield_stress=20"])])
+    second = load_config([*COARSE, "sim=reference", "task.yield_stress=20"])
+    return EpisodeBatch([first, second], contact="soft")
+
+
+@pytest.fixture(scope="module")
+def problem(episodes: EpisodeBatch) -> Problem:
+    return episodes.problem
 
 
 def draw(seed: int, **options) -> torch.Tensor:
@@ -126,6 +133,114 @@ def test_there_is_no_second_derivative(problem: Problem) -> None:
         gradient.sum().backward()
 
 
+# ---------------------------------------------------------------- a policy that reacts
+
+
+class Blind(torch.nn.Module):
+    """Actions that do not depend on what is observed, one row for each call."""
+
+    def __init__(self, actions: torch.Tensor) -> None:
+        super().__init__()
+        self.actions = torch.nn.Parameter(actions)
+        self.calls = 0
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return self.actions[:, self.calls - 1]
+
+
+def network(episodes: EpisodeBatch, outputs: int, seed: int = 0) -> torch.nn.Sequential:
+    """A network that reacts to what it sees, in float64."""
+    entries = episodes.observation_space.shape[0]
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        layers = torch.nn.Linear(entries, 8), torch.nn.Tanh(), torch.nn.Linear(8, outputs), torch.nn.Tanh()
+        made = torch.nn.Sequential(*layers).double()
+    with torch.no_grad():
+        made[0].weight *= 3.0
+    return made
+
+
+def gradient_of(module: torch.nn.Module) -> torch.Tensor:
+    return torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
+
+
+@pytest.mark.parametrize("valued", [False, True])
+def test_the_whole_gradient_of_a_policy_agrees_with_differences(episodes: EpisodeBatch, valued: bool) -> None:
+    policy, critic = network(episodes, 6), network(episodes, 1, seed=1)
+    weights = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
+    value = (lambda seen: critic(seen)[:, 0]) if valued else None
+
+    def loss() -> float:
+        episodes.reset()
+        policy.zero_grad()
+        done = policy_gradient(episodes, policy, HORIZON, discount=0.8, value=value)
+        total = sum(0.8**t * done.loss[t].mean() for t in range(HORIZON))
+        return float(total) - (0.8**HORIZON * float(value(done.observations[-1]).mean()) if valued else 0.0)
+
+    loss()
+    assert all(parameter.grad is None for parameter in critic.parameters())
+    direction = torch.randn(weights.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    direction /= direction.norm()
+    along, step, beside = float(gradient_of(policy) @ direction), 1e-5, []
+    for sign in (1, -1):
+        torch.nn.utils.vector_to_parameters(weights + sign * step * direction, policy.parameters())
+        beside.append(loss())
+    assert along == pytest.approx((beside[0] - beside[1]) / (2 * step), rel=1e-6)
+
+
+def test_without_a_reaction_it_is_the_gradient_of_a_rollout(episodes: EpisodeBatch) -> None:
+    actions = draw(8).detach()
+    policy, wanted = Blind(actions.clone()), actions.clone().requires_grad_()
+    episodes.reset()
+    done = policy_gradient(episodes, policy, HORIZON)
+    losses = rollout(episodes.problem, wanted)
+    losses.mean().backward()
+    np.testing.assert_array_equal(done.loss.sum(0).numpy(), losses.detach().numpy())
+    torch.testing.assert_close(policy.actions.grad, wanted.grad, rtol=1e-12, atol=1e-14)
+
+
+def test_a_reaction_changes_the_gradient(episodes: EpisodeBatch) -> None:
+    policy = network(episodes, 6)
+    episodes.reset()
+    done = policy_gradient(episodes, policy, HORIZON)
+    whole = gradient_of(policy)
+    policy.zero_grad()
+    rollout(episodes.problem, policy(done.observations[:-1].transpose(0, 1))).mean().backward()
+    assert float((whole - gradient_of(policy)).norm()) > 1e-3 * float(whole.norm())
+
+
+def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None:
+    policy = network(episodes, 6)
+    episodes.reset()
+    parts = [policy_gradient(episodes, policy, steps) for steps in (1, HORIZON - 1)]
+    with pytest.raises(ResetNeeded, match="the episode is over"):
+        policy_gradient(episodes, policy, 1)
+    observation, _ = episodes.reset()
+    for t in range(HORIZON):
+        part, k = (parts[0], t) if t < 1 else (parts[1], t - 1)
+        np.testing.assert_array_equal(part.observations[k].float().numpy(), observation)
+        step = episodes.step(part.actions[k].numpy())
+        observation = step.observation
+        np.testing.assert_allclose(part.loss[k].numpy(), step.info["loss"], rtol=1e-12)
+    # More steps than are left are refused before the first.
+    episodes.reset()
+    with pytest.raises(ResetNeeded):
+        policy_gradient(episodes, policy, HORIZON + 1)
+
+
+def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
+    actions = draw(9).detach()
+    before = episodes.problem.try_out(actions.numpy(), gradient=True)
+    episodes.reset()
+    with pytest.raises(ValueError, match=r"actions have shape \(2, 5\)"):
+        policy_gradient(episodes, network(episodes, 5), HORIZON)
+    episodes.reset()
+    policy_gradient(episodes, network(episodes, 6), HORIZON, discount=0.5)
+    after = episodes.problem.try_out(actions.numpy(), gradient=True)
+    np.testing.assert_array_equal(after.gradient, before.gradient)
+
+
 # ---------------------------------------------------------------- method=apg
 
 
@@ -152,7 +267,7 @@ def test_apg_lowers_the_loss(finished: RunResult) -> None:
     rows = finished.iterations
     assert rows["steps"].tolist() == [HORIZON * i for i in range(ITERATIONS)]
     spent = rows["steps_forward"].tolist(), rows["steps_gradient"].tolist()
-    assert spent == ([HORIZON * (i + 1) for i in range(ITERATIONS)],) * 2
+    assert spent == ([0] * ITERATIONS, [HORIZON * (i + 1) for i in range(ITERATIONS)])
     measured = set(episode_columns(["density", "sdf", "contact"])) | set(BUDGETS)
     assert measured | {"iteration", "episodes", "steps", "gradient_norm", "seconds"} == set(rows.columns)
     assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and (rows["gradient_norm"] > 0).all()
@@ -163,7 +278,7 @@ def test_apg_lowers_the_loss(finished: RunResult) -> None:
 
 def test_apg_resumes_to_the_same_numbers(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, "method.lr=0.01")
-    with stopped_at(2, apg, "rollout"):
+    with stopped_at(2, apg, "policy_gradient"):
         run_config(cfg)
     assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
     again = run(cfg)

@@ -75,6 +75,7 @@ SECTIONS = (
     ("method=multistart", "method.", config.MultistartConfig, "method/multistart.yaml"),
     ("method=hybrid, solve", "method.", config.StagesConfig, "method/solve.yaml"),
     ("method=apg", "method.", config.ApgConfig, "method/apg.yaml"),
+    ("method=shac", "method.", config.ShacConfig, "method/shac.yaml"),
     ("method=sac, td3, ppo", "method.", config.RlConfig, "method/sac.yaml"),
     ("method=sac, td3", "method.", config.OffPolicyConfig, "method/sac.yaml"),
     ("method=td3", "method.", config.Td3Config, "method/td3.yaml"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,8 +24,16 @@ TRACEBACK = "PLAB_TRACEBACK"
 """Variable of the environment that lets a bug through with its traceback."""
 
 
+LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>'[^']{400})[^']+(?=')")
+"""What a message says too much of: a word, or what stands in quotation marks."""
+
+
 class PlabError(Exception):
     """Something that whoever uses plab can put right; the message is one line that says what would do."""
+
+    def __str__(self) -> str:
+        """Return the message, long values cut short."""
+        return LONG.sub(lambda found: f"{(found['word'] or found['quoted'])[:200]}...", super().__str__())
 
 
 class ArgumentError(PlabError, ValueError):

@@ -209,6 +209,17 @@ FAMILIES: dict[str, Family] = {
         kind=GRADIENT,
         methods={"apg": Appearance("APG", "#000000", ":")},
     ),
+    "shac": Family(
+        label="a policy, trained through the simulator's gradient and by a value function",
+        config=f"{_TYPES}:ShacConfig",
+        runner="plab.runners.shac:ShacRunner",
+        columns=("train_reward", "train_score"),
+        may_be_nan=("train_reward", "train_score"),
+        rules={"shac": Rule("plab.runners.shac:SHAC", f"{_TYPES}:ShacConfig")},
+        contact="hard",
+        kind=GRADIENT,
+        methods={"shac": Appearance("SHAC", "#DDAA33", ":")},
+    ),
 }
 """plab's own families by name, the ``family`` of a method's YAML."""
 

@@ -7,7 +7,7 @@ are tensors. With ``sim.device=cuda`` they stay on the device.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from plab.problem import Problem
     from plab.sim import Recording, Simulator, State
 
-__all__ = ["States", "TensorEnv", "rollout", "simulate"]
+__all__ = ["States", "Stretch", "TensorEnv", "policy_gradient", "rollout", "simulate"]
 
 
 def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
@@ -199,6 +199,95 @@ def _start(simulator: Simulator, parts: dict[str, np.ndarray]) -> None:
     if parts:
         simulator.reset()
         simulator.set_initial_state(replace(simulator.state(), **parts))
+
+
+class Stretch(NamedTuple):
+    """Some steps of a policy in a batch of episodes.
+
+    Attributes:
+        observations: Before each step and after the last, shape [T + 1, batch, entry].
+        actions: Shape [T, batch, A].
+        terms: Unweighted loss terms after each step, shape [T, batch, term].
+        loss: Weighted step losses, shape [T, batch].
+    """
+
+    observations: torch.Tensor
+    actions: torch.Tensor
+    terms: torch.Tensor
+    loss: torch.Tensor
+
+
+def policy_gradient(
+    batch: EpisodeBatch,
+    policy: torch.nn.Module,
+    steps: int,
+    *,
+    discount: float = 1.0,
+    value: Callable[[torch.Tensor], torch.Tensor] | None = None,
+) -> Stretch:
+    """Run a policy from where a batch of episodes stands, and add the gradient of its loss to the ``grad`` of
+    its parameters.
+
+    The loss is the mean over the environments of the discounted step losses, less the discounted value of the
+    last observation. The gradient is the whole one: it goes through the simulated states, and through what
+    each action changes in later observations, and thereby in later actions. A policy may draw its actions, as
+    functions of noise (``rsample``).
+
+    Args:
+        batch: Episodes that were :meth:`~plab.envs.core.EpisodeBatch.reset`; they advance.
+        policy: Maps observations, shape [batch, entry], to actions, shape [batch, A], which are clipped to
+            [-1, 1]; on the simulator's device. Observations have the type of its parameters.
+        steps: Steps T.
+        discount: The loss of step t weighs so much to the power of t, the value to the power of T.
+        value: Maps observations to values, shape [batch]; its parameters get no gradient.
+
+    Returns:
+        What was observed and done; nothing of it has a gradient.
+
+    Raises:
+        ValueError: If an action has another shape or is not finite.
+        gymnasium.error.ResetNeeded: If the episodes have fewer steps left.
+        plab.sim.SimulationError: If a state, loss or gradient stops being finite.
+        MemoryError: If the gradient does not fit the memory budget.
+    """
+    parameters = [one for one in policy.parameters() if one.requires_grad]
+    like = parameters[0].detach()
+    seen: list[torch.Tensor] = []
+    done: list[torch.Tensor] = []
+
+    def given(array: Any) -> Any:
+        return array if like.is_cuda else array.detach().double().numpy()
+
+    def choose(t: int, observation: Any) -> Any:
+        seen.append(torch.as_tensor(observation).to(like).requires_grad_())
+        if t == steps:
+            return None
+        with torch.enable_grad():
+            done.append(policy(seen[t]))
+        return given(done[t])
+
+    def react(t: int, actions_bar: Any) -> Any:
+        if t < steps:
+            bar = torch.as_tensor(actions_bar).to(like)
+            seen_bar, *by_parameter = torch.autograd.grad(
+                done[t], [seen[t], *parameters], bar, allow_unused=True
+            )
+            for parameter, part in zip(parameters, by_parameter, strict=True):
+                if part is not None:
+                    part = part / batch.size
+                    parameter.grad = part if parameter.grad is None else parameter.grad + part
+        elif value is None:
+            return None
+        else:
+            with torch.enable_grad():
+                worth = value(seen[steps]).sum()
+            (seen_bar,) = torch.autograd.grad(-(discount**steps) * worth, seen[steps])
+        return None if seen_bar is None else given(seen_bar)
+
+    terms = batch.closed_loop(steps, choose, react, discount=discount, like=like if like.is_cuda else None)
+    loss = batch.problem.loss_of(terms)
+    shown = [torch.as_tensor(array).to(like).transpose(0, 1) for array in (terms, loss)]
+    return Stretch(torch.stack(seen).detach(), torch.stack(done).detach(), *shown)
 
 
 class TensorEnv:

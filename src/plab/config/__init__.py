@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         PpoConfig,
         RlConfig,
         SacConfig,
+        ShacConfig,
         Td3Config,
         TrajectoryConfig,
     )
@@ -78,6 +79,7 @@ __all__ = [
     "RlConfig",
     "SacConfig",
     "SamplerConfig",
+    "ShacConfig",
     "SimConfig",
     "StagesConfig",
     "TargetsConfig",

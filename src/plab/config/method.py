@@ -30,6 +30,7 @@ __all__ = [
     "PpoConfig",
     "RlConfig",
     "SacConfig",
+    "ShacConfig",
     "Td3Config",
     "TrajectoryConfig",
 ]
@@ -242,6 +243,46 @@ class Td3Config(OffPolicyConfig):
         for name in ("exploration_noise", "target_noise", "target_noise_clip"):
             at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)
         at_least(f"{path}.policy_delay", self.policy_delay, 1)
+
+
+@dataclass
+class ShacConfig(RlConfig):
+    """Short-horizon actor-critic.
+
+    Attributes:
+        scenes: Scenes that the environments of the training are drawn from; 0: that of the run.
+        window: Steps through which the gradient goes.
+        value_lr: Learning rate of the value function.
+        lr_decay: Let the learning rates fall linearly to 0 over the run.
+        td_lambda: Lambda of the value function's targets.
+        tau: How far the value function in use follows at each window.
+        value_epochs: Passes of the value function over a window.
+        minibatches: Minibatches of each pass.
+        noise: Standard deviation of the actions at first, before the hyperbolic tangent.
+        max_gradient_norm: Longer gradients are scaled down to this norm.
+    """
+
+    scenes: int
+    window: int
+    value_lr: float
+    lr_decay: bool
+    td_lambda: float
+    tau: float
+    value_epochs: int
+    minibatches: int
+    noise: float
+    max_gradient_norm: float
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        at_least(f"{path}.scenes", self.scenes, 0)
+        for name in ("window", "value_epochs", "minibatches"):
+            at_least(f"{path}.{name}", getattr(self, name), 1)
+        for name in ("value_lr", "noise", "max_gradient_norm"):
+            positive(f"{path}.{name}", getattr(self, name))
+        unit(f"{path}.td_lambda", self.td_lambda)
+        share(f"{path}.tau", self.tau)
 
 
 @dataclass

@@ -6,7 +6,7 @@ asks for, and add nothing of their own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -255,10 +255,7 @@ class EpisodeBatch:
             plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
-        simulator = self._simulator
-        if self._step is None or self._step == self.horizon:
-            what = "no episode has started" if self._step is None else "the episode is over"
-            raise ResetNeeded(f"{what}: call reset() before step()")
+        simulator, now = self._simulator, self._now()
         # Faults are found with the measures: one wait for the device less.
         simulator.step(actions, check=False)
         # Queued before the wait for the measures.
@@ -271,9 +268,75 @@ class EpisodeBatch:
                 raise
             # Told once a step: asked again, the measures are those of the others.
             failures, info = error.failures, self._info(actions)
-        self._step += 1
+        self._step = now + 1
         reward = self._initial_loss.like(actions) - info["loss"]
         return Transition(observation, reward, self._step == self.horizon, info, failures)
+
+    def closed_loop(
+        self,
+        steps: int,
+        choose: Callable[[int, Array], Array],
+        react: Callable[[int, Array], Array | None],
+        *,
+        discount: float = 1.0,
+        like: torch.Tensor | None = None,
+    ) -> Array:
+        """Advance all sub-environments by some steps whose actions are chosen from observations, and go back
+        through the states and through what chose the actions.
+
+        Observations are of the simulation's type, float32 or float64.
+
+        Args:
+            steps: Steps T, at most those that are left of the episodes.
+            choose: Called with t = 0 to T and observations, shape [batch, entry]; returns the actions of step
+                t, shape [batch, action]; what it returns for T is ignored.
+            react: Called with t = T to 0 and the derivative of the discounted loss by the actions of step t,
+                None for T; returns the derivative by the observation before step t through these actions
+                (for T: of a function of the last observation), or None.
+            discount: The loss of step t weighs so much to the power of t.
+            like: Given a CUDA tensor, everything is one too.
+
+        Returns:
+            Unweighted loss terms after each step, shape [batch, T, term].
+
+        Raises:
+            gymnasium.error.ResetNeeded: If the episodes have fewer steps left.
+            plab.sim.SimulationError: If a state, loss or gradient stops being finite.
+            MemoryError: If the gradient does not fit the memory budget.
+        """
+        now = self._now(steps)
+        entries = self._pose_entries
+        observed = (self.observation_space.shape[0] - len(entries)) // 6
+        shape = self.size, len(self.problem.scenes[0].manipulators), 8
+
+        def chosen(t: int, particles: Array, poses: Array) -> Array:
+            return choose(t, self._joined(particles, poses))
+
+        def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
+            bar = react(t, actions_bar)
+            if bar is None:
+                return None
+            moved, posed = bar[:, : 6 * observed], bar[:, 6 * observed :]
+            whole = (
+                bar.new_zeros(self.size, shape[1] * 8)
+                if on_device(bar)
+                else np.zeros((self.size, shape[1] * 8))
+            )
+            whole[:, entries] = posed
+            return moved.reshape(self.size, observed, 6), whole.reshape(shape)
+
+        terms = self._simulator.closed_loop(
+            steps, chosen, reaction, stride=self._stride, discount=discount, like=like
+        )
+        self._step = now + steps
+        return terms
+
+    def _now(self, steps: int = 1) -> int:
+        """Return the number of the step that is next, of which so many have to be left."""
+        if self._step is None or self._step + steps > self.horizon:
+            what = "no episode has started" if self._step is None else "the episode is over"
+            raise ResetNeeded(f"{what}: call reset() before step()")
+        return self._step
 
     def frames(self) -> tuple[np.ndarray, ...]:
         """Draw the current states.
@@ -299,16 +362,18 @@ class EpisodeBatch:
         self._problem = None
 
     def _observe(self, like: Array = None) -> Array:
-        particles: Array = self._simulator.observe(self._stride, like)
-        poses: Array = self._simulator.poses(like)
+        joined = self._joined(self._simulator.observe(self._stride, like), self._simulator.poses(like))
+        return joined.float() if on_device(joined) else joined.astype(np.float32)
+
+    def _joined(self, particles: Array, poses: Array) -> Array:
+        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses."""
         rows = particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]
-        if on_device(like):
+        if on_device(particles):
             # Whoever gave a tensor has imported torch.
             import torch
 
-            return torch.cat(rows, dim=1).float()
-        out = np.empty((self.size, *self.observation_space.shape), np.float32)
-        return np.concatenate(rows, axis=1, out=out, casting="same_kind")
+            return torch.cat(rows, dim=1)
+        return np.concatenate(rows, axis=1)
 
     def _info(self, like: Array = None) -> dict[str, Array]:
         measures = self._simulator.measure(like)

@@ -1,7 +1,6 @@
 """A policy network trained through the simulator's gradient: ``apg``, analytic policy gradient.
 
-Each iteration runs an episode of the policy, then the same actions once more with gradient. Observations are
-treated as constants: how the actions change them, and thereby later actions, is left out of the gradient. To
+Each iteration runs an episode of the policy, and goes back through its states, observations and actions. To
 reproduce a result:
 
     python -m plab.run task=Move variant=1 method=apg seed=0
@@ -14,20 +13,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-import numpy as np
 import torch
 
 from plab.config import ApgConfig
-from plab.runners.common import policy_episode, shared_batches, torch_settings
+from plab.runners.common import shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.runner import Runner, Step, Track
-from plab.torch import rollout
+from plab.torch import policy_gradient
 
 __all__ = ["ApgRunner", "PolicyTraining"]
 
 
 class ApgRunner(Runner):
-    """Trains a policy network; each iteration is an episode of it, and the same actions with gradient."""
+    """Trains a policy network; each iteration is an episode of it, with gradient."""
 
     def context(self) -> AbstractContextManager[Any]:
         """Give torch its threads."""
@@ -41,19 +39,30 @@ class ApgRunner(Runner):
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the network, or take that of the file."""
         (entries,), (size,) = self._episode.observation_space.shape, self._episode.action_space.shape
-        self._training = PolicyTraining(self._method, entries, size, track.cfg.seed)
+        device = torch.device(track.cfg.sim.device)
+        self._training = PolicyTraining(self._method, entries, size, track.cfg.seed, device)
         if state is not None:
             self._training.restore(state)
 
     def step(self, track: Track) -> Step:
         """Run an episode of the policy, and improve the policy by the gradient of its loss."""
-        done = policy_episode(self._episode, self._training.act)
-        # The actions again, now as functions of the weights; the same numbers but for rounding.
-        actions = self._training.policy(torch.from_numpy(done.observations))
-        norm = self._training.step(rollout(self.problem, actions[None]).sum())
-        measured, steps = done.measures | {"gradient_norm": norm}, len(done.actions)
-        # An iteration is one episode, simulated twice.
-        return Step(measured, done.actions, self._training.state(), track.iteration, steps_gradient=steps)
+        episode, training = self._episode, self._training
+        _, before = episode.reset()
+        done = policy_gradient(episode, training.policy, episode.horizon)
+        actions = done.actions[:, 0].cpu().double().numpy()
+        rewards = before["loss"][0] - done.loss[:, 0].double()
+        problem, last = episode.problem, episode.problem.simulator.measure()
+        sums = zip(problem.term_names, done.terms[:, 0].double().sum(0).tolist(), strict=True)
+        measured = {
+            "loss": float(done.loss.double().sum()),
+            **{f"loss_{name}": total for name, total in sums},
+            "reward": float(rewards.sum()),
+            "iou": float(last.iou[0]),
+            "score": float(problem.scores_of(last.iou)[0][0]),
+            "gradient_norm": training.improve(),
+        }
+        state, steps = training.state(), len(actions)
+        return Step(measured, actions, state, track.iteration, steps_forward=0, steps_gradient=steps)
 
     @property
     def _method(self) -> ApgConfig:
@@ -67,7 +76,9 @@ class PolicyTraining:
         policy: Maps observations, shape [..., entry], to actions in (-1, 1), shape [..., A].
     """
 
-    def __init__(self, method: ApgConfig, observation_size: int, action_dim: int, seed: int) -> None:
+    def __init__(
+        self, method: ApgConfig, observation_size: int, action_dim: int, seed: int, device: torch.device
+    ) -> None:
         """Make the network, with torch's own initial weights.
 
         Args:
@@ -75,24 +86,19 @@ class PolicyTraining:
             observation_size: Entries of an observation.
             action_dim: Length A of the action vector.
             seed: Seed of the initial weights.
+            device: Where the network is to be.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.policy = _network([observation_size, *method.hidden, action_dim])
+            self.policy = _network([observation_size, *method.hidden, action_dim]).to(device)
         self._optimizer = torch.optim.Adam(self.policy.parameters(), lr=method.lr)
 
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """Return the actions for observations of shape [env, entry], shape [env, A]."""
-        with torch.no_grad():
-            return self.policy(torch.from_numpy(observations)).numpy()
-
-    def step(self, loss: torch.Tensor) -> float:
-        """Improve the policy by the gradient of a loss; return the gradient's norm over all weights."""
-        self._optimizer.zero_grad()
-        loss.backward()
+    def improve(self) -> float:
+        """Improve the policy by the gradient that its parameters hold, and clear that; return its norm."""
         gradients = [parameter.grad for parameter in self.policy.parameters()]
         norm = torch.cat([part.flatten() for part in gradients if part is not None]).norm()
         self._optimizer.step()
+        self._optimizer.zero_grad()
         return float(norm)
 
     def state(self) -> dict[str, Any]:

@@ -335,11 +335,17 @@ class ForwardSimulator:
             Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
         """
         self._require_runtime()
+        return self._observe(self._particles.current, 0, stride, like)
+
+    def _observe(
+        self, state: ti.Ndarray, slot: int, stride: int, like: torch.Tensor | None
+    ) -> np.ndarray | torch.Tensor:
+        """:meth:`observe` for a time slot of an array, whose particles are in the present order."""
         count = -(-self.particle_count // stride)
         size = self.batch * count * 6
 
         def fill(out: ti.Ndarray | torch.Tensor) -> None:
-            self._engine.observe(self._particles.current, 0, self._particles.order.numbers, stride, out)
+            self._engine.observe(state, slot, self._particles.order.numbers, stride, out)
 
         if on_device(like):
             return output_for(fill, size, self.precision == "float64", like).reshape(self.batch, count, 6)

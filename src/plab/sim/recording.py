@@ -12,7 +12,7 @@ import taichi as ti
 
 from plab.errors import ArgumentError
 from plab.sim.particles import Particles
-from plab.sim.tensors import on_device, output_for, write_numbers
+from plab.sim.tensors import copy_numbers, on_device, output_for
 
 if TYPE_CHECKING:
     import torch
@@ -105,7 +105,7 @@ class Recorder:
         engine, numbers = self._engine, self._particles.order.numbers
         if engine.sorts:
             copy = ti.ndarray(ti.i32, shape=numbers.shape)
-            write_numbers(numbers, copy)
+            copy_numbers(numbers, 0, copy, 0, numbers.shape[0])
             numbers = copy
         self._numbers.append(numbers)
         size = engine.batch * engine.particles * 6

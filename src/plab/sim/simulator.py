@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import taichi as ti
 
 from plab.errors import ArgumentError
+from plab.sim.closed_loop import ClosedLoop
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
@@ -54,7 +57,7 @@ class Simulator(ForwardSimulator):
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
         kept = gradient or not self._skips.history
         plan = self._tape.plan(steps, self.memory_mb) if kept else None
-        poses = self._pose_history(steps)
+        poses = self._pose_history(steps, self._initial_poses)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
         self._tape.forward(array, poses, None if gradient else terms, steps, plan)
@@ -104,7 +107,7 @@ class Simulator(ForwardSimulator):
         """
         self.reset()
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
-        poses = self._pose_history(steps)
+        poses = self._pose_history(steps, self._initial_poses)
         recorder = Recorder(self._particles, actions, every_step, mass, steps)
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         self._tape.forward(array, poses, None, steps, plan, after=recorder.note)
@@ -129,6 +132,71 @@ class Simulator(ForwardSimulator):
             return gradient and self._version == version
 
         return recorder.recording(shown[1:].swapaxes(0, 1), back, current)
+
+    def closed_loop(
+        self,
+        steps: int,
+        choose: Callable[[int, Any, Any], Any],
+        react: Callable[[int, Any], tuple[Any, Any] | None],
+        *,
+        stride: int = 1,
+        discount: float = 1.0,
+        like: torch.Tensor | None = None,
+    ) -> np.ndarray | torch.Tensor:
+        """Run environment steps from the current state whose actions are chosen from what is observed, and go
+        back through the states and through what chose the actions.
+
+        The loss is the sum of the weighted step losses, and of whatever function of the last observation
+        ``react`` differentiates.
+
+        Args:
+            steps: Environment steps T.
+            choose: Called with t = 0 to T, positions and velocities as :meth:`observe` returns them, and
+                poses as :meth:`poses` does; returns the actions of step t, shape [batch, action], clipped to
+                [-1, 1]; what it returns for T is ignored.
+            react: Called with t = T to 0 and the loss's derivative by the actions of step t, shape [batch,
+                action], None for T; returns the derivatives by what was observed before step t that go
+                through these actions (for T: of a function of the last observation), each shaped as it, or
+                None. What it returns for 0 is ignored.
+            stride: Distance of the observed particles' numbers.
+            discount: Step t's loss weighs so much to the power of t.
+            like: Given a CUDA tensor, everything is one too, of its type.
+
+        Returns:
+            Unweighted loss terms after each step, shape [batch, T, term]; the simulator is left in the last
+            state.
+
+        Raises:
+            ValueError: If a shape is wrong, an action is not finite, or there is no loss to differentiate.
+            SimulationError: If state, loss or gradient stop being finite.
+            MemoryError: If even the sparsest checkpoints do not fit the budget.
+        """
+        self._require_runtime()
+        if not self.terms:
+            raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
+        self._version += 1
+        # Contact before this stretch has nothing to do with its actions.
+        self._engine.touched.fill(0)
+        plan = self._tape.plan(steps, self.memory_mb)
+        poses = self._pose_history(steps, cast(np.ndarray, self.poses()))
+        terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
+        observe = functools.partial(self._observe, stride=stride, like=like)
+        loop = ClosedLoop(self._particles, poses, steps, choose, react, observe, stride, discount, like)
+        loop.look(0, self._particles.current, 0)
+        self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
+        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
+        with loop.discounting():
+            before = self._steps_before_contact(steps)
+            bars = self._tape.backward(
+                loop.actions, poses, terms, steps, before, loop.add, actions_bar=loop.actions_bar
+            )
+        require_none(
+            broken_gradients(numbers_of(bars, (steps, self.batch, self.action_dim), like).swapaxes(0, 1))
+        )
+        loop.answer(0)
+        self._place_last(poses, steps)
+        values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), like)
+        return self._judged(values).terms[1:].swapaxes(0, 1)
 
     def state_gradient(self) -> State:
         """Gradient of the last :meth:`rollout`'s loss with respect to the state it started from.
@@ -186,11 +254,11 @@ class Simulator(ForwardSimulator):
 
     # -- internals ----------------------------------------------------------------------------------
 
-    def _pose_history(self, steps: int) -> ti.Ndarray:
+    def _pose_history(self, steps: int, first: np.ndarray) -> ti.Ndarray:
         """Room for the manipulators' poses before and after each environment step; the first ones are set."""
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
         whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
-        whole[0] = self._initial_poses
+        whole[0] = first
         poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
         return poses
 

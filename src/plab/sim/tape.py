@@ -202,6 +202,7 @@ class Tape:
         steps: int,
         contact_free: int,
         add: Callable[[int, ti.Ndarray, int, ti.Ndarray], None] | None = None,
+        actions_bar: ti.Ndarray | None = None,
     ) -> ti.Ndarray:
         """Go back through the steps that :meth:`forward` has run with a length.
 
@@ -213,12 +214,14 @@ class Tape:
             contact_free: Steps at the start through which particles' adjoints need not be followed.
             add: Called before each step with its number, array and time slot of the state that it has led to,
                 and that state's adjoint, to which it may add.
+            actions_bar: Array for the result, in which the adjoint of a step's actions stands when ``add`` is
+                called for the step before; a new one if None.
 
         Returns:
             Adjoint of the actions, laid out like these.
         """
         engine = self._engine
-        actions_bar = ti.ndarray(ti.f64, shape=actions.shape)
+        actions_bar = ti.ndarray(ti.f64, shape=actions.shape) if actions_bar is None else actions_bar
         # Allocated on the way forward.
         assert self.bar is not None
         actions_bar.fill(0)

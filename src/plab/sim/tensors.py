@@ -22,11 +22,11 @@ __all__ = [
     "Constants",
     "action_array",
     "clear",
+    "copy_numbers",
     "numbers_of",
     "on_device",
     "output_for",
     "step_actions",
-    "write_numbers",
 ]
 
 
@@ -53,10 +53,16 @@ class Constants:
 
 
 @ti.kernel
-def write_numbers(source: ti.types.ndarray(ndim=1), target: ti.types.ndarray(ndim=1)):
-    """Copy numbers from the start of one array to the start of another, in its type."""
-    for i in range(ti.min(source.shape[0], target.shape[0])):
-        target[i] = source[i]
+def copy_numbers(
+    source: ti.types.ndarray(ndim=1),
+    first: ti.i32,
+    target: ti.types.ndarray(ndim=1),
+    at: ti.i32,
+    count: ti.i32,
+):
+    """Copy some numbers of one array, from its entry ``first``, to entry ``at`` of another, in its type."""
+    for i in range(count):
+        target[at + i] = source[first + i]
 
 
 @ti.kernel
@@ -86,18 +92,22 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
     return out.to(like.dtype)
 
 
-def numbers_of(array: ti.Ndarray, shape: tuple[int, ...], like: object) -> "np.ndarray | torch.Tensor":
+def numbers_of(
+    array: ti.Ndarray, shape: tuple[int, ...], like: object, first: int = 0
+) -> "np.ndarray | torch.Tensor":
     """What an array on the device holds, as a tensor like a CUDA tensor or else as an array.
 
     Args:
         array: Array on the device of the simulation.
         shape: Shape of the result; what the array holds beyond it is left out.
         like: Given a CUDA tensor, the result is one too, of its type.
+        first: Entry of the array with which the result begins.
     """
+    count = int(np.prod(shape))
     if on_device(like):
-        count = int(np.prod(shape))
-        return output_for(lambda out: write_numbers(array, out), count, True, like).reshape(shape)
-    return array.to_numpy()[: int(np.prod(shape))].reshape(shape)
+        filled = output_for(lambda out: copy_numbers(array, first, out, 0, count), count, True, like)
+        return filled.reshape(shape)
+    return array.to_numpy()[first : first + count].reshape(shape)
 
 
 def step_actions(
@@ -196,7 +206,7 @@ def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
     if not numbers.shape[0]:
         return array
     if on_device(numbers) and device == "cuda":
-        write_numbers(numbers, array)
+        copy_numbers(numbers, 0, array, 0, numbers.shape[0])
         if not _in_default_stream():
             ti.sync()
     else:

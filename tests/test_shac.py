@@ -1,0 +1,152 @@
+"""Short-horizon actor-critic: runs on a coarse scene, and what they are made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from plab.config import Config, ConfigError, ShacConfig, load_config
+from plab.results import RunResult, read, result_path
+from plab.reuse import SimulatorCache
+from plab.runners import run_config
+from plab.runners.policy import load_policy, policy_path
+from plab.runners.shac import (
+    DEVIATION_MIN,
+    FIRST_SCENE,
+    ShacPolicy,
+    ShacTraining,
+    drawn_scenes,
+    td_lambda,
+)
+from same_runs import assert_same_numbers, stopped_at
+
+HORIZON = 5
+COARSE = (
+    "task=Move",
+    "sim.grid_size=32",
+    "sim.particles_scale=0.03",
+    f"sim.horizon={HORIZON}",
+    "sim.substeps=5",
+    "progress=false",
+)
+SHAC = (
+    "method=shac",
+    "method.num_envs=3",
+    "method.scenes=2",
+    "method.episodes=10",
+    "method.evaluate_every=5",
+    "method.window=2",
+    "method.hidden=[8]",
+    "method.value_epochs=2",
+)
+CACHE = SimulatorCache()
+
+
+def make_config(folder: Path, *overrides: str) -> Config:
+    return load_config([*COARSE, *SHAC, f"results_dir={folder}", *overrides])
+
+
+def run(cfg: Config) -> RunResult:
+    run_config(cfg, CACHE)
+    return read(result_path(cfg))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """An uninterrupted run."""
+    return run(make_config(tmp_path_factory.mktemp("results")))
+
+
+@pytest.mark.physics
+def test_rows_policy_and_budgets(finished: RunResult) -> None:
+    rows = finished.iterations
+    # Rounds of three episodes: 6 are as many as 5, 12 as many as 10.
+    assert rows["episodes"].tolist() == [0, 6, 12]
+    assert rows["steps"].tolist() == [0, 6 * HORIZON, 12 * HORIZON]
+    assert rows["steps_gradient"].tolist() == rows["steps"].tolist()
+    assert rows["steps_forward"].tolist() == [HORIZON, 2 * HORIZON, 3 * HORIZON]
+    assert np.isnan(rows["train_reward"]).tolist() == [True, False, False]
+    assert rows["train_score"].iloc[1:].between(0, 1).all()
+    policy = load_policy(finished.path)
+    assert isinstance(policy.network, ShacPolicy)
+    kept = np.load(policy_path(finished.path))
+    actions = policy(np.stack([kept["mean"]] * 2))
+    assert actions.shape == (2, 6) and (np.abs(actions) < 1.0).all()
+    # What hardly changes is not blown up.
+    assert kept["variance"].min() == DEVIATION_MIN**2 < kept["variance"].max()
+    # Training has changed what it does.
+    assert rows["loss"].nunique() == 3
+
+
+@pytest.mark.physics
+def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult) -> None:
+    cfg = make_config(tmp_path)
+    for written in (1, 2):
+        with stopped_at(1):
+            run_config(cfg, CACHE)
+        assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == written
+    again = run(cfg)
+    assert_same_numbers(again, finished)
+    known, got = (np.load(policy_path(result.path)) for result in (finished, again))
+    for name in known.files:
+        np.testing.assert_array_equal(got[name], known[name])
+
+
+@pytest.mark.physics
+def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
+    cfg = make_config(tmp_path)
+    with stopped_at(1):
+        run_config(cfg, CACHE)
+    state = read(result_path(cfg).with_suffix(".partial.h5")).resume
+    observed = Box(-1.0, 1.0, state["statistics"]["mean"].shape, np.float32)
+    batch = SimpleNamespace(size=3, observation_space=observed, action_space=Box(-1.0, 1.0, (6,), np.float32))
+    ShacTraining(cfg.method_as(ShacConfig), batch, 0).restore(state)
+    other = make_config(tmp_path, "method.hidden=[9]").method_as(ShacConfig)
+    with pytest.raises(ValueError, match=r"mean.0.weight has shape \[8, "):
+        ShacTraining(other, batch, 0).restore(state)
+
+
+def test_targets_look_ahead_as_far_as_lambda_says() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rewards = torch.rand((4, 2), generator=generator, dtype=torch.float64)
+    values = torch.rand((5, 2), generator=generator, dtype=torch.float64)
+    gamma, decay = 0.9, 0.7
+
+    def ahead(t: int, count: int) -> torch.Tensor:
+        """Rewards of so many steps, then the value."""
+        return sum(gamma**k * rewards[t + k] for k in range(count)) + gamma**count * values[t + count]
+
+    for t in range(4):
+        left = 4 - t
+        mixed = sum((1 - decay) * decay ** (k - 1) * ahead(t, k) for k in range(1, left))
+        wanted = mixed + decay ** (left - 1) * ahead(t, left)
+        torch.testing.assert_close(td_lambda(rewards, values, gamma, decay)[t], wanted)
+    torch.testing.assert_close(td_lambda(rewards, values, gamma, 0.0), rewards + gamma * values[1:])
+
+
+@pytest.mark.parametrize("own", [["variant=2"], ["variant=random", "seed_scene=9000"]])
+def test_the_scenes_of_a_training_are_drawn(own: list[str]) -> None:
+    cfg = load_config([*COARSE, *SHAC, *own, "sim.particles_scale=0.05"])
+    scenes = drawn_scenes(cfg, cfg.method_as(ShacConfig))
+    assert [one.seed_scene for one in scenes] == [FIRST_SCENE, FIRST_SCENE + 1, FIRST_SCENE]
+    assert scenes[0].task != scenes[1].task != cfg.task
+    assert all(one.sim == cfg.sim and one.method == cfg.method for one in scenes)
+
+
+def test_scenes_are_not_drawn_of_a_task_that_was_changed() -> None:
+    cfg = load_config([*COARSE, *SHAC, "task.yield_stress=77"])
+    with pytest.raises(ConfigError, match=r"leave out what changes the task, or set method.scenes=0"):
+        drawn_scenes(cfg, cfg.method_as(ShacConfig))
+
+
+def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("plab.runners.shac.check_torch_device", lambda method: None)
+    cfg = make_config(tmp_path, "method.torch_device=cuda")
+    with pytest.raises(ConfigError, match=r"set method.torch_device=cpu, as sim.device"):
+        run_config(cfg, CACHE)
+    assert not list(tmp_path.rglob("*.h5"))
