@@ -119,7 +119,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         policy = _policy(path)
     except FileNotFoundError:
         raise ResultsError(
-            f"{path} is not there: sac, td3 and ppo write it when a run ends; see docs/rl.md"
+            f"{path} is not there: sac, td3, ppo and shac write it when a run ends; see docs/rl.md"
         ) from None
     except ResultsError:
         raise
