@@ -146,9 +146,6 @@ class Simulator(ForwardSimulator):
         """Run environment steps from the current state whose actions are chosen from what is observed, and go
         back through the states and through what chose the actions.
 
-        The loss is the sum of the weighted step losses, and of whatever function of the last observation
-        ``react`` differentiates.
-
         Args:
             steps: Environment steps T.
             choose: Called with t = 0 to T, positions and velocities as :meth:`observe` returns them, and
@@ -156,8 +153,8 @@ class Simulator(ForwardSimulator):
                 [-1, 1]; what it returns for T is ignored.
             react: Called with t = T to 0 and the loss's derivative by the actions of step t, shape [batch,
                 action], None for T; returns the derivatives by what was observed before step t that go
-                through these actions (for T: of a function of the last observation), each shaped as it, or
-                None. What it returns for 0 is ignored.
+                through these actions (for T: of a function of the last observation, which joins the loss),
+                each shaped as it, or None; what it returns for 0 is ignored.
             stride: Distance of the observed particles' numbers.
             discount: Step t's loss weighs so much to the power of t.
             like: Given a CUDA tensor, everything is one too, of its type.
@@ -185,14 +182,11 @@ class Simulator(ForwardSimulator):
         loop.look(0, self._particles.current, 0)
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
         require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
+        before = self._steps_before_contact(steps)
         with loop.discounting():
-            before = self._steps_before_contact(steps)
-            bars = self._tape.backward(
-                loop.actions, poses, terms, steps, before, loop.add, actions_bar=loop.actions_bar
-            )
-        require_none(
-            broken_gradients(numbers_of(bars, (steps, self.batch, self.action_dim), like).swapaxes(0, 1))
-        )
+            self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
+        bars = numbers_of(loop.actions_bar, (steps, self.batch, self.action_dim), like)
+        require_none(broken_gradients(bars.swapaxes(0, 1)))
         loop.answer(0)
         self._place_last(poses, steps)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), like)
