@@ -176,7 +176,8 @@ def test_the_whole_gradient_of_a_policy_agrees_with_differences(episodes: Episod
         policy.zero_grad()
         done = policy_gradient(episodes, policy, HORIZON, discount=0.8, value=value)
         total = sum(0.8**t * done.loss[t].mean() for t in range(HORIZON))
-        return float(total) - (0.8**HORIZON * float(value(done.observations[-1]).mean()) if valued else 0.0)
+        worth = value(done.observations[-1]).mean().item() if valued else 0.0
+        return float(total) - 0.8**HORIZON * worth
 
     loss()
     assert all(parameter.grad is None for parameter in critic.parameters())
