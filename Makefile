@@ -3,7 +3,8 @@
 # make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
 #
 # With the development tools; CONTRIBUTING.md has more about them:
-# make test-unit   only the tests that simulate nothing
+# make test-quick  only the tests that simulate nothing, for the loop while working
+# make test-gpu    all that needs a CUDA device: the tests marked gpu, and the simulator's own on CUDA
 # make test-slow   the slow ones: all fifty configurations at full size, half an hour on two cores at least
 # make lint        style, spelling, imports, unused code and dependencies
 # make typecheck   types of src/
@@ -35,7 +36,7 @@ BIN := $(VENV)/bin
 # A test that hangs is ended after a quarter of an hour, and told with where it hung.
 PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
-.PHONY: run dev test test-unit test-slow lint typecheck coverage benchmark docs docs-serve build clean system-packages \
+.PHONY: run dev test test-quick test-gpu test-slow lint typecheck coverage benchmark docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
@@ -47,8 +48,13 @@ dev: $(VENV)/.dev.stamp $(VENV)/.docs.stamp
 test: $(VENV)/.dev.stamp
 	$(PARALLEL) -m "not slow"
 
-test-unit: $(VENV)/.dev.stamp
+test-quick: $(VENV)/.dev.stamp
 	$(PARALLEL) -m "not physics and not slow and not gpu"
+
+test-gpu: $(VENV)/.dev.stamp
+	$(PARALLEL) -m gpu
+	PLAB_TEST_DEVICE=cuda $(PARALLEL) -m "not slow" tests/test_simulator.py tests/test_simulator_reference.py \
+	    tests/test_mixed_materials.py tests/verification
 
 test-slow: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m slow

@@ -10,7 +10,7 @@ import torch
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.problem import Problem
-from plab.torch import TensorEnv, rollout
+from plab.torch import TensorEnv, policy_gradient, rollout
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 
@@ -65,3 +65,28 @@ def test_gradients_of_tensors_stay_on_the_device() -> None:
     np.testing.assert_allclose(losses.detach().cpu().numpy(), want.loss.sum(axis=1), rtol=1e-10)
     scale = np.abs(want.gradient).max()
     np.testing.assert_allclose(actions.grad.cpu().numpy(), want.gradient, atol=1e-9 * scale)
+
+
+@pytest.mark.parametrize("envs", [2, 128])
+def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
+    """Also where there are so many particles that they are put into the order of their cells."""
+    gradients = []
+    for device, size in (("cpu", 2), ("cuda", envs)):
+        cfg = load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}"])
+        episodes = EpisodeBatch([cfg] * size, contact="soft")
+        if size == 128:
+            assert episodes.problem.simulator._engine.sorts
+        torch.manual_seed(0)
+        entries = episodes.observation_space.shape[0]
+        layers = torch.nn.Linear(entries, 8), torch.nn.Tanh(), torch.nn.Linear(8, 6), torch.nn.Tanh()
+        policy = torch.nn.Sequential(*layers).double().to(device)
+        episodes.reset()
+        for steps in (3, 1):
+            done = policy_gradient(
+                episodes, policy, steps, discount=0.9, value=lambda seen: seen[:, :60].square().sum(1)
+            )
+        assert done.loss.device.type == device
+        gradients.append(torch.cat([one.grad.flatten() for one in policy.parameters()]).cpu().numpy())
+        episodes.close()
+    scale = np.abs(gradients[0]).max()
+    np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-8 * scale)
