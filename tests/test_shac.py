@@ -6,21 +6,21 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from gymnasium.spaces import Box
 
-from plab.config import Config, ConfigError, ShacConfig, load_config
+from plab.bench import unseen
+from plab.config import Config, ConfigError, ShacConfig, drawn_configs, load_config
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import (
     DEVIATION_MIN,
-    FIRST_SCENE,
     ShacPolicy,
     ShacTraining,
-    drawn_scenes,
     td_lambda,
 )
 from same_runs import assert_same_numbers, stopped_at
@@ -111,6 +111,35 @@ def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
         ShacTraining(other, batch, 0).restore(state)
 
 
+@pytest.mark.physics
+def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
+    finished: RunResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "unseen.csv"
+    assert unseen.main([str(finished.path), "--scenes", "3", "--together", "2", "--csv", str(table)]) == 0
+    (row,) = pd.read_csv(table).to_dict("records")
+    assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", "2 drawn scenes", 3)
+    assert row["lower"] <= row["score"] <= row["upper"] and 0.0 <= row["median"] <= 1.0
+    assert str(finished.path) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["task=Move"], "name the result file of a run that has trained a policy"),
+        (["a.h5", "--scenes", "1"], "--scenes has to be at least 2"),
+        (["a.h5"], "a.policy.npz is not there: sac, td3, ppo and shac write it when a run ends"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_tried(argv: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = unseen.main(argv)
+    except SystemExit as stopped:
+        code = stopped.code
+    assert code == 2 and line in capsys.readouterr().err
+
+
 def test_targets_look_ahead_as_far_as_lambda_says() -> None:
     generator = torch.Generator().manual_seed(0)
     rewards = torch.rand((4, 2), generator=generator, dtype=torch.float64)
@@ -132,16 +161,16 @@ def test_targets_look_ahead_as_far_as_lambda_says() -> None:
 @pytest.mark.parametrize("own", [["variant=2"], ["variant=random", "seed_scene=9000"]])
 def test_the_scenes_of_a_training_are_drawn(own: list[str]) -> None:
     cfg = load_config([*COARSE, *SHAC, *own, "sim.particles_scale=0.05"])
-    scenes = drawn_scenes(cfg, cfg.method_as(ShacConfig))
-    assert [one.seed_scene for one in scenes] == [FIRST_SCENE, FIRST_SCENE + 1, FIRST_SCENE]
+    scenes = drawn_configs(cfg, (1000, 1001))
+    assert [one.seed_scene for one in scenes] == [1000, 1001]
     assert scenes[0].task != scenes[1].task != cfg.task
     assert all(one.sim == cfg.sim and one.method == cfg.method for one in scenes)
 
 
 def test_scenes_are_not_drawn_of_a_task_that_was_changed() -> None:
     cfg = load_config([*COARSE, *SHAC, "task.yield_stress=77"])
-    with pytest.raises(ConfigError, match=r"leave out what changes the task, or set method.scenes=0"):
-        drawn_scenes(cfg, cfg.method_as(ShacConfig))
+    with pytest.raises(ConfigError, match="leave out what changes the task, or draw none"):
+        drawn_configs(cfg, (0,))
 
 
 def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch) -> None:

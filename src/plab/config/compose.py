@@ -9,7 +9,8 @@ OmegaConf.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -39,6 +40,7 @@ __all__ = [
     "build_scene",
     "check_overrides",
     "choices",
+    "drawn_configs",
     "finish",
     "load_config",
     "variant_task",
@@ -139,6 +141,28 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         GlobalHydra.instance().hydra = surrounding
     # Several configurations may share a list of overrides.
     return finish(composed, overrides, alone=False)
+
+
+def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
+    """Return configurations that differ from one in their scenes, which are drawn: ``variant=random``.
+
+    Args:
+        cfg: The configuration.
+        seeds: A ``seed_scene`` for each.
+
+    Raises:
+        ConfigError: If the task is not one of the suite as it stands in its file, or has nothing to draw.
+    """
+    name, own = cfg.task.name, [f"variant={cfg.variant}"]
+    if cfg.seed_scene is not None:
+        own = ["variant=random", f"seed_scene={cfg.seed_scene}"]
+    if load_config([f"task={name}", *own]).task != cfg.task:
+        raise ConfigError(
+            f"scenes of task {name} are drawn as its file has it: leave out what changes the task, or draw "
+            "none"
+        )
+    drawn = (load_config([f"task={name}", "variant=random", f"seed_scene={seed}"]) for seed in seeds)
+    return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
 
 
 def _searchpath(config_dir: str | Path | None) -> list[str]:

@@ -15,7 +15,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -24,7 +24,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import create_mlp
 
-from plab.config import Config, ConfigError, RlConfig, ShacConfig, load_config
+from plab.config import ConfigError, RlConfig, ShacConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
 from plab.runners.common import policy_episode, shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
@@ -106,7 +106,10 @@ class ShacRunner(Runner):
                 f"method.torch_device={cfg.sim.device}, as sim.device"
             )
         if method.scenes:
-            self._training_batch = EpisodeBatch(drawn_scenes(cfg, method), contact=method.contact)
+            count = min(method.scenes, method.num_envs)
+            scenes = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
+            environments = [scenes[k % count] for k in range(method.num_envs)]
+            self._training_batch = EpisodeBatch(environments, contact=method.contact)
             (self._evaluation,) = shared_batches(self.cache, cfg, (1, "hard"))
         else:
             kinds = (method.num_envs, method.contact), (1, "hard")
@@ -166,28 +169,6 @@ class ShacRunner(Runner):
     @property
     def _method(self) -> ShacConfig:
         return self.tracks[0].cfg.method_as(ShacConfig)
-
-
-def drawn_scenes(cfg: Config, method: ShacConfig) -> list[Config]:
-    """Return the configurations of the environments of a training on drawn scenes, one after the other and
-    from the first again.
-
-    Raises:
-        ConfigError: If the task of the run is not one of the suite as it stands in its file.
-    """
-    name, own = cfg.task.name, [f"variant={cfg.variant}"]
-    if cfg.seed_scene is not None:
-        own = ["variant=random", f"seed_scene={cfg.seed_scene}"]
-    if load_config([f"task={name}", *own]).task != cfg.task:
-        raise ConfigError(
-            f"method.scenes draws scenes of task {name} as its file has it: leave out what changes the task, "
-            "or set method.scenes=0"
-        )
-    drawn = []
-    for number in range(min(method.scenes, method.num_envs)):
-        one = load_config([f"task={name}", "variant=random", f"seed_scene={FIRST_SCENE + number}"])
-        drawn.append(replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene))
-    return [drawn[k % len(drawn)] for k in range(method.num_envs)]
 
 
 class ShacTraining:

@@ -1,0 +1,94 @@
+"""What trained policies score in scenes that they have not seen: ``variant=random`` of their task.
+
+    python -m plab.bench.unseen results/Move-vrandom9000/shac/seed0-12ab34cd.h5
+    python -m plab.bench.unseen A.h5 B.h5 --scenes 20 --csv unseen.csv sim.device=cpu
+
+A row per policy: mean score in the hard contact model with its 95 % interval (Student's t), median, and the
+share of scenes with at least 0.9. The settings of the simulation are those of the training.
+"""
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from plab.cli.arguments import Parser, positive, sources_and_words, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import report
+from plab.config import Config, drawn_configs, load_config
+from plab.envs.core import EpisodeBatch
+from plab.results import read
+from plab.runners.policy import Policy, load_policy
+
+__all__ = ["FIRST", "main", "rows", "scores_of"]
+
+COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
+
+FIRST = 10_000
+"""``seed_scene`` of the first scene: beyond those of trainings (:mod:`plab.runners.shac`) and of submissions
+(:mod:`plab.submissions.schema`)."""
+
+
+def scores_of(policy: Policy, cfgs: Sequence[Config], together: int) -> np.ndarray:
+    """Return the scores of a policy, shape [configuration], so many of them simulated at a time."""
+    found: list[float] = []
+    for first in range(0, len(cfgs), together):
+        batch = EpisodeBatch(cfgs[first : first + together])
+        observation, info = batch.reset()
+        for _ in range(batch.horizon):
+            # What breaks off scores nothing.
+            step = batch.step(policy(observation), strict=False)
+            observation, info = np.nan_to_num(step.observation), step.info
+            info["score"][list(step.failures)] = 0.0
+        found += info["score"].tolist()
+        batch.close()
+    return np.array(found)
+
+
+def rows(
+    paths: Sequence[str], count: int, together: int, words: Sequence[str]
+) -> Iterator[dict[str, object]]:
+    """Measure policies, one after the other.
+
+    Args:
+        paths: Their runs' result files.
+        count: Scenes.
+        together: Scenes simulated at a time.
+        words: Overrides of the configurations.
+    """
+    for path in paths:
+        policy, config = load_policy(path), read(Path(path)).config
+        sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
+        cfg = load_config([f"task={config['task']['name']}", *sim, *words])
+        scores = scores_of(policy, drawn_configs(cfg, range(FIRST, FIRST + count)), together)
+        mean, error = scores.mean(), stats.sem(scores)
+        lower, upper = stats.t.interval(0.95, count - 1, mean, error) if error > 0 else (mean, mean)
+        numbers = mean, lower, upper, np.median(scores), (scores >= 0.9).mean()
+        drawn = config["method"].get("scenes", 0)
+        trained_on = f"{drawn} drawn scenes" if drawn else f"variant {config['variant']}"
+        named = (path, config["task"]["name"], trained_on, count)
+        yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Parse the command line, run, print, write a CSV file if asked to."""
+    parser = Parser("plab.bench.unseen", __doc__)
+    parser.add_argument("what", nargs="+", metavar="RESULT | KEY=VALUE", help="keys are those of plab.run")
+    parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="so many scenes")
+    parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    options = parser.parse_args(argv)
+    paths, words = sources_and_words(options.what)
+    if not paths:
+        parser.error("name the result file of a run that has trained a policy")
+    if options.scenes < 2:
+        parser.error("--scenes has to be at least 2: one score has no interval")
+    widths = {"policy": max(map(len, paths)), "trained_on": 17}
+    report(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
