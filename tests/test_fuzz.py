@@ -235,6 +235,12 @@ def test_long_values_are_cut_short(word: str) -> None:
     assert_helpful(caught.value)
 
 
+def test_what_stands_between_quoted_words_is_not_cut() -> None:
+    names = ", ".join(f"name{k}" for k in range(100))
+    message = f"'a' does not exist; choose from: {names}; or leave 'b' out"
+    assert str(PlabError(message)) == message
+
+
 @cases
 def test_any_overrides(count: int) -> None:
     @trying(count)

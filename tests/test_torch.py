@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -236,6 +237,15 @@ def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
     episodes.reset()
     with pytest.raises(ValueError, match=r"actions have shape \(2, 5\)"):
         policy_gradient(episodes, network(episodes, 5), HORIZON)
+    episodes.reset()
+    calls = count()
+
+    def react(t: int, bar: np.ndarray | None) -> None:
+        if next(calls) == 1:
+            raise ArithmeticError("on the way back")
+
+    with pytest.raises(ArithmeticError):
+        episodes.closed_loop(HORIZON, lambda t, seen: actions[:, 0].numpy(), react, discount=0.5)
     episodes.reset()
     policy_gradient(episodes, network(episodes, 6), HORIZON, discount=0.5)
     after = episodes.problem.try_out(actions.numpy(), gradient=True)

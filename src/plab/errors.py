@@ -24,7 +24,7 @@ TRACEBACK = "PLAB_TRACEBACK"
 """Variable of the environment that lets a bug through with its traceback."""
 
 
-LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>'[^']{400})[^']+(?=')")
+LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>(?<![^\s(])'[^']{400})[^']+(?=')")
 """What a message says too much of: a word, or what stands in quotation marks."""
 
 

@@ -284,7 +284,7 @@ class EpisodeBatch:
         """Advance all sub-environments by some steps whose actions are chosen from observations, and go back
         through the states and through what chose the actions.
 
-        Observations are of the simulation's type, float32 or float64.
+        Observations are float64; CUDA tensors have the type of ``like``.
 
         Args:
             steps: Steps T, at most those that are left of the episodes.
@@ -362,18 +362,20 @@ class EpisodeBatch:
         self._problem = None
 
     def _observe(self, like: Array = None) -> Array:
-        joined = self._joined(self._simulator.observe(self._stride, like), self._simulator.poses(like))
-        return joined.float() if on_device(joined) else joined.astype(np.float32)
+        seen = self._simulator.observe(self._stride, like), self._simulator.poses(like)
+        joined = self._joined(*seen, np.float32)
+        return joined.float() if on_device(joined) else joined
 
-    def _joined(self, particles: Array, poses: Array) -> Array:
-        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses."""
+    def _joined(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
+        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses, shape
+        [batch, manipulator, 8]; ``dtype`` is that of an array."""
         rows = particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]
         if on_device(particles):
             # Whoever gave a tensor has imported torch.
             import torch
 
             return torch.cat(rows, dim=1)
-        return np.concatenate(rows, axis=1)
+        return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
 
     def _info(self, like: Array = None) -> dict[str, Array]:
         measures = self._simulator.measure(like)

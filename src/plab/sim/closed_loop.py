@@ -3,8 +3,7 @@ through the states and through what chose the actions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +25,10 @@ class ClosedLoop:
     Attributes:
         actions: Actions of all steps, as they are chosen.
         actions_bar: Their adjoints, as they come to be known.
+        weights: Weights of the terms of the loss before the discount, shape [term]; set before the way back.
     """
+
+    weights: np.ndarray
 
     def __init__(
         self,
@@ -66,12 +68,8 @@ class ClosedLoop:
 
     def look(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Observe the state before step t, in a time slot of an array, and have its actions chosen."""
-        engine, numbers = self._engine, self._particles.order.numbers
-        if engine.sorts:
-            copy = ti.ndarray(ti.i32, shape=numbers.shape)
-            copy_numbers(numbers, 0, copy, 0, numbers.shape[0])
-            numbers = copy
-        self._numbers.append(numbers)
+        engine = self._engine
+        self._numbers.append(self._particles.order.noted())
         shape = engine.batch, engine.manipulators, 8
         poses = numbers_of(self._poses, shape, self._like, first=t * int(np.prod(shape)))
         chosen = self._choose(t, self._observe(state, slot), poses)
@@ -87,7 +85,7 @@ class ClosedLoop:
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
         """Add to the adjoint of the state that step t has led to what it does through its observation."""
         if self._discount != 1.0:
-            self._engine.term_weights.from_numpy(self._weights * self._discount**t)
+            self._engine.term_weights.from_numpy(self.weights * self._discount**t)
         given = self.answer(t + 1)
         if given is None:
             return
@@ -112,13 +110,6 @@ class ClosedLoop:
             return self._react(t, None)
         shape = self._engine.batch, self._engine.actions_per_step
         return self._react(t, numbers_of(self.actions_bar, shape, self._like, first=t * self._row))
-
-    @contextmanager
-    def discounting(self) -> Iterator[None]:
-        """Put back the weights of the terms of the loss after the ``with`` block."""
-        self._weights = self._engine.term_weights.to_numpy()
-        yield
-        self._engine.term_weights.from_numpy(self._weights)
 
     def _zeros(self, like: Any) -> Any:
         shape = self._engine.batch, self._engine.particles, 3

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import taichi as ti
 
+from plab.sim.tensors import copy_numbers
+
 if TYPE_CHECKING:
     from plab.sim.cuda_engine import CudaEngine
     from plab.sim.engine import CpuEngine
@@ -134,6 +136,14 @@ class ParticleOrder:
         """The order at present, shape [batch, particle]."""
         batch, particles = self.initial.shape
         return self.numbers.to_numpy().reshape(batch, -1)[:, :particles].astype(np.int64)
+
+    def noted(self) -> ti.Ndarray:
+        """Return :attr:`numbers` as they are now, whatever order comes next."""
+        if not self._engine.sorts:
+            return self.numbers
+        copy = self._array(1)
+        copy_numbers(self.numbers, 0, copy, 0, self.places)
+        return copy
 
     def sort(
         self,

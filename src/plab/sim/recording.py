@@ -12,7 +12,7 @@ import taichi as ti
 
 from plab.errors import ArgumentError
 from plab.sim.particles import Particles
-from plab.sim.tensors import copy_numbers, on_device, output_for
+from plab.sim.tensors import on_device, output_for
 
 if TYPE_CHECKING:
     import torch
@@ -102,11 +102,7 @@ class Recorder:
         """Take the state that step t has led to."""
         if t < self._first:
             return
-        engine, numbers = self._engine, self._particles.order.numbers
-        if engine.sorts:
-            copy = ti.ndarray(ti.i32, shape=numbers.shape)
-            copy_numbers(numbers, 0, copy, 0, numbers.shape[0])
-            numbers = copy
+        engine, numbers = self._engine, self._particles.order.noted()
         self._numbers.append(numbers)
         size = engine.batch * engine.particles * 6
         self._rows.append(self._taken(size, lambda out: engine.observe(state, slot, numbers, 1, out)))

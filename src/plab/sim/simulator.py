@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -116,12 +117,11 @@ class Simulator(ForwardSimulator):
         shown = numbers_of(poses, (steps + 1, self.batch, self.manipulator_count, 8), actions)
 
         def back() -> np.ndarray | torch.Tensor:
-            weights = self._engine.term_weights.to_numpy()
-            self._engine.term_weights.fill(0)
             terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
             before = self._steps_before_contact(steps)
-            bars = self._tape.backward(array, poses, terms, steps, before, add=recorder.add)
-            self._engine.term_weights.from_numpy(weights)
+            with self._kept_weights():
+                self._engine.term_weights.fill(0)
+                bars = self._tape.backward(array, poses, terms, steps, before, add=recorder.add)
             bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
             require_none(broken_gradients(bar))
             return bar
@@ -183,7 +183,7 @@ class Simulator(ForwardSimulator):
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
         require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
         before = self._steps_before_contact(steps)
-        with loop.discounting():
+        with self._kept_weights() as loop.weights:
             self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
         bars = numbers_of(loop.actions_bar, (steps, self.batch, self.action_dim), like)
         require_none(broken_gradients(bars.swapaxes(0, 1)))
@@ -247,6 +247,15 @@ class Simulator(ForwardSimulator):
         return self._particles.unpack(bar.to_numpy(), poses)
 
     # -- internals ----------------------------------------------------------------------------------
+
+    @contextmanager
+    def _kept_weights(self) -> Iterator[np.ndarray]:
+        """Put the weights of the terms back after the ``with`` block, however it ends."""
+        weights = self._engine.term_weights.to_numpy()
+        try:
+            yield weights
+        finally:
+            self._engine.term_weights.from_numpy(weights)
 
     def _pose_history(self, steps: int, first: np.ndarray) -> ti.Ndarray:
         """Room for the manipulators' poses before and after each environment step; the first ones are set."""
