@@ -127,7 +127,7 @@ def test_help_all_names_everything(capsys):
         assert key in text
     for key in (
         "sim.precision=float32",
-        "method.lr_by_task={default: 0.1, ",
+        "method.lr_by_task.plab={Chopsticks: 0.01, ",
         "method.loss_weights.sdf=10.0",
         "task.target.radius=0.135",
     ):

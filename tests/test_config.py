@@ -341,13 +341,18 @@ def test_a_variant_may_have_any_name():
     [
         (["task=Move"], 0.1),
         (["task=Chopsticks"], 0.01),
-        (["task=Chopsticks", "method=gd"], 0.1),
+        (["task=Chopsticks", "method=gd"], 0.01),
+        (["task=Writer", "method=gd"], 0.1),
         (["task=Chopsticks", "method=adam_h"], 0.1),
+        (["task=TripleMove"], 0.1),
+        (["task=TripleMove", "protocol=release"], 0.01),
+        (["task=TripleMove", "protocol=release", "method=gd"], 0.01),
+        (["task=Chopsticks", "protocol=release", "method=gd"], 0.1),
         (["task=Chopsticks", "method.lr=0.3"], 0.3),
-        (["task=Move", "method.lr_by_task.default=0.2"], 0.2),
+        (["task=Chopsticks", "method.lr_by_task.plab.Chopsticks=0.2"], 0.2),
     ],
 )
-def test_adam_has_a_learning_rate_by_task(overrides: list[str], lr: float):
+def test_a_learning_rate_goes_by_numbers_and_task(overrides: list[str], lr: float):
     method = load_config(overrides).method
     assert method.lr == lr and method.lr_by_task == {}
 

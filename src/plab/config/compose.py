@@ -349,14 +349,11 @@ def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool)
     task, method, variant = composed.task, composed.method, composed.variant
     used: dict[str, tuple[str, str | None]] = {}
     if alone:
-        rates = method.get("lr_by_task") or {}
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
-        used["method.lr_by_task."] = f"task={task.name}", task.name if task.name in rates else "default"
-        used["method.contact_by_task."] = (
-            f"protocol.contact={composed.protocol.contact}",
-            composed.protocol.contact,
-        )
-        used[f"method.contact_by_task.{composed.protocol.contact}."] = f"task={task.name}", task.name
+        for section, key in ("lr_by_task", "numbers"), ("contact_by_task", "contact"):
+            chosen = composed.protocol[key]
+            used[f"method.{section}."] = f"protocol.{key}={chosen}", chosen
+            used[f"method.{section}.{chosen}."] = f"task={task.name}", task.name
     if alone or variant == RANDOM:
         # Of the variants a random one uses that which gives what is not drawn, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant

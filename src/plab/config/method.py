@@ -81,7 +81,8 @@ class TrajectoryConfig(MethodConfig):
     Attributes:
         optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
-        lr_by_task: Learning rates by task. Empty in a run's configuration: what was used is in ``lr``.
+        lr_by_task: Learning rates by whose numbers the task has, and task. Empty in a run's configuration:
+            what was used is in ``lr``.
         contact_by_task: Weights of the contact term by term and task. Empty likewise: what was used is in
             ``loss_weights``.
         betas: Decay rates of adam's two moment estimates.
@@ -94,8 +95,8 @@ class TrajectoryConfig(MethodConfig):
 
     optimizer: str
     lr: float
-    lr_by_task: dict[str, float]
-    contact_by_task: dict[str, dict[str, float]]
+    lr_by_task: dict[str, Any]
+    contact_by_task: dict[str, Any]
     betas: list[float]
     eps: float
     momentum: float

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from plab.errors import ConfigError
 
@@ -12,6 +17,7 @@ __all__ = [
     "SUITE_VARIANTS",
     "conf_folder",
     "group_names",
+    "shipped_file",
     "suite_tasks",
 ]
 
@@ -43,6 +49,29 @@ def conf_folder() -> Path:
 def group_names(group: str) -> list[str]:
     """Return the names of plab's own files of a group, such as ``method``; none where there is no such."""
     return sorted(path.stem for path in (conf_folder() / group).glob("*.yaml"))
+
+
+@functools.cache
+def shipped_file(group: str, name: str) -> Mapping[str, Any]:
+    """Return what one of plab's own files says, over those that it is based on; nothing if there is none."""
+    path = conf_folder() / group / f"{name}.yaml"
+    if not path.is_file():
+        return {}
+    own = yaml.safe_load(path.read_text(encoding="utf-8"))
+    merged: dict[str, Any] = {}
+    for base in own.get("defaults", ()):
+        if isinstance(base, str) and base != "_self_" and not base.startswith("/"):
+            merged = _merged(merged, shipped_file(group, base))
+    return _merged(merged, own)
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    both = {
+        key: _merged(below[key], value)
+        for key, value in above.items()
+        if isinstance(value, dict) and isinstance(below.get(key), dict)
+    }
+    return {**below, **above, **both}
 
 
 def suite_tasks() -> list[str]:

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 
 from plab.config.selection import Selection, one_protocol, require_possible
-from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, conf_folder, suite_tasks
+from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import PlabError
 from plab.locks import held
 from plab.report.methods import method, ordered
@@ -419,7 +418,7 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     """Return what a method and a task have in plab's files under a protocol, by dotted key, but for what does
     not matter."""
     usual = _usual(method, protocol)
-    usual = usual | _usual_by_task(method, task, usual["protocol.contact"])
+    usual = usual | _usual_by_task(method, task, usual)
     exact = usual["protocol.numbers"] == "release"
     usual |= {f"task.{key}": value for key, value in _usual_task(task, exact).items()}
     return {key: value for key, value in usual.items() if key not in _HARMLESS}
@@ -447,27 +446,23 @@ def _usual(method: str, protocol: str) -> dict[str, Any]:
     return dict(_leaves({name: config[name] for name in (*sections, "seed_particles")}))
 
 
-def _usual_by_task(method: str, task: str, contact: str) -> dict[str, float]:
+def _usual_by_task(method: str, task: str, usual: Mapping[str, Any]) -> dict[str, float]:
     """Return learning rate and contact weight of a method that has some of its own for the task."""
-    own = _own_file("method", method)
-    rates, weights = own.get("lr_by_task", {}), own.get("contact_by_task", {}).get(contact, {})
-    found = {"method.lr": rates.get(task, rates["default"])} if rates else {}
-    return found | ({"method.loss_weights.contact": weights[task]} if task in weights else {})
+    places = (
+        ("method.lr", "lr_by_task", "protocol.numbers"),
+        ("method.loss_weights.contact", "contact_by_task", "protocol.contact"),
+    )
+    own = shipped_file("method", method)
+    tasks = {key: own.get(section, {}).get(usual[choice], {}) for key, section, choice in places}
+    return {key: values[task] for key, values in tasks.items() if task in values}
 
 
 def _usual_task(task: str, exact: bool) -> dict[str, Any]:
     """Return the numbers of a task that are no part of bodies, manipulators, target or variants, the
     release's if they are to be ``exact``."""
-    own = _own_file("task", task)
+    own = shipped_file("task", task)
     own = own | own.get("release", {}) if exact else own
     return {key: value for key, value in own.items() if not isinstance(value, dict)}
-
-
-@functools.cache
-def _own_file(group: str, name: str) -> Mapping[str, Any]:
-    """Return what one of plab's own files says, nothing where plab has no such file."""
-    path = conf_folder() / group / f"{name}.yaml"
-    return yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _changed_by_variant(config: Mapping[str, Any]) -> Mapping[str, Any]:

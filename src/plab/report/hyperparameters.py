@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
 
-from plab.config.suite import conf_folder
+from plab.config.suite import conf_folder, shipped_file
 from plab.report.methods import method
 from plab.report.reference import paper_table
 from plab.report.table import NOTHING, Table
@@ -100,49 +100,34 @@ def _rl_rows() -> Iterator[dict[str, str]]:
 
 
 def _gradient_rows() -> Iterator[dict[str, str]]:
+    # Imported here: composing needs Hydra.
+    from plab.config import load_config
+
     paper = paper_table("gradient_settings").set_index(["method", "key"])["value"]
     for name in GRADIENT_METHODS:
-        content = _inherited(name)
+        content = load_config([f"method={name}"]).method
         for key in _GRADIENT_KEYS[name]:
             theirs = yaml.safe_load(str(paper[name, key]))
             yield {
                 "method": name,
                 "key": key,
-                "plab": _value(_general(content, key)),
+                "plab": _value(getattr(content, key)),
                 "paper": _value(theirs),
-                "remark": _comments(_text("adam"), None).get(key, "") + _exceptions(content, key),
+                "remark": _comments(_text("adam"), None).get(key, "")
+                + _exceptions(name, key, getattr(content, key)),
                 "paper remark": "",
             }
 
 
-def _general(content: Mapping[str, Any], key: str) -> Any:
-    """Return a key's value for tasks that are not named."""
-    return content["lr_by_task"]["default"] if _by_task(content, key) else content[key]
-
-
-def _exceptions(content: Mapping[str, Any], key: str) -> str:
-    """Return what the remark on a key has to say of the tasks that are named."""
-    rates = content["lr_by_task"] if _by_task(content, key) else {}
-    return "".join(f"; {_value(rate)} on {task}" for task, rate in rates.items() if task != "default")
-
-
-def _by_task(content: Mapping[str, Any], key: str) -> bool:
-    """Whether a key refers to the values by task, as ``lr`` does unless a method sets it."""
-    return key == "lr" and isinstance(content[key], str)
+def _exceptions(name: str, key: str, general: Any) -> str:
+    """Return what the remark on a key has to say of the tasks that have another value."""
+    rates = shipped_file("method", name)["lr_by_task"]["plab"] if key == "lr" else {}
+    return "".join(f"; {_value(rate)} on {task}" for task, rate in rates.items() if rate != general)
 
 
 @functools.cache
 def _text(name: str) -> str:
     return (conf_folder() / "method" / f"{name}.yaml").read_text(encoding="utf-8")
-
-
-def _inherited(name: str) -> Mapping[str, Any]:
-    """Return a method's file with that of the method it is based on."""
-    own = yaml.safe_load(_text(name))
-    bases = [base for base in own["defaults"] if isinstance(base, str) and base != "_self_"]
-    return {
-        key: value for base in bases if not base.startswith("/") for key, value in _inherited(base).items()
-    } | own
 
 
 def _comments(text: str, profile: str | None) -> dict[str, str]:
