@@ -3,7 +3,7 @@
 # make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
 #
 # With the development tools; CONTRIBUTING.md has more about them:
-# make test-quick  only the tests that simulate nothing, for the loop while working
+# make test-quick  only the unit tests, in two minutes, for the loop while working
 # make test-gpu    all that needs a CUDA device: the tests marked gpu, and the simulator's own on CUDA
 # make test-slow   the slow ones: all fifty configurations at full size, half an hour on two cores at least
 # make lint        style, spelling, imports, unused code and dependencies
@@ -49,7 +49,7 @@ test: $(VENV)/.dev.stamp
 	$(PARALLEL) -m "not slow"
 
 test-quick: $(VENV)/.dev.stamp
-	$(PARALLEL) -m "not physics and not slow and not gpu"
+	$(PARALLEL) -m "not physics and not whole and not slow and not gpu"
 
 test-gpu: $(VENV)/.dev.stamp
 	$(PARALLEL) -m gpu

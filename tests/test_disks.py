@@ -26,6 +26,8 @@ from plab.runners import run_batch
 from refusals import snapshot
 from rights import ordinary_rights
 
+pytestmark = pytest.mark.whole
+
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SWEEP = ("-m", *COARSE, "seed=0,1,2", "checkpoint_seconds=0")
 

@@ -19,6 +19,8 @@ from plab.errors import PlabError
 from plab.report.collect import collect
 from plab.status import NAMES, survey
 
+pytestmark = pytest.mark.whole
+
 FEW, MANY = 200, 2000
 """Cases that are tried each time, and in the slow tests."""
 

@@ -40,6 +40,8 @@ from plab.scene import SceneError
 from plab.shape_files import ShapeError
 from plab.targets import TargetError, load_release_target
 
+pytestmark = pytest.mark.whole
+
 OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError, ShapeError)
 
 CASES = {"few": 34, "many": 334}

@@ -166,6 +166,7 @@ def test_it(number):
 """
 
 
+@pytest.mark.whole
 def test_a_file_of_tests_runs_in_one_process(tmp_path):
     (tmp_path / "conftest.py").write_text("from scheduling import pytest_xdist_make_scheduler\n")
     for name in ("test_one", "test_two", "test_three"):

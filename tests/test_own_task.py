@@ -15,6 +15,8 @@ from plab.config import ConfigError, build_scene, choices, load_config
 from plab.results import load
 from plab.targets import build_target
 
+pytestmark = pytest.mark.whole
+
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "examples" / "own_task" / "conf"
 DUMBBELL = (OWN / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")

@@ -334,6 +334,7 @@ def _second_fails(intact):
     return rollout
 
 
+@pytest.mark.physics
 def test_the_check_finds_a_best_row_that_is_not_the_best(finished) -> None:
     result = finished["cem"]
     worst = int(result.iterations["score"].argmin())

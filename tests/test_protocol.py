@@ -153,6 +153,7 @@ def test_the_mass_tensor_has_negative_masses_and_sums_up(simulator: Simulator) -
         np.testing.assert_allclose(got[e].sum(), world.particle_count * world.particle_mass)
 
 
+@pytest.mark.physics
 def test_rotations_are_of_unit_length_after_the_start(simulator: Simulator) -> None:
     simulator.set_scenes(SCENES)
     pin = KINDS.index("RollingPin")
@@ -208,6 +209,7 @@ def test_the_default_is_plabs_own() -> None:
 
 
 @pytest.mark.parametrize("method", choices("method"))
+@pytest.mark.whole
 def test_the_release_is_for_all_methods(method: str) -> None:
     cfg = load_config(["protocol=release", f"method={method}", "task=Rope"])
     world = build_scene(cfg)
@@ -220,6 +222,7 @@ def test_the_release_is_for_all_methods(method: str) -> None:
 
 
 @pytest.mark.parametrize("task", choices("task"))
+@pytest.mark.whole
 def test_the_release_is_for_all_tasks(task: str) -> None:
     for variant in "12345":
         ours = build_scene(load_config([f"task={task}", f"variant={variant}"]))
@@ -264,6 +267,7 @@ def test_results_without_the_score_are_their_protocols() -> None:
         assert stored_config(text)["protocol"]["score"] == score
 
 
+@pytest.mark.whole
 def test_numbers_have_all_digits() -> None:
     def exact(task: str, variant: int) -> Scene:
         return build_scene(load_config([f"task={task}", f"variant={variant}", "protocol.numbers=release"]))
@@ -336,6 +340,7 @@ def test_loss_and_gradient_of_torus_are_known(protocol: str, loss: float, norm: 
 # --------------------------------------------------------------------------------------------------- results
 
 
+@pytest.mark.physics
 def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
     coarse = [
         "sim.grid_size=16",

@@ -25,6 +25,8 @@ from plab.results import load
 from plab.sim import Simulator
 from suite import scene
 
+pytestmark = pytest.mark.whole
+
 ROOM = 16e9
 """Bytes of memory that the computer of these tests has."""
 

@@ -23,6 +23,8 @@ from plab.report.figures import grid, log_axis, style
 from plab.report.methods import method, ordered
 from plab.report.series import band, load_series, rows_on_axes
 
+pytestmark = pytest.mark.whole
+
 # ------------------------------------------------------------------------------------------------------ bands
 
 

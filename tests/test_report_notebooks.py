@@ -23,6 +23,8 @@ from plab.report.table import MINUS, NOTHING
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
 
+pytestmark = pytest.mark.whole
+
 # ------------------------------------------------------------------------------------------------- verdicts
 
 

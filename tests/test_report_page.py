@@ -27,6 +27,8 @@ from plab.report.media import best_runs, present
 from plab.report.methods import method
 from plab.results import load
 
+pytestmark = pytest.mark.whole
+
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 drawing = pytest.mark.skipif(missing_graphics() is not None, reason=str(missing_graphics()))

@@ -32,6 +32,8 @@ from plab.report.times import timing
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load, pack
 
+pytestmark = pytest.mark.whole
+
 GOLDEN = Path(__file__).parent / "golden"
 
 

@@ -22,6 +22,8 @@ from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin
 
+pytestmark = pytest.mark.whole
+
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 

@@ -16,6 +16,8 @@ from plab.config import Config, load_config
 from plab.families import FAMILIES
 from plab.results import SCHEMA_VERSION, read, result_path
 
+pytestmark = pytest.mark.whole
+
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 HERE = Path(__file__).parent
