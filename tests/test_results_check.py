@@ -161,3 +161,12 @@ def test_a_damaged_stream_in_an_archive_is_told(tmp_path: Path, capsys) -> None:
     archive.write_bytes(image)
     assert main(["check", str(archive)]) == 1
     assert "truncated or damaged (Corrupt input data)" in capsys.readouterr().out
+
+
+def test_a_folder_named_like_an_archive_of_plab_is_meant_by_its_path(
+    tmp_path: Path, monkeypatch, capsys
+) -> None:
+    synthetic.save(synthetic.run(tmp_path / "release"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "./release"]) == 0
+    assert capsys.readouterr().out == "1 run(s) checked, all well\n"

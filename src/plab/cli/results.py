@@ -91,7 +91,8 @@ def _add_forms(parser: Parser) -> None:
 
 
 def _source(text: str) -> Path:
-    return resolve(folder(text))
+    # As a path ./example would be the word.
+    return resolve(text) if text in EXAMPLES else folder(text)
 
 
 def _names(text: str) -> list[str]:
