@@ -15,10 +15,10 @@ import torch
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.problem import Problem
 from plab.report.series import rows_on_axes
-from plab.results import BUDGETS, RunResult, load, read, result_path, write
+from plab.results import BUDGETS, RunResult, checking, load, read, result_path, write
 from plab.results.checking import problems
 from plab.reuse import SimulatorCache
-from plab.runners import RunError, run_batch, run_config
+from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
 from plab.runners.planners.cem import Cem
 from plab.runners.planners.sampling import actions_of, knots_of
@@ -258,6 +258,31 @@ def test_a_batch_goes_on_where_each_of_its_runs_stands(finished, tmp_path: Path,
     run_batch([first, other])
     assert_same_numbers(read(result_path(first)), finished["solve"])
     assert_same_numbers(read(result_path(other)), run(make_config(tmp_path / "alone", "solve", "seed=1")))
+
+
+@pytest.mark.physics
+def test_a_run_ends_when_it_is_solved(finished, tmp_path: Path, monkeypatch) -> None:
+    undisturbed = [finished["cem"], run(make_config(tmp_path / "alone", "cem", "seed=1"))]
+    scores = np.stack([result.iterations["score"] for result in undisturbed])
+    # One run reaches it after fewer rows than the other, which may not.
+    enough = next(level for level in np.sort(scores.ravel()) if len(set(rows_until(scores, level))) == 2)
+    rows = rows_until(scores, enough)
+    for module in (runner, checking):
+        monkeypatch.setattr(module, "SOLVED", enough)
+    cfgs = [make_config(tmp_path, "cem"), make_config(tmp_path, "cem", "seed=1")]
+    run_batch(cfgs)
+    results = [read(result_path(cfg)) for cfg in cfgs]
+    for result, own, count in zip(results, scores, rows, strict=True):
+        assert result.status == "finished" and problems(result) == []
+        assert result.iterations["score"].tolist() == own[:count].tolist()
+    monkeypatch.setattr(checking, "SOLVED", 1.0)
+    shorter = results[int(np.argmin(rows))]
+    assert f"it is finished after {min(rows)} of 4 iterations" in problems(shorter)
+
+
+def rows_until(scores: np.ndarray, enough: float) -> list[int]:
+    """Rows that each run has when it ends at a score."""
+    return [1 + int(np.argmax(own >= enough)) if own.max() >= enough else len(own) for own in scores]
 
 
 # ---------------------------------------------------------------- budgets

@@ -37,6 +37,15 @@ def test_band_is_mean_and_spread_where_all_runs_are() -> None:
     np.testing.assert_allclose(found.std, [1.0, 1.0, 1.0])
 
 
+def test_a_run_that_is_solved_keeps_its_score() -> None:
+    solved = pd.DataFrame({"simulated": [1, 3], "best_score": [0.0, 1.0]})
+    other = pd.DataFrame({"simulated": [1, 5], "best_score": [0.0, 0.4]})
+    found = band([solved, other], "simulated", "best_score")
+    assert found.x.tolist() == [1, 3, 5]
+    np.testing.assert_allclose(found.mean, [0.0, 0.6, 0.7])
+    assert band([solved, solved], "simulated", "best_score").x.tolist() == [1, 3]
+
+
 def test_values_below_zero_count_as_zero_run_by_run() -> None:
     runs = [pd.DataFrame({"episodes": [1, 2], "reward": values}) for values in ([-9.0, 4.0], [1.0, -2.0])]
     assert band(runs, "episodes", "reward").mean.tolist() == [0.5, 2.0]

@@ -15,10 +15,24 @@ from typing import Any, TypeVar
 from plab.errors import ConfigError, pick
 from plab.plugins import load_object
 
-__all__ = ["FAMILIES", "GRADIENT", "RL", "Appearance", "Family", "Rule", "family", "known_family", "schemas"]
+__all__ = [
+    "FAMILIES",
+    "GRADIENT",
+    "RL",
+    "SOLVED",
+    "Appearance",
+    "Family",
+    "Rule",
+    "family",
+    "known_family",
+    "schemas",
+]
 
 RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
+
+SOLVED = 1.0
+"""The highest score there is."""
 
 _TYPES = "plab.config"
 _AGENTS = "plab.runners.population"

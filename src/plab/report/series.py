@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.families import known_family
+from plab.families import SOLVED, known_family
 from plab.report.collect import Runs
 from plab.results import BUDGETS, read_curves, read_iterations
 
@@ -94,7 +94,8 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> 
 
 
 def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
-    """Return mean and spread of a column over runs, between where all have begun and the first one ends.
+    """Return mean and spread of a column over runs, between where all have begun and the first one ends; a
+    run that is solved keeps its score.
 
     Args:
         tables: Rows of each run.
@@ -110,7 +111,10 @@ def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None 
     curves = [(x, y) for x, y in pairs if len(x)]
     if not curves:
         return None
-    low, high = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    low = max(x[0] for x, _ in curves)
+    solved = [column == "best_score" and y[-1] >= SOLVED for _, y in curves]
+    ends = [x[-1] for (x, _), whole in zip(curves, solved, strict=True) if not whole]
+    high = min(ends, default=max(x[-1] for x, _ in curves))
     x = np.unique(np.concatenate([x for x, _ in curves]))
     x = x[(x >= low) & (x <= high)]
     if not len(x):

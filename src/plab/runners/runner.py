@@ -17,7 +17,7 @@ import numpy as np
 
 from plab.config import ConfigError
 from plab.config.checks import check_packages
-from plab.families import family
+from plab.families import SOLVED, family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
 from plab.results import BUDGETS, ResultsError, row_count
@@ -94,6 +94,11 @@ class Track:
         # Files that were begun before there were budgets go on without.
         self._budget = {name: 0 for name in BUDGETS if name in rows or not len(rows)}
         self._budget |= {name: int(rows[name].iloc[-1]) for name in self._budget if len(rows)}
+
+    @property
+    def solved(self) -> bool:
+        """Whether its score is the highest there is, where that is what it looks for."""
+        return self._best_score >= SOLVED
 
     @property
     def cfg(self) -> Config:

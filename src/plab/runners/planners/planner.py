@@ -196,8 +196,8 @@ class PlannerRunner(Runner):
     """Tries the candidates of all runs of a batch together.
 
     The simulator has as many environments per run as the smallest population, or fewer if the memory has no
-    room for more; what is more than that is tried one part after the other. A run ends whose candidates all
-    break off.
+    room for more; what is more than that is tried one part after the other. A run ends when its score is the
+    highest there is; one whose candidates all break off, too.
     """
 
     def context(self) -> AbstractContextManager[Any]:
@@ -223,6 +223,10 @@ class PlannerRunner(Runner):
         self._planners[number] = make_planner(track.cfg.method, start)
         if state is not None:
             self._planners[number].restore(state)
+
+    def has_more(self, track: Track) -> bool:
+        """Whether a run has iterations to do: none once it is solved."""
+        return super().has_more(track) and not track.solved
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Let the planners of all runs do one iteration each."""
