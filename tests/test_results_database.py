@@ -28,6 +28,7 @@ from plab.config.selection import Selection
 from plab.examples import example_archive
 from plab.report.collect import collect
 from plab.results import (
+    ResultsError,
     connect,
     database,
     load,
@@ -74,7 +75,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def ask(source: Path, sql: str) -> list[tuple]:
+def ask(source: Path | list[Path], sql: str) -> list[tuple]:
     with closing(connect(source, iterations="iterations" in sql)) as connection:
         return connection.execute(sql).fetchall()
 
@@ -453,6 +454,47 @@ def test_tables(folder: Path) -> None:
         pd.testing.assert_frame_equal(rows.drop(columns="run"), run.iterations)
 
 
+def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
+    one, two, archive = tmp_path / "it's", tmp_path / "two", tmp_path / "all.plab.zip.xz"
+    for folder, seeds in ((one, (0, 1)), (two, (1, 2))):
+        for seed in seeds:
+            age(synthetic.save(synthetic.run(folder, seed=seed, score=0.25 if folder == one else 0.5)))
+    pack(two, archive)
+    sources = [two, archive, one]
+    listed = "SELECT folder, seed, round(score, 9) FROM runs ORDER BY folder, seed"
+    # Loose files that are as good as each other all stay; what an archive has beside them does not.
+    assert ask(sources, listed) == [
+        (str(one), 0, 0.25),
+        (str(one), 1, 0.25),
+        (str(two), 1, 0.5),
+        (str(two), 2, 0.5),
+    ]
+    assert len(load(sources)) == 4
+    assert ask(one, listed) == [(str(one), 0, 0.25), (str(one), 1, 0.25)]
+    assert ask([archive, archive], "SELECT count(*), count(DISTINCT folder) FROM runs") == [(2, 1)]
+    assert len(load([archive, archive])) == 2
+    assert ask([], "SELECT folder FROM runs") == []
+    for name in ("evaluations", "times", "config", "iterations"):
+        values = f"SELECT runs.seed, {name}.* FROM runs JOIN {name} USING (run) WHERE folder = '{two}'"
+        together, alone = ([row[:1] + row[2:] for row in ask(places, values)] for places in (sources, two))
+        assert together and sorted(together, key=repr) == sorted(alone, key=repr), name
+        counted = f"SELECT count(*) FROM {name} WHERE run IN (SELECT run FROM runs)"
+        assert ask(sources, counted)[0][0] == ask(one, counted)[0][0] + ask(two, counted)[0][0]
+
+
+def test_what_cannot_be_read_of_several_sources_is_left_out(folder: Path, tmp_path: Path, recwarn) -> None:
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(b"x")
+    assert ask([bad, folder], "SELECT count(*) FROM runs") == [(3,)]
+    assert str(recwarn.pop().message).startswith(f"left out 1 unreadable file(s): {bad}")
+    with pytest.raises(ResultsError, match="truncated"):
+        connect([bad, bad])
+    with pytest.raises(ResultsError, match="does not exist"):
+        connect([folder, tmp_path / "no"])
+    with pytest.raises(ResultsError, match="a list of them, not 5"):
+        connect(5)  # type: ignore[arg-type]
+
+
 def test_targets_of_users_are_named_and_not_held(tmp_path: Path) -> None:
     made = synthetic.run(tmp_path)
     made.config["targets"]["source"] = "mine"
@@ -595,6 +637,9 @@ def test_several_sources_are_taken_in_the_same_way(tmp_path: Path, capsys) -> No
         row["seed"]: float(row["score"]) for row in csv.DictReader(io.StringIO(capsys.readouterr().out))
     }
     assert {"0", "1"} <= set(scored)
+    assert main(["sql", "select folder, count(*) from runs group by folder", *sources, "--csv"]) == 0
+    counted = dict(csv.reader(io.StringIO(capsys.readouterr().out)))
+    assert counted.pop(str(one)) == counted.pop(str(archive)) == "1" and len(counted) == 2
     assert status([*sources, *words, "--json"]) == 0
     known = json.loads(capsys.readouterr().out)["runs"]
     assert {run["seed"] for run in known if run["state"] == "done"} == set(scored)

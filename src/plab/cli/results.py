@@ -1,7 +1,7 @@
 """Show, query, check, pack and unpack result files.
 
 python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
-python -m plab.results sql "select ..." [results]             any question to the tables of docs/results.md
+python -m plab.results sql "select ..." [results ...]         any question to the tables of docs/results.md
 python -m plab.results check [results ...]                    check every file against the schema
 python -m plab.results pack results --output runs.plab.zip.xz    put finished runs into one small file
 python -m plab.results unpack runs.plab.zip.xz --output folder   make files of them again
@@ -75,9 +75,7 @@ def _scores_arguments(parser: Parser) -> None:
 def _sql_arguments(parser: Parser) -> None:
     """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
     parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
-    parser.add_argument(
-        "source", nargs="?", type=_source, default=Path("results"), help=f"{_SOURCES} (default: results)"
-    )
+    _add_sources(parser)
     parser.set_defaults(run=_sql)
     _add_forms(parser)
 
@@ -88,6 +86,11 @@ def _add_forms(parser: Parser) -> None:
         what = f"print {what} instead of a text"
         form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
     parser.set_defaults(form="text")
+
+
+def _add_sources(parser: Parser) -> None:
+    what = f"each a {_SOURCES} (default: results)"
+    parser.add_argument("sources", nargs="*", type=_source, default=[Path("results")], help=what)
 
 
 def _source(text: str) -> Path:
@@ -104,9 +107,7 @@ _SOURCES = f"folder, file, archive, or one of {', '.join(EXAMPLES)}"
 
 def _check_arguments(parser: Parser) -> None:
     """Check every file against the schema; exit code 1 if anything is wrong."""
-    parser.add_argument(
-        "sources", nargs="*", type=_source, default=[Path("results")], help=f"each a {_SOURCES}"
-    )
+    _add_sources(parser)
     parser.set_defaults(run=_check)
 
 
@@ -147,7 +148,7 @@ def _scores(options: argparse.Namespace) -> int:
 
 
 def _sql(options: argparse.Namespace) -> int:
-    columns, rows, unreadable = query(options.source, options.query)
+    columns, rows, unreadable = query(options.sources, options.query)
     _tell_left_out(unreadable)
     print_table(columns, rows, options.form)
     return 0

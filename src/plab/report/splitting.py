@@ -24,7 +24,7 @@ class SplitError(PlabError, ValueError):
 
 
 def split_rows(
-    found: Sequence[Row], key: str, places: Sequence[str | Path]
+    found: Sequence[Row], key: str, places: Sequence[Path]
 ) -> tuple[list[Row], dict[str, list[str]]]:
     """Give the runs of a method that differ in a setting names of their own.
 
@@ -64,7 +64,7 @@ def split_rows(
     return renamed, dict(names)
 
 
-def _reader(key: str, places: Sequence[str | Path]) -> Callable[[Row], str]:
+def _reader(key: str, places: Sequence[Path]) -> Callable[[Row], str]:
     """Return what gives a run's value of a key, as text."""
     if key == SEED:
         return lambda row: str(row.values["seed"])

@@ -18,10 +18,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from plab.results.database import run_number, text
+from plab.results.database import quoted, run_number
 from plab.results.files import read_iterations
 from plab.results.hdf5 import columns
-from plab.results.loading import counting_files, read_each
+from plab.results.loading import counting_files, places, read_each
 from plab.results.schema import ARCHIVE_SUFFIX, ResultsError
 from plab.results.store import Store, file_key
 from plab.results.workers import each
@@ -53,11 +53,10 @@ def read_curves(source: str | Path | Sequence[str | Path], paths: Iterable[str |
         ResultsError: If one cannot be read.
     """
     wanted = list(map(str, paths))
-    sources = [source] if isinstance(source, str | Path) else source
     files = {path.partition(_INSIDE)[0] + ARCHIVE_SUFFIX if _INSIDE in path else path for path in wanted}
     found: dict[str, Curves] = {}
     asked = set(wanted)
-    for root in map(Path, sources):
+    for root in places(source):
         for path, member, curves in _stored(root, files):
             place = str(path / member) if member else str(path)
             if place in asked:
@@ -66,19 +65,17 @@ def read_curves(source: str | Path | Sequence[str | Path], paths: Iterable[str |
     return [found[path] if path in found else _directly(path) for path in wanted]
 
 
-def add_iterations(connection: sqlite3.Connection, source: str | Path) -> None:
+def add_iterations(connection: sqlite3.Connection, sources: Sequence[Path]) -> None:
     """Add the table ``iterations`` to a connection of :func:`plab.results.connect`.
 
     Args:
         connection: The connection.
-        source: Where it leads.
+        sources: Where it leads.
     """
-    root = Path(source)
     counted = {run for (run,) in connection.execute("SELECT run FROM runs")}
     names: set[str] = set()
     connection.execute("CREATE TEMP TABLE iterations (run INTEGER)")
-    for path, member, packed in _stored(root):
-        run = run_number(file_key(root, path), member)
+    for run, packed in _numbered(sources):
         if run not in counted:
             continue
         curves = _unpacked(*packed)
@@ -86,8 +83,8 @@ def add_iterations(connection: sqlite3.Connection, source: str | Path) -> None:
         curves = {name: curves[name] for name in {name.lower(): name for name in curves}.values()}
         for name in (name for name in curves if name.lower() not in names):
             names.add(name.lower())
-            connection.execute(f"ALTER TABLE temp.iterations ADD COLUMN {_quoted(name)}")
-        into = ", ".join(["run", *map(_quoted, curves)])
+            connection.execute(f"ALTER TABLE temp.iterations ADD COLUMN {_name(name)}")
+        into = ", ".join(["run", *map(_name, curves)])
         places = ", ".join("?" * (len(curves) + 1))
         rows = zip(*(values.tolist() for values in curves.values()), strict=True)
         connection.executemany(
@@ -102,6 +99,13 @@ Packed = tuple[str, bytes]
 """Names and types of columns, JSON, and the columns one after the other, compressed."""
 
 _INSIDE = f"{ARCHIVE_SUFFIX}{os.sep}"
+
+
+def _numbered(sources: Sequence[Path]) -> Iterator[tuple[int, Packed]]:
+    """Yield number and iterations of all runs."""
+    for place, root in enumerate(sources):
+        for path, member, packed in _stored(root):
+            yield run_number(file_key(root, path), member, place), packed
 
 
 def _stored(root: Path, wanted: Container[str] | None = None) -> Iterator[tuple[Path, str, Packed]]:
@@ -167,5 +171,5 @@ def _directly(path: str) -> Curves:
     return {str(name): table[name].to_numpy() for name in table}
 
 
-def _quoted(name: str) -> str:
-    return '"' + text(name).replace('"', '""') + '"'
+def _name(column: str) -> str:
+    return quoted(column, '"')

@@ -21,7 +21,7 @@ from plab.config.selection import lookup
 from plab.results.schema import ResultsError
 from plab.results.store import DAMAGED, File, Store
 
-__all__ = ["COLUMNS", "Database", "Row", "run_number", "sql_value", "text"]
+__all__ = ["COLUMNS", "Database", "Row", "quoted", "run_number", "sql_value", "tables_of", "text"]
 
 COLUMNS = (
     "task",
@@ -77,12 +77,19 @@ UPDATE all_runs SET counts = run IN (
     SELECT run FROM (
         SELECT run, rank() OVER (
             PARTITION BY config_hash
-            ORDER BY status <> 'finished', archived, CASE WHEN archived THEN path END
+            ORDER BY status <> 'finished', archived, CASE WHEN archived THEN file END,
+                CASE WHEN archived THEN path END
         ) AS place FROM all_runs
     ) WHERE place = 1
 )
 """
 """Leaves out what :func:`plab.results.loading.rows` leaves out, too."""
+
+_OF_SOURCES = f"""
+CREATE TEMP VIEW runs AS SELECT run, {", ".join((*COLUMNS, *_MORE))}, {{folder}} AS folder
+    FROM main.all_runs WHERE counts
+"""
+"""Not kept: the same folder may be given by another path next time."""
 
 _OF_RUNS = ("run_sections", "all_evaluations", "all_times", "all_runs")
 
@@ -299,14 +306,54 @@ class Database:
         yield from (sql_value(more.get(name, values.get(name))) for name in (*COLUMNS, *_MORE))
 
 
-def run_number(key: bytes, member: str) -> int:
+def run_number(key: bytes, member: str, place: int = 0) -> int:
     """Return what stands for a run in all tables.
 
     Args:
         key: :func:`plab.results.store.file_key` of its file.
         member: Its name in an archive, empty for a file of its own.
+        place: Number of its source among several.
     """
-    return _number(key + b"\0" + os.fsencode(member))
+    return _number(key + b"\0" + os.fsencode(member)) ^ place
+
+
+def tables_of(sources: Sequence[str], connections: Sequence[sqlite3.Connection]) -> sqlite3.Connection:
+    """Return the tables of some sources, with the column ``folder`` in that of runs: their source.
+
+    Args:
+        sources: What the sources are called.
+        connections: :meth:`Database.connection` of each; all but the one returned are closed.
+    """
+    names = [quoted(source, "'") for source in sources]
+    if len(connections) == 1:
+        (connection,) = connections
+        connection.execute(_OF_SOURCES.format(folder=names[0]))
+        return connection
+    whole = sqlite3.connect("", isolation_level=None)
+    whole.executescript(_LAYOUT)
+    whole.execute("BEGIN")
+    for place, connection in enumerate(connections):
+        with contextlib.closing(connection):
+            _add_tables(whole, connection, place)
+    whole.execute(_COUNT)
+    whole.execute("COMMIT")
+    cases = " ".join(f"WHEN {place} THEN {name}" for place, name in enumerate(names))
+    whole.execute(_OF_SOURCES.format(folder=f"CASE file {cases} END" if names else "NULL"))
+    return whole
+
+
+def _add_tables(whole: sqlite3.Connection, connection: sqlite3.Connection, place: int) -> None:
+    """Add the tables of a source to those of several; its place there stands for the runs' files."""
+    for name in (*_OF_RUNS, "sections", "section_keys"):
+        cursor = connection.execute(f"SELECT * FROM {name}")
+        marks = ", ".join("?" * len(cursor.description))
+        rows: Iterable[tuple[Any, ...]] = cursor
+        if name == "all_runs":
+            rows = ((run ^ place, place, *rest) for run, _, *rest in cursor)
+        elif name in _OF_RUNS:
+            rows = ((run ^ place, *rest) for run, *rest in cursor)
+        # Several sources may have the same sections.
+        whole.executemany(f"INSERT OR IGNORE INTO {name} VALUES ({marks})", rows)
 
 
 def sql_value(value: Any) -> Any:
@@ -324,6 +371,11 @@ def sql_value(value: Any) -> Any:
 def text(value: str) -> str:
     """Return a text without what is no Unicode, as in names of files."""
     return value.encode("utf-8", "replace").decode()
+
+
+def quoted(value: str, mark: str) -> str:
+    """Return a text as SQL has it between marks: a name between ``"``, a value between ``'``."""
+    return mark + text(value).replace(mark, 2 * mark) + mark
 
 
 def _number(name: bytes) -> int:

@@ -40,6 +40,7 @@ __all__ = [
     "counting_files",
     "load",
     "members",
+    "places",
     "read_each",
     "read_rows",
     "readable_rows",
@@ -116,12 +117,9 @@ def rows(
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    if not isinstance(source, str | Path | Sequence):
-        raise ResultsError(f"results are in a folder, an archive, a file, or a list of them, not {source!r}")
-    sources = [source] if isinstance(source, str | Path) else source
     found: list[Row] = []
     unreadable: list[ResultsError] = []
-    for root in map(Path, sources):
+    for root in places(source):
         for entry in _all_rows(root, database):
             if isinstance(entry, ResultsError):
                 unreadable.append(entry)
@@ -137,10 +135,20 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = rows(source)
-    sources = [source] if isinstance(source, str | Path) else source
-    if unreadable and not found and not any(Path(root).is_dir() for root in sources):
+    if unreadable and not found and not any(root.is_dir() for root in places(source)):
         raise unreadable[0]
     return found, unreadable
+
+
+def places(source: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return the folders, archives and files that are meant.
+
+    Raises:
+        ResultsError: If it is nothing of the kind.
+    """
+    if not isinstance(source, str | Path | Sequence):
+        raise ResultsError(f"results are in a folder, an archive, a file, or a list of them, not {source!r}")
+    return [Path(source)] if isinstance(source, str | Path) else list(map(Path, source))
 
 
 @contextmanager

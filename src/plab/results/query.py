@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ import pandas as pd
 from plab.config.selection import Selection, SelectionError, lookup
 from plab.errors import PlabError
 from plab.results.curves import add_iterations
-from plab.results.database import Row
-from plab.results.loading import readable_rows, up_to_date, warn_of
+from plab.results.database import Row, tables_of
+from plab.results.loading import places, readable_rows, up_to_date, warn_of
 from plab.results.schema import ResultsError
 
 __all__ = ["QueryError", "connect", "query", "scores"]
@@ -24,25 +24,29 @@ class QueryError(PlabError, ValueError):
     """A query that cannot be answered; the message is one line that says why."""
 
 
-def connect(source: str | Path = "results", *, iterations: bool = False) -> sqlite3.Connection:
+def connect(
+    source: str | Path | Sequence[str | Path] = "results", *, iterations: bool = False
+) -> sqlite3.Connection:
     """Return the tables of results, for SQL and pandas, up to date and only for reading.
 
     Args:
-        source: A folder, an archive or a single result file.
+        source: A folder, an archive, a single result file, or several of them.
         iterations: Add the table ``iterations``, which takes longer.
 
     Returns:
         A connection with the tables of docs/results.md; close it when it is done with.
 
     Raises:
-        ResultsError: If there is nothing at ``source``, or it is a file that cannot be read.
+        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
-    connection, unreadable = _connected(Path(source), iterations)
+    connection, unreadable = _connected(places(source), iterations)
     warn_of(unreadable)
     return connection
 
 
-def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
+def query(
+    source: str | Path | Sequence[str | Path], sql: str
+) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
     """Answer an SQL query.
 
     Args:
@@ -56,13 +60,14 @@ def query(source: str | Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]
         QueryError: If it is no query, or wrong.
         ResultsError: As for :func:`connect`.
     """
+    sources = places(source)
     try:
         try:
-            return _answer(Path(source), sql, iterations=False)
+            return _answer(sources, sql, iterations=False)
         except sqlite3.OperationalError as error:
             if str(error) != _NO_ITERATIONS:
                 raise
-            return _answer(Path(source), sql, iterations=True)
+            return _answer(sources, sql, iterations=True)
     except (sqlite3.Error, sqlite3.Warning) as error:
         raise QueryError(_explained(" ".join(str(error).split()))) from None
 
@@ -128,22 +133,30 @@ _READING = {
 }
 
 
-def _connected(root: Path, iterations: bool) -> tuple[sqlite3.Connection, list[ResultsError]]:
-    with up_to_date(root) as known:
-        if root.is_file() and known.unreadable and not any(isinstance(row, Row) for row in known.rows()):
-            raise known.unreadable[0]
-        connection = known.connection()
-    if iterations:
-        add_iterations(connection, root)
-    connection.execute("PRAGMA query_only = ON")
-    connection.set_authorizer(_reads)
-    return connection, known.unreadable
+def _connected(sources: Sequence[Path], iterations: bool) -> tuple[sqlite3.Connection, list[ResultsError]]:
+    connections: list[sqlite3.Connection] = []
+    unreadable: list[ResultsError] = []
+    with ExitStack() as opened:
+        for root in sources:
+            with up_to_date(root) as known:
+                connections.append(opened.enter_context(closing(known.connection())))
+                unreadable += known.unreadable
+        connection = opened.enter_context(closing(tables_of(list(map(str, sources)), connections)))
+        if unreadable and not any(root.is_dir() for root in sources):
+            if connection.execute("SELECT 1 FROM runs LIMIT 1").fetchone() is None:
+                raise unreadable[0]
+        if iterations:
+            add_iterations(connection, sources)
+        connection.execute("PRAGMA query_only = ON")
+        connection.set_authorizer(_reads)
+        opened.pop_all()
+    return connection, unreadable
 
 
 def _answer(
-    root: Path, sql: str, *, iterations: bool
+    sources: Sequence[Path], sql: str, *, iterations: bool
 ) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    connection, unreadable = _connected(root, iterations)
+    connection, unreadable = _connected(sources, iterations)
     with closing(connection):
         cursor = connection.execute(sql)
         if cursor.description is None:
