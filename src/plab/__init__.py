@@ -1,5 +1,6 @@
 """plab: PlasticineLab rebuilt as an experiment harness, from one command line to the result file."""
 
+import inspect
 import os
 
 # Taichi prints a banner on standard output unless told so before it is imported, by whichever part of plab.
@@ -8,5 +9,9 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 from plab.envs import register_suite
 
 __version__ = "0.1.0"
+
+# Taichi's decorators ask for the source of the importer: inspect looks through all modules, each time, for a
+# file that it does not know.
+vars(inspect).setdefault("modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 
 register_suite()
