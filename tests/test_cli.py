@@ -127,7 +127,7 @@ def test_help_all_names_everything(capsys):
         assert key in text
     for key in (
         "sim.precision=float32",
-        "method.lr_by_task.plab={Chopsticks: 0.01, ",
+        "method.lr_by_task.plab={other: 0.1, Chopst",
         "method.loss_weights.sdf=10.0",
         "task.target.radius=0.135",
     ):
@@ -161,14 +161,14 @@ def test_cfg_job_prints_the_configuration(capsys, tmp_path):
 
 
 def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_path):
-    assert main(["task=Move", "variant=2", "method=gd", "seed=7", "method.lr=0.05"]) == 0
+    assert main(["task=Move", "variant=2", "method=gd", "seed=7", "method.lr=50"]) == 0
     (cfg,) = seen
     assert (cfg.task.name, cfg.variant, cfg.method.name, cfg.seed, cfg.method.lr) == (
         "Move",
         "2",
         "gd",
         7,
-        0.05,
+        50,
     )
     assert Path.cwd() == tmp_path
     assert list(tmp_path.iterdir()) == []

@@ -213,7 +213,7 @@ def test_methods_differ_only_where_their_files_say():
     adam, gd, adam_h = (
         dataclasses.asdict(load_config([f"method={m}"]).method) for m in ("adam", "gd", "adam_h")
     )
-    assert gd == adam | {"name": "gd", "optimizer": "gd"}
+    assert gd == adam | {"name": "gd", "optimizer": "gd", "lr": 100.0, "max_gradient_norm": 0.03}
     assert adam_h == adam | {"name": "adam_h", "contact": "hard"}
 
 
@@ -341,8 +341,10 @@ def test_a_variant_may_have_any_name():
     [
         (["task=Move"], 0.1),
         (["task=Chopsticks"], 0.01),
-        (["task=Chopsticks", "method=gd"], 0.01),
-        (["task=Writer", "method=gd"], 0.1),
+        (["task=Chopsticks", "method=gd"], 10.0),
+        (["task=Table", "method=gd"], 10.0),
+        (["task=Move", "method=gd", "method.lr_by_task.plab.other=3"], 3.0),
+        (["task=Writer", "method=gd"], 100.0),
         (["task=Chopsticks", "method=adam_h"], 0.1),
         (["task=TripleMove"], 0.1),
         (["task=TripleMove", "protocol=release"], 0.01),
@@ -355,6 +357,21 @@ def test_a_variant_may_have_any_name():
 def test_a_learning_rate_goes_by_numbers_and_task(overrides: list[str], lr: float):
     method = load_config(overrides).method
     assert method.lr == lr and method.lr_by_task == {}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "limit"),
+    [
+        (["method=adam"], None),
+        (["method=gd"], 0.03),
+        (["method=gd", "protocol=release"], None),
+        (["method=gd", "method.max_gradient_norm=null"], None),
+        (["method=gd", "method.max_gradient_norm_by_numbers.plab=2"], 2.0),
+    ],
+)
+def test_gd_has_a_limit_with_plabs_numbers(overrides: list[str], limit: float | None):
+    method = load_config(overrides).method
+    assert method.max_gradient_norm == limit and method.max_gradient_norm_by_numbers == {}
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from plab.autograd import policy_gradient, rollout
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
-from plab.torch import TensorEnv, policy_gradient, rollout
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 

@@ -96,7 +96,7 @@ class Threads(ThreadPhases):
     def scatter_alone(self, grid: ti.template(), e, base, fx, field: ti.template()):
         w = spline(fx)
         node = e * self.nodes + self.linear(base)
-        scatter(grid, node, self.axis * self.axis, self.axis, w, field, self.work, 0)
+        scatter(grid, node, self.axis * self.axis, self.axis, w, field, self.scratch, 0)
 
     @ti.kernel
     def scatter_all(self, state: ti.types.ndarray(ndim=1)):
@@ -170,7 +170,7 @@ def built(scenes: list[Scene]) -> tuple[Tiles, Threads]:
         phases.fill_bodies(scenes, order)
         phases.allocate_adjoint()
         phases.clear_adjoint()
-    both[1].work = ti.Vector.field(4, runtime.real, shape=9)
+    both[1].scratch = ti.Vector.field(4, runtime.real, shape=9)
     return both
 
 

@@ -14,6 +14,7 @@ import taichi as ti
 import torch
 
 import reference_mpm as reference
+from plab.autograd import simulate
 from plab.config import ConfigError, load_config
 from plab.envs.core import EpisodeBatch
 from plab.losses import TERMS, check_gradient, make_terms
@@ -22,7 +23,6 @@ from plab.objective import soft_iou
 from plab.results import load, read
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim import SimulationError, Simulator
-from plab.torch import simulate
 from suite import KINDS, Kinetic, scene
 
 ROOT = Path(__file__).resolve().parents[1]

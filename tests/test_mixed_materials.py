@@ -12,10 +12,10 @@ import torch
 
 import reference_mpm as reference
 import suite
+from plab.autograd import simulate
 from plab.losses import make_terms
 from plab.scene import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
-from plab.torch import simulate
 
 pytestmark = pytest.mark.physics
 

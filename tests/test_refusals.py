@@ -248,7 +248,7 @@ def test_calls_from_python(call, line):
 
 @pytest.mark.physics
 def test_rollouts_of_no_steps_and_of_no_numbers():
-    from plab.torch import TensorEnv
+    from plab.envs.tensors import TensorEnv
 
     with pytest.raises(PlabError, match="there is no configuration"):
         TensorEnv([])

@@ -33,7 +33,7 @@ PYTHON = {
             "plab.objective",
             "plab.losses",
             "plab.losses.term",
-            "plab.torch",
+            "plab.autograd",
             "plab.scene",
             "plab.targets",
         ),
@@ -51,7 +51,7 @@ PYTHON = {
     "environments": (
         "Environments",
         "",
-        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs", "plab.submissions.recording"),
+        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs.tensors", "plab.envs", "plab.submissions.recording"),
     ),
     "results": (
         "Results",

@@ -33,12 +33,12 @@ from plab.cli.command import command_line
 from plab.cli.tables import report
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.families import FAMILIES
 from plab.runners.common import torch_settings
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.population import Population
 from plab.runners.rl_trainer import Trainer
-from plab.torch import TensorEnv
 
 __all__ = ["main", "measure", "measure_population"]
 

@@ -54,6 +54,7 @@ _NOT_SEARCHED = (
     "contact_by_task",
     "momentum",
     "max_gradient_norm",
+    "max_gradient_norm_by_numbers",
     "iterations",
 )
 """Settings of the method that ``--search`` has flags of its own for, or does not use."""

@@ -21,7 +21,7 @@ repeated.
 
 EXAMPLES
   python -m plab.run task=Rope method=adam seed=0
-  python -m plab.run task=Move variant=3 method=gd method.lr=0.05
+  python -m plab.run task=Move variant=3 method=gd method.lr=50
   python -m plab.run sim.particles_scale=0.2 method.iterations=20      a quick try
   python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs that share a simulator
   python -m plab.run +experiment=yield_ablation                a sweep that a file describes

@@ -353,7 +353,13 @@ def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool)
         for section, key in ("lr_by_task", "numbers"), ("contact_by_task", "contact"):
             chosen = composed.protocol[key]
             used[f"method.{section}."] = f"protocol.{key}={chosen}", chosen
-            used[f"method.{section}.{chosen}."] = f"task={task.name}", task.name
+            tasks = method.get(section, {}).get(chosen, {})
+            used[f"method.{section}.{chosen}."] = (
+                f"task={task.name}",
+                "other" if "other" in tasks and task.name not in tasks else task.name,
+            )
+        numbers = composed.protocol.numbers
+        used["method.max_gradient_norm_by_numbers."] = f"protocol.numbers={numbers}", numbers
     if alone or variant == RANDOM:
         # Of the variants a random one uses that which gives what is not drawn, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant
@@ -381,10 +387,11 @@ def _choose_profile(method: DictConfig) -> None:
 
 
 def _choose_by_task(method: DictConfig) -> None:
-    """Put the task's learning rate and contact weight where they are referred to, and forget the others'."""
+    """Put learning rate, contact weight and limit of the gradient where they are referred to, and forget those
+    of other tasks and numbers."""
     if "lr_by_task" in method:
         OmegaConf.resolve(method)
-        method.lr_by_task = method.contact_by_task = {}
+        method.lr_by_task = method.contact_by_task = method.max_gradient_norm_by_numbers = {}
 
 
 def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:

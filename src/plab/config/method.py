@@ -81,14 +81,15 @@ class TrajectoryConfig(MethodConfig):
     Attributes:
         optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
         lr: Learning rate; actions are in [-1, 1].
-        lr_by_task: Learning rates by whose numbers the task has, and task. Empty in a run's configuration:
-            what was used is in ``lr``.
+        lr_by_task: Learning rates by whose numbers the task has, and task, or ``other``. Empty in a run's
+            configuration: what was used is in ``lr``.
         contact_by_task: Weights of the contact term by term and task. Empty likewise: what was used is in
             ``loss_weights``.
         betas: Decay rates of adam's two moment estimates.
         eps: Added to adam's denominator.
         momentum: gd's momentum, on (1 - momentum)-weighted gradients.
         max_gradient_norm: Longer gradients are scaled down to this norm; None sets no limit.
+        max_gradient_norm_by_numbers: Limits by whose numbers the task has. Empty likewise.
         iterations: Rollouts with gradient, hence updates.
         action_init: Initial actions are uniform in +- this.
     """
@@ -101,6 +102,7 @@ class TrajectoryConfig(MethodConfig):
     eps: float
     momentum: float
     max_gradient_norm: float | None
+    max_gradient_norm_by_numbers: dict[str, Any]
     iterations: int
     action_init: float
 

@@ -52,6 +52,7 @@ _HARMLESS = (
     "method.tensorboard",
     "method.lr_by_task",
     "method.contact_by_task",
+    "method.max_gradient_norm_by_numbers",
     "method.torch_device",
     "method.torch_threads",
     # Acts where method.loss_terms.contact says so.
@@ -453,7 +454,8 @@ def _usual_by_task(method: str, task: str, usual: Mapping[str, Any]) -> dict[str
     )
     own = shipped_file("method", method)
     tasks = {key: own.get(section, {}).get(usual[choice], {}) for key, section, choice in places}
-    return {key: values[task] for key, values in tasks.items() if task in values}
+    found = {key: values.get(task, values.get("other")) for key, values in tasks.items()}
+    return {key: value for key, value in found.items() if value is not None}
 
 
 def _usual_task(task: str, exact: bool) -> dict[str, Any]:

@@ -247,7 +247,8 @@ def config_hash(cfg: Any) -> str:
     if not plain.get("seed_particles"):
         plain.pop("seed_particles", None)
     # Always empty.
-    plain["method"].pop("contact_by_task", None)
+    for key in ("contact_by_task", "max_gradient_norm_by_numbers"):
+        plain["method"].pop(key, None)
     plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
     # What a file holds counts, not where it is.
     plain["task"] = _without_places(plain["task"])

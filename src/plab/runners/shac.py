@@ -24,6 +24,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import create_mlp
 
+from plab.autograd import Stretch, policy_gradient
 from plab.config import ConfigError, RlConfig, ShacConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
 from plab.runners.common import policy_episode, shared_batches, torch_settings
@@ -32,7 +33,6 @@ from plab.runners.policy import Policy, save_policy
 from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import CLIP, ModelKind, Spaces
 from plab.runners.runner import Runner, Step, Track
-from plab.torch import Stretch, policy_gradient
 
 __all__ = ["SHAC", "ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
 
@@ -313,7 +313,7 @@ class ShacTraining:
 
 
 class _Drawing(torch.nn.Module):
-    """The policy as :func:`plab.torch.policy_gradient` runs it: of observations as they are, with noise."""
+    """The policy as :func:`plab.autograd.policy_gradient` runs it: of raw observations, with noise."""
 
     def __init__(self, training: ShacTraining) -> None:
         super().__init__()

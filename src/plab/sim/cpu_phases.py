@@ -11,7 +11,7 @@ from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, with_unit_rotation
-from plab.sim.storage import BLOCK, CHUNKS, FRAME_ADJOINT, PLACES, SPREAD, STAGE, WORK
+from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, SCRATCH, STENCILS, STRAINS
 from plab.sim.term_phases import TermPhases
 
 __all__ = ["BLOCK_NODES", "CpuPhases"]
@@ -32,7 +32,9 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         m = max(1, self.manipulators)
         self.frame_bar = ti.field(ti.f64, shape=(self.batch * self.chunks, m, FRAME_ADJOINT))
         # Shares of the chunks in the poses' adjoints under terms of distances.
-        self.pose_part = ti.Vector.field(8, ti.f64, shape=(self.batch, self.chunks if self.spreads else 1, m))
+        self.pose_part = ti.Vector.field(
+            8, ti.f64, shape=(self.batch, self.chunks if self.beyond_nearest else 1, m)
+        )
 
     def clear_adjoint(self) -> None:
         """Begin a gradient: clear the adjoints that are sums over its steps."""
@@ -67,8 +69,8 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
         """Material update and scatter of momentum and mass."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * SPREAD)
-        places_at = self.bounded(grid_index * PLACES)
+        at = self.bounded(grid_index * STENCILS)
+        bases_at = self.bounded(grid_index * BASES)
         known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
@@ -79,19 +81,19 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 self.tile_entry(after, e, tile),
                 entry9,
                 e,
-                self.bounded(grid_index * STAGE),
+                self.bounded(grid_index * STRAINS),
                 True,
             )
-            self.stencil_tile(state, source, at, places_at, False)
+            self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
             for lane in range(self.lanes_of(tile)):
-                key = self.places[places_at + KEY][lane]
+                key = self.bases[bases_at + KEY][lane]
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                place = self.places[places_at + NODE][lane]
-                node = self.bounded(grid_index * self.nodes + place)
-                self.scatter_momentum(entry9, lane, place, node, at, self.bounded(grid_index * WORK))
+                base_node = self.bases[bases_at + NODE][lane]
+                node = self.bounded(grid_index * self.nodes + base_node)
+                self.scatter_momentum(entry9, lane, base_node, node, at, self.bounded(grid_index * SCRATCH))
 
     @ti.func
     def grid_chunk(self, e, c, s):
@@ -126,44 +128,44 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     def gather_chunk(self, state: ti.template(), before, after, e, c, time):
         """Velocities, affine matrices and positions after the substep."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * SPREAD)
-        places_at = self.bounded(grid_index * PLACES)
+        at = self.bounded(grid_index * STENCILS)
+        bases_at = self.bounded(grid_index * BASES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
-            self.stencil_tile(state, source, at, places_at, False)
+            self.stencil_tile(state, source, at, bases_at, False)
             for lane in range(self.lanes_of(tile)):
-                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
+                node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle(
-                    state, source, target, lane, node, e, time, at, self.bounded(grid_index * WORK)
+                    state, source, target, lane, node, e, time, at, self.bounded(grid_index * SCRATCH)
                 )
 
     @ti.func
     def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
         """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * SPREAD)
-        places_at = self.bounded(grid_index * PLACES)
-        work_at = self.bounded(grid_index * WORK)
+        at = self.bounded(grid_index * STENCILS)
+        bases_at = self.bounded(grid_index * BASES)
+        scratch_at = self.bounded(grid_index * SCRATCH)
         known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
-            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STAGE), False)
-            self.stencil_tile(state, source, at, places_at, False)
+            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STRAINS), False)
+            self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
             self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
-                key = self.places[places_at + KEY][lane]
+                key = self.bases[bases_at + KEY][lane]
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                place = self.places[places_at + NODE][lane]
-                node = self.bounded(grid_index * self.nodes + place)
-                self.scatter_momentum(entry9, lane, place, node, at, work_at)
-                self.scatter_adjoint(bar, entry, lane, place, node, at, work_at)
+                base_node = self.bases[bases_at + NODE][lane]
+                node = self.bounded(grid_index * self.nodes + base_node)
+                self.scatter_momentum(entry9, lane, base_node, node, at, scratch_at)
+                self.scatter_adjoint(bar, entry, lane, base_node, node, at, scratch_at)
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
@@ -187,18 +189,18 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     def gather_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c):
         """Adjoints of the particles before the substep."""
         grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * SPREAD)
-        places_at = self.bounded(grid_index * PLACES)
+        at = self.bounded(grid_index * STENCILS)
+        bases_at = self.bounded(grid_index * BASES)
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
-            self.stencil_tile(state, source, at, places_at, True)
+            self.stencil_tile(state, source, at, bases_at, True)
             self.momentum_tile(state, source, entry9, at)
             self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
-                node = self.bounded(e * self.nodes + self.places[places_at + NODE][lane])
+                node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle_adjoint(
                     state,
                     source,
@@ -209,9 +211,11 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                     lane,
                     node,
                     at,
-                    self.bounded(grid_index * WORK),
+                    self.bounded(grid_index * SCRATCH),
                 )
-            self.material_tile_adjoint(state, source, bar, entry, entry9, e, self.bounded(grid_index * STAGE))
+            self.material_tile_adjoint(
+                state, source, bar, entry, entry9, e, self.bounded(grid_index * STRAINS)
+            )
 
     # -- poses --------------------------------------------------------------------------------------
 
@@ -293,7 +297,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 self.mark(grid_index, block * 8 + crossing, stamp)
                 self.scatter_mass(grid_index, base, fx)
                 if ti.static(len(self.particle_terms) > 0):
-                    part += self.particle_measures(e, x, self.vector(state, source + 3, lane))
+                    part += self.particle_measures(e, x, self.vector(state, source + AT_V, lane))
                 self.tally_distances(e, c, tile * self.lanes + lane, x)
         self.particle_part[e, c] = part
 
@@ -351,7 +355,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 for shape, start, stop in ti.static(self.runs):
                     if ti.static(self.acts(shape)):
                         for m in range(start, stop):
-                            x_bar, pose_bar = self.spread_gradient(shape, e, m, tile * self.lanes + lane, x)
+                            x_bar, pose_bar = self.distance_gradient(shape, e, m, tile * self.lanes + lane, x)
                             # Plainly: += on a field is an atomic.
                             self.pose_part[e, c, m] = self.pose_part[e, c, m] + pose_bar
                             for i in ti.static(range(3)):

@@ -2,19 +2,19 @@
 nodes of one particle after the other.
 
 LLVM vectorises what ends in stores to a field, and what begins with loads from one. So each part of the work
-leaves its results in ``spread`` (lane vectors, one particle per lane) or in ``work`` (4-vectors of one
+leaves its results in ``stencils`` (lane vectors, one particle per lane) or in ``scratch`` (4-vectors of one
 particle), and the next part takes them from there.
 """
 
 import taichi as ti
 
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import INDEX_MASK, PLACES, SPREAD, WORK
+from plab.sim.storage import AT_C, AT_V, BASES, INDEX_MASK, SCRATCH, STENCILS
 from plab.sim.transfer import at_base, column, gather, gather_adjoint, scatter, spline, spline_slope
 
 __all__ = ["TransferTiles"]
 
-# Entries of a tile in ``spread``: weights and their slopes by offset and axis, x / dx - base, and the values
+# Entries of a tile in ``stencils``: weights and their slopes by offset and axis, x / dx - base, and values
 # at the base node of the two affine fields that are scattered, without their last entries.
 WEIGHTS = 0
 SLOPES = 9
@@ -22,7 +22,7 @@ OFFSETS = 18
 MOMENTUM_FIELD = 21
 ADJOINT_FIELD = 24
 
-# Entries in ``places``: node in the environment's grid; block and crossing in one number.
+# Entries in ``bases``: node in the environment's grid; block and crossing in one number.
 NODE = 0
 KEY = 1
 
@@ -43,9 +43,9 @@ class TransferTiles(ParticlePhases):
                 f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
             )
         # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
-        self.work = ti.Vector.field(4, self.real, shape=grids * WORK)
-        self.spread = ti.Vector.field(self.lanes, self.real, shape=grids * SPREAD)
-        self.places = ti.Vector.field(self.lanes, ti.i32, shape=grids * PLACES)
+        self.scratch = ti.Vector.field(4, self.real, shape=grids * SCRATCH)
+        self.stencils = ti.Vector.field(self.lanes, self.real, shape=grids * STENCILS)
+        self.bases = ti.Vector.field(self.lanes, ti.i32, shape=grids * BASES)
         super()._allocate()
         # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
         self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
@@ -69,14 +69,14 @@ class TransferTiles(ParticlePhases):
     # -- by lanes -----------------------------------------------------------------------------------
 
     @ti.func
-    def stencil_tile(self, state: ti.template(), source, at, places_at, slopes: ti.template()):
+    def stencil_tile(self, state: ti.template(), source, at, bases_at, slopes: ti.template()):
         """Weights, offsets and base nodes of a tile's particles.
 
         Args:
             state: Particle state.
             source: Entry of the tile.
-            at: First entry of the thread's share of ``spread``.
-            places_at: First entry of the thread's share of ``places``.
+            at: First entry of the thread's share of ``stencils``.
+            bases_at: First entry of the thread's share of ``bases``.
             slopes: Whether the weights' slopes are needed.
         """
         node = ti.Vector.zero(ti.i32, self.lanes)
@@ -85,38 +85,40 @@ class TransferTiles(ParticlePhases):
         for axis in ti.static(range(3)):
             base, f = self.stencil(state[source + axis])
             w = spline(f)
-            self.spread[at + OFFSETS + axis] = f
+            self.stencils[at + OFFSETS + axis] = f
             for k in ti.static(range(3)):
-                self.spread[at + WEIGHTS + 3 * k + axis] = w[k]
+                self.stencils[at + WEIGHTS + 3 * k + axis] = w[k]
             if ti.static(slopes):
                 dw = spline_slope(f)
                 for k in ti.static(range(3)):
-                    self.spread[at + SLOPES + 3 * k + axis] = dw[k]
+                    self.stencils[at + SLOPES + 3 * k + axis] = dw[k]
             node = node * self.axis + base
             b, crosses = self.block_along(base)
             block = block * self.blocks_per_axis + b
             crossing = crossing + (crosses << axis)
-        self.places[places_at + NODE] = node
-        self.places[places_at + KEY] = block * 8 + crossing
+        self.bases[bases_at + NODE] = node
+        self.bases[bases_at + KEY] = block * 8 + crossing
 
     @ti.func
     def momentum_tile(self, state: ti.template(), source, entry9, at):
         """Value at the base node of the momentum that each particle of a tile scatters."""
-        f = [self.spread[at + OFFSETS + i] for i in range(3)]
+        f = [self.stencils[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
             row = [self.affine[entry9 + 3 * i + j] for j in range(3)]
-            self.spread[at + MOMENTUM_FIELD + i] = at_base(self.mass * state[source + 3 + i], row, f, self.dx)
+            self.stencils[at + MOMENTUM_FIELD + i] = at_base(
+                self.mass * state[source + AT_V + i], row, f, self.dx
+            )
 
     @ti.func
     def adjoint_tile(self, state: ti.template(), source, after, bar: ti.template(), target, at):
         """Value at the base node of what each particle of a tile adds to the velocities' adjoint."""
-        f = [self.spread[at + OFFSETS + i] for i in range(3)]
+        f = [self.stencils[at + OFFSETS + i] for i in range(3)]
         for i in ti.static(range(3)):
-            row = [bar[target + 6 + 3 * i + j] for j in range(3)]
+            row = [bar[target + AT_C + 3 * i + j] for j in range(3)]
             v_bar = self.velocity_adjoint(
-                state[source + i], state[after + 3 + i], bar[target + i], bar[target + 3 + i]
+                state[source + i], state[after + AT_V + i], bar[target + i], bar[target + AT_V + i]
             )
-            self.spread[at + ADJOINT_FIELD + i] = at_base(v_bar, row, f, 4.0 * self.inv_dx)
+            self.stencils[at + ADJOINT_FIELD + i] = at_base(v_bar, row, f, 4.0 * self.inv_dx)
 
     # -- particle by particle -----------------------------------------------------------------------
 
@@ -126,74 +128,78 @@ class TransferTiles(ParticlePhases):
         return [
             ti.Vector(
                 [
-                    self.spread[at + 3 * k][lane],
-                    self.spread[at + 3 * k + 1][lane],
-                    self.spread[at + 3 * k + 2][lane],
+                    self.stencils[at + 3 * k][lane],
+                    self.stencils[at + 3 * k + 1][lane],
+                    self.stencils[at + 3 * k + 2][lane],
                 ]
             )
             for k in range(3)
         ]
 
     @ti.func
-    def own(self, entry, place):
+    def own(self, entry, base_node):
         """An entry, the same, that LLVM takes for a particle's own: with one for the whole tile it would keep
         an address for each of dozens of entries, more than there are registers.
 
-        ``place`` is the base node as it stands in ``places``: not negative, but LLVM must not know.
+        ``base_node`` is the base node as it stands in ``bases``: not negative, but LLVM must not know.
         """
-        return self.bounded(entry + (place >> 31))
+        return self.bounded(entry + (base_node >> 31))
 
     @ti.func
     def base_value(self, at, lane, last):
         """Value of an affine field at a particle's base node, as a 4-vector."""
-        return ti.Vector([self.spread[at][lane], self.spread[at + 1][lane], self.spread[at + 2][lane], last])
+        return ti.Vector(
+            [self.stencils[at][lane], self.stencils[at + 1][lane], self.stencils[at + 2][lane], last]
+        )
 
     @ti.func
-    def scatter_momentum(self, entry9, lane, place, grid_node, at, work_at):
+    def scatter_momentum(self, entry9, lane, base_node, grid_node, at, scratch_at):
         """Add a particle's momentum and mass to its nodes.
 
         Args:
             entry9: Entry of the tile in ``affine``.
             lane: Particle of the tile.
-            place: Its base node, from ``places``.
+            base_node: Its base node, from ``bases``.
             grid_node: Index of the base node in ``momentum``.
-            at: First entry of the thread's share of ``spread``.
-            work_at: First entry of the thread's share of ``work``.
+            at: First entry of the thread's share of ``stencils``.
+            scratch_at: First entry of the thread's share of ``scratch``.
         """
-        a = self.load(self.affine, self.own(entry9, place), lane, 9)
+        a = self.load(self.affine, self.own(entry9, base_node), lane, 9)
         value = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        own_work = self.own(work_at, place)
-        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, own_work)
+        own_scratch = self.own(scratch_at, base_node)
+        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, own_scratch)
 
     @ti.func
-    def scatter_adjoint(self, bar: ti.template(), target, lane, place, grid_node, at, work_at):
+    def scatter_adjoint(self, bar: ti.template(), target, lane, base_node, grid_node, at, scratch_at):
         """Add what a particle contributes to the adjoint of the grid's velocities.
 
         Args:
             bar: Adjoint of the particle state after the substep.
             target: Entry of the tile in it.
             lane: Particle of the tile.
-            place: Its base node, from ``places``.
+            base_node: Its base node, from ``bases``.
             grid_node: Index of the base node in ``velocity_bar``.
-            at: First entry of the thread's share of ``spread``.
-            work_at: First entry of the thread's share of ``work``.
+            at: First entry of the thread's share of ``stencils``.
+            scratch_at: First entry of the thread's share of ``scratch``.
         """
-        c_bar = self.load(bar, target + 6, lane, 9)
+        c_bar = self.load(bar, target + AT_C, lane, 9)
         value = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
-        own_work = self.own(work_at, place)
-        self.scatter_field(self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, own_work)
+        own_scratch = self.own(scratch_at, base_node)
+        self.scatter_field(
+            self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, own_scratch
+        )
 
     @ti.func
     def scatter_field(
-        self, grid: ti.template(), grid_node, value, a: ti.template(), scale, lane, at, work_at
+        self, grid: ti.template(), grid_node, value, a: ti.template(), scale, lane, at, scratch_at
     ):
         """Scatter an affine field: its value at the base node, its increments scale times A's columns."""
         q = [value, column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
         w = self.weights(at + WEIGHTS, lane)
-        scatter(grid, grid_node, self.axis * self.axis, self.axis, w, q, self.work, work_at)
+        scatter(grid, grid_node, self.axis * self.axis, self.axis, w, q, self.scratch, scratch_at)
 
     @ti.func
-    def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, work_at):
+    def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, scratch_at):
         """Grid to particle: v, C and x after the substep.
 
         Args:
@@ -204,18 +210,18 @@ class TransferTiles(ParticlePhases):
             node: Index of the base node in ``velocity``.
             e: Environment.
             time: Substep, noted where the speed is not sane.
-            at: First entry of the thread's share of ``spread``.
-            work_at: First entry of the thread's share of ``work``.
+            at: First entry of the thread's share of ``stencils``.
+            scratch_at: First entry of the thread's share of ``scratch``.
         """
         # A variable: what is passed on as an expression is compiled again wherever it is used.
         w = self.weights(at + WEIGHTS, lane)
-        gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.work, work_at)
-        f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+        gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.scratch, scratch_at)
+        f = [self.stencils[at + OFFSETS + j][lane] for j in range(3)]
         x = self.vector(state, source, lane)
-        m0 = self.work[work_at]
-        mx = self.work[work_at + 1]
-        my = self.work[work_at + 2]
-        mz = self.work[work_at + 3]
+        m0 = self.scratch[scratch_at]
+        mx = self.scratch[scratch_at + 1]
+        my = self.scratch[scratch_at + 2]
+        mz = self.scratch[scratch_at + 3]
         # Everything is read before the first store, after which LLVM has to look up where arrays are again.
         self.put_gathered(state, target, lane, x, f, m0, mx, my, mz, e, time)
 
@@ -231,22 +237,22 @@ class TransferTiles(ParticlePhases):
         lane,
         node,
         at,
-        work_at,
+        scratch_at,
     ):
         """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
         a = self.load(self.affine, entry9, lane, 9)
-        c_bar = self.load(bar, target + 6, lane, 9)
-        self.work[work_at + 7] = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        self.work[work_at + 11] = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
+        c_bar = self.load(bar, target + AT_C, lane, 9)
+        self.scratch[scratch_at + 7] = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
+        self.scratch[scratch_at + 11] = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
         for j in ti.static(range(3)):
-            self.work[work_at + 8 + j] = column(a, j, self.dx)
-            self.work[work_at + 12 + j] = column(c_bar, j, 4.0 * self.inv_dx)
+            self.scratch[scratch_at + 8 + j] = column(a, j, self.dx)
+            self.scratch[scratch_at + 12 + j] = column(c_bar, j, 4.0 * self.inv_dx)
         w = self.weights(at + WEIGHTS, lane)
         dw = self.weights(at + SLOPES, lane)
         for i in ti.static(range(3)):
-            self.work[work_at + 15][i] = w[i][0]
-            self.work[work_at + 16][i] = dw[i][0]
-            self.work[work_at + 17][i] = float(i)
+            self.scratch[scratch_at + 15][i] = w[i][0]
+            self.scratch[scratch_at + 16][i] = dw[i][0]
+            self.scratch[scratch_at + 17][i] = float(i)
         gather_adjoint(
             self.velocity,
             self.momentum_bar,
@@ -255,17 +261,17 @@ class TransferTiles(ParticlePhases):
             self.axis,
             w,
             dw,
-            self.work,
-            work_at,
+            self.scratch,
+            scratch_at,
         )
-        slope = ti.Vector([self.work[work_at + 4 + i].sum() for i in range(3)])
-        f = [self.spread[at + OFFSETS + j][lane] for j in range(3)]
+        slope = ti.Vector([self.scratch[scratch_at + 4 + i].sum() for i in range(3)])
+        f = [self.stencils[at + OFFSETS + j][lane] for j in range(3)]
         x = self.vector(state, source, lane)
-        v_after = self.vector(state, after + 3, lane)
-        m0 = self.work[work_at]
-        mx = self.work[work_at + 1]
-        my = self.work[work_at + 2]
-        mz = self.work[work_at + 3]
+        v_after = self.vector(state, after + AT_V, lane)
+        m0 = self.scratch[scratch_at]
+        mx = self.scratch[scratch_at + 1]
+        my = self.scratch[scratch_at + 2]
+        mz = self.scratch[scratch_at + 3]
         a_bar = self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, f, m0, mx, my, mz, slope)
         for i in ti.static(range(9)):
             self.affine[entry9 + i][lane] = a_bar[i]

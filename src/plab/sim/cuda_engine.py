@@ -268,7 +268,7 @@ class CudaEngine(ThreadPhases):
                 entry = self.tile_entry(slot, e, tile)
                 lane = particle % self.lanes
                 self.add_particle_gradient(state, entry, bar, self.tile_entry(0, e, tile), lane, e)
-        if ti.static(self.spreads):
+        if ti.static(self.beyond_nearest):
             for q in range(self.particle_threads):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):

@@ -28,7 +28,7 @@ from plab.sim.material import (
 from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7, with_unit_rotation
 from plab.sim.shapes import signed_distance
-from plab.sim.storage import FRAME_ADJOINT
+from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
 from plab.sim.transfer import affine_field, spline, spline_slope
 
 __all__ = ["DISTANCE_GROUPS", "CudaPhases"]
@@ -178,29 +178,29 @@ class CudaPhases(OrderPhases, PosePhases):
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)
-        v_after = self.vector(state, after + 3, lane)
+        v_after = self.vector(state, after + AT_V, lane)
         q = self.momentum_field(state, source, a, lane, fx)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
         w = spline(fx)
         dw = spline_slope(fx)
         node = e * self.nodes + self.linear(base)
         m0, mx, my, mz, slope = self.moments_adjoint(self.velocity, self.momentum_bar, node, w, dw, q, h)
-        c_bar = self.load(bar, target + 6, lane, 9)
+        c_bar = self.load(bar, target + AT_C, lane, 9)
         return self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, fx, m0, mx, my, mz, slope)
 
     @ti.func
     def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
         """The affine field of momentum and mass that a particle scatters, given A."""
-        v = self.vector(state, source + 3, lane)
+        v = self.vector(state, source + AT_V, lane)
         return affine_field(self.mass * v, self.mass, a, fx, self.dx)
 
     @ti.func
     def velocity_adjoint_field(self, state: ti.template(), x, after, bar: ti.template(), target, lane, fx):
         """The affine field that the particle's adjoint contributes to the adjoint of the grid velocities."""
-        v = self.vector(state, after + 3, lane)
+        v = self.vector(state, after + AT_V, lane)
         x_bar = self.vector(bar, target, lane)
-        v_bar = self.velocity_adjoint(x, v, x_bar, self.vector(bar, target + 3, lane))
-        c_bar = self.load(bar, target + 6, lane, 9)
+        v_bar = self.velocity_adjoint(x, v, x_bar, self.vector(bar, target + AT_V, lane))
+        c_bar = self.load(bar, target + AT_C, lane, 9)
         return affine_field(v_bar, 0.0, c_bar, fx, 4.0 * self.inv_dx)
 
     # -- material ------------------------------------------------------------------------------------
@@ -210,8 +210,8 @@ class CudaPhases(OrderPhases, PosePhases):
         """:meth:`material_tile` for one particle; returns A, row by row."""
         out = ti.Vector.zero(self.real, 9)
         p = self.parameters_of_particle(e, source, lane)
-        c = self.load(state, source + 6, lane, 9)
-        f = self.load(state, source + 15, lane, 9)
+        c = self.load(state, source + AT_C, lane, 9)
+        f = self.load(state, source + AT_F, lane, 9)
         g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
@@ -225,10 +225,10 @@ class CudaPhases(OrderPhases, PosePhases):
                 if self.flows(k):
                     f_new = flow(d, g, p[2], self.series)
                     for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = f_new[i]
+                        state[target + AT_F + i][lane] = f_new[i]
                 else:
                     for i in ti.static(range(9)):
-                        state[target + 15 + i][lane] = g[i]
+                        state[target + AT_F + i][lane] = g[i]
         else:
             out = self.spectral_material(state, source, target, lane, e, update)
         return out
@@ -239,9 +239,9 @@ class CudaPhases(OrderPhases, PosePhases):
     ):
         """:meth:`material_tile_adjoint` for one particle, given the adjoint of A."""
         p = self.parameters_of_particle(e, source, lane)
-        c = self.load(state, source + 6, lane, 9)
-        f = self.load(state, source + 15, lane, 9)
-        g_bar = self.load(bar, target + 15, lane, 9)
+        c = self.load(state, source + AT_C, lane, 9)
+        f = self.load(state, source + AT_F, lane, 9)
+        g_bar = self.load(bar, target + AT_F, lane, 9)
         g = trial_gradient(c, f, self.dt)
         j = det(g)
         c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
@@ -265,8 +265,8 @@ class CudaPhases(OrderPhases, PosePhases):
             z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
             c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
             for i in ti.static(range(9)):
-                bar[target + 6 + i][lane] = c_out[i] + self.mass * a_bar[i]
-                bar[target + 15 + i][lane] = f_out[i]
+                bar[target + AT_C + i][lane] = c_out[i] + self.mass * a_bar[i]
+                bar[target + AT_F + i][lane] = f_out[i]
         else:
             self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 

@@ -5,6 +5,7 @@ import taichi as ti
 from plab.sim.cuda_phases import CudaPhases
 from plab.sim.cuda_warp import NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
 from plab.sim.grid_phases import MASS_MIN
+from plab.sim.storage import AT_V
 from plab.sim.transfer import spline, widen
 
 __all__ = ["RESIDENT_BLOCK", "ThreadPhases"]
@@ -154,7 +155,7 @@ class ThreadPhases(CudaPhases):
     def particle_terms_thread(self, state: ti.template(), w, entry, e, particle, lane, x, counts):
         """Terms and distances of a particle of a thread's tile; all lanes of a warp take part."""
         if ti.static(len(self.particle_terms) > 0):
-            values = self.particle_measures(e, x, self.vector(state, entry + 3, lane))
+            values = self.particle_measures(e, x, self.vector(state, entry + AT_V, lane))
             for k in ti.static(range(len(self.particle_terms))):
                 share = ti.select(counts, values[k], 0.0)
                 # All lanes of a warp have particles of the same environment.
@@ -198,7 +199,7 @@ class ThreadPhases(CudaPhases):
         for shape, start, stop in ti.static(self.runs):
             if ti.static(self.acts(shape)):
                 for m in range(start, stop):
-                    x_bar, pose_bar = self.spread_gradient(shape, e, m, particle, x)
+                    x_bar, pose_bar = self.distance_gradient(shape, e, m, particle, x)
                     counts = particle < self.particles
                     if counts:
                         for i in ti.static(range(3)):

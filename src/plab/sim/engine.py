@@ -99,12 +99,12 @@ class CpuEngine(CpuPhases):
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
             if contact:
                 self.particle_gradient_chunk(state, slot, bar, e, c)
-            if ti.static(self.spreads):
+            if ti.static(self.beyond_nearest):
                 self.distance_gradient_chunk(state, slot, bar, e, c)
         self.barrier(team, size)
         if rank == 0:
             self.nearest_gradient(state, slot, bar, e)
-            if ti.static(self.spreads):
+            if ti.static(self.beyond_nearest):
                 self.join_pose_gradients(e)
         self.barrier(team, size)
 

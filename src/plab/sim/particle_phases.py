@@ -3,12 +3,8 @@ adjoints."""
 
 import taichi as ti
 
-from plab.sim.spectral import (
-    spectral_parameter_adjoint,
-    spectral_return_map,
-    spectral_return_map_adjoint,
-)
-from plab.sim.storage import BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
+from plab.sim.spectral import spectral_parameter_adjoint, spectral_return_map, spectral_return_map_adjoint
+from plab.sim.storage import AT_C, AT_F, AT_V, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
 
 __all__ = ["ParticlePhases"]
 
@@ -106,10 +102,10 @@ class ParticlePhases(Storage):
         c2 = scale * (mz - fx[2] * m0)
         for i in ti.static(range(3)):
             state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * m0[i], 0.0), self.x_max)
-            state[target + 3 + i][lane] = m0[i]
-            state[target + 6 + 3 * i][lane] = c0[i]
-            state[target + 7 + 3 * i][lane] = c1[i]
-            state[target + 8 + 3 * i][lane] = c2[i]
+            state[target + AT_V + i][lane] = m0[i]
+            state[target + AT_C + 3 * i][lane] = c0[i]
+            state[target + AT_C + 3 * i + 1][lane] = c1[i]
+            state[target + AT_C + 3 * i + 2][lane] = c2[i]
         speed = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
         # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
         if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
@@ -148,7 +144,7 @@ class ParticlePhases(Storage):
                 c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
             ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
             bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
-            bar[target + 3 + i][lane] = self.mass * m0[i]
+            bar[target + AT_V + i][lane] = self.mass * m0[i]
             a_bar[3 * i] = self.dx * (mx[i] - fx[0] * m0[i])
             a_bar[3 * i + 1] = self.dx * (my[i] - fx[1] * m0[i])
             a_bar[3 * i + 2] = self.dx * (mz[i] - fx[2] * m0[i])
@@ -225,13 +221,13 @@ class ParticlePhases(Storage):
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.parameters_of_particle(e, source, lane)
-        c = as_matrix(self.load(state, source + 6, lane, 9))
-        f = as_matrix(self.load(state, source + 15, lane, 9))
+        c = as_matrix(self.load(state, source + AT_C, lane, 9))
+        f = as_matrix(self.load(state, source + AT_F, lane, 9))
         f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
         out = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(9)):
             if ti.static(update):
-                state[target + 15 + i][lane] = f_new[i // 3, i % 3]
+                state[target + AT_F + i][lane] = f_new[i // 3, i % 3]
             out[i] = self.stress_scale * tau[i // 3, i % 3] + self.mass * c[i // 3, i % 3]
         return out
 
@@ -249,9 +245,9 @@ class ParticlePhases(Storage):
     ):
         """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
         p = self.parameters_of_particle(e, source, lane)
-        c = as_matrix(self.load(state, source + 6, lane, 9))
-        f = as_matrix(self.load(state, source + 15, lane, 9))
-        f_new_bar = as_matrix(self.load(bar, target + 15, lane, 9))
+        c = as_matrix(self.load(state, source + AT_C, lane, 9))
+        f = as_matrix(self.load(state, source + AT_F, lane, 9))
+        f_new_bar = as_matrix(self.load(bar, target + AT_F, lane, 9))
         a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
@@ -266,8 +262,8 @@ class ParticlePhases(Storage):
         c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
         f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
         for i in ti.static(range(9)):
-            bar[target + 6 + i][lane] = c_bar[i // 3, i % 3]
-            bar[target + 15 + i][lane] = f_bar[i // 3, i % 3]
+            bar[target + AT_C + i][lane] = c_bar[i // 3, i % 3]
+            bar[target + AT_F + i][lane] = f_bar[i // 3, i % 3]
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 

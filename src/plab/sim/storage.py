@@ -28,22 +28,30 @@ from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.skips import Skips
 
 __all__ = [
+    "AT_C",
+    "AT_F",
+    "AT_V",
+    "BASES",
     "BLOCK",
     "BLOCK_BITS",
     "CHUNKS",
     "FRAME_ADJOINT",
     "INDEX_MASK",
-    "PLACES",
-    "SPREAD",
-    "STAGE",
+    "SCRATCH",
     "STATE",
     "STATE_MASK",
-    "WORK",
+    "STENCILS",
+    "STRAINS",
     "Storage",
 ]
 
 STATE = 24
-"""Entries per particle: x (3), v (3), C (9), F (9)."""
+"""Entries per particle: x (3), v (3), C (9), F (9); the same of a state's adjoint."""
+
+AT_V = 3
+AT_C = 6
+AT_F = 15
+"""Where v, C and F begin; x is first."""
 
 BLOCK_BITS = 2
 BLOCK = 1 << BLOCK_BITS
@@ -66,16 +74,16 @@ INDEX_MASK = 2**30 - 1
 # What follows are strides of the threads' working areas, which keep apart what two threads write: a cache
 # line that both of them use costs more than the work itself.
 
-WORK = 32
+SCRATCH = 32
 """4-vectors per chunk of particles for the transfers of one particle; 18 are used."""
 
-SPREAD = 32
+STENCILS = 32
 """Lane vectors per chunk for weights and affine fields of one tile; 27 are used."""
 
-PLACES = 8
-"""Lane vectors of integers per chunk for where one tile's particles are; 2 are used."""
+BASES = 8
+"""Lane vectors of integers per chunk for the base nodes of one tile; 2 are used."""
 
-STAGE = 56
+STRAINS = 56
 """Lane vectors per chunk for the intermediate results of one tile's material update; 49 are used."""
 
 LANES = {"cpu": 8, "cuda": 32}

@@ -18,7 +18,7 @@ import taichi as ti
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
 from plab.sim.shapes import gap_slope, signed_distance
-from plab.sim.storage import Storage
+from plab.sim.storage import AT_V, Storage
 from plab.sim.transfer import spline, spline_slope
 
 __all__ = ["EXTRA_MEASURES", "TermPhases"]
@@ -209,13 +209,13 @@ class TermPhases(Storage):
     def add_particle_gradient(self, state: ti.template(), entry, bar: ti.template(), target, lane, e):
         """Add the gradient of the terms of nodes and particles to a particle's adjoint."""
         x = self.vector(state, entry, lane)
-        v = self.vector(state, entry + 3, lane)
+        v = self.vector(state, entry + AT_V, lane)
         base, fx = self.stencil(x)
         x_bar, v_bar = self.particle_gradient(e, base, fx, x, v)
         for i in ti.static(range(3)):
             bar[target + i][lane] = bar[target + i][lane] + x_bar[i]
             if ti.static(len(self.particle_terms) > 0):
-                bar[target + 3 + i][lane] = bar[target + 3 + i][lane] + v_bar[i]
+                bar[target + AT_V + i][lane] = bar[target + AT_V + i][lane] + v_bar[i]
 
     # -- terms of distances -------------------------------------------------------------------------
 
@@ -288,7 +288,7 @@ class TermPhases(Storage):
                             self.pose_bar[e, m] += pose_bar
 
     @ti.func
-    def spread_gradient(self, shape: ti.template(), e, m, particle, x):
+    def distance_gradient(self, shape: ti.template(), e, m, particle, x):
         """Adjoints of a particle's position and a manipulator's pose under terms that look at all
         particles."""
         x_bar = x * 0.0
@@ -306,7 +306,7 @@ class TermPhases(Storage):
         return MANIPULATOR_SHAPES[shape].moves
 
     @property
-    def spreads(self) -> bool:
+    def beyond_nearest(self) -> bool:
         """Whether a term of distances has a gradient for more than the nearest particle."""
         return any(not term.nearest_only for _k, _column, term in self.distance_terms)
 

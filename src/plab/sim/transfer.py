@@ -75,7 +75,14 @@ def affine_field(value, last, a: ti.template(), f, scale):
 
 @ti.func
 def scatter(
-    grid: ti.template(), node, stride_x, stride_y, w: ti.template(), q: ti.template(), work: ti.template(), at
+    grid: ti.template(),
+    node,
+    stride_x,
+    stride_y,
+    w: ti.template(),
+    q: ti.template(),
+    scratch: ti.template(),
+    at,
 ):
     """Add an affine field of 4-vectors, weighted, to a particle's stencil.
 
@@ -86,17 +93,17 @@ def scatter(
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
         q: The field's value at the base node, and its increments along x, y and z.
-        work: Field of 4-vectors for intermediate results.
+        scratch: Field of 4-vectors for intermediate results.
         at: First of nine entries.
     """
     # Weighted along z, node by node: the values at the base node, and increments along x and y.
     for k in ti.static(range(3)):
-        work[at + k] = w[k][2] * (q[0] + float(k) * q[3])
-        work[at + 3 + k] = w[k][2] * q[1]
-        work[at + 6 + k] = w[k][2] * q[2]
-    x0 = work[at]
-    x1 = work[at + 1]
-    x2 = work[at + 2]
+        scratch[at + k] = w[k][2] * (q[0] + float(k) * q[3])
+        scratch[at + 3 + k] = w[k][2] * q[1]
+        scratch[at + 6 + k] = w[k][2] * q[2]
+    x0 = scratch[at]
+    x1 = scratch[at + 1]
+    x2 = scratch[at + 2]
     for i in ti.static(range(3)):
         y0 = x0
         y1 = x1
@@ -108,17 +115,17 @@ def scatter(
             grid[row + 1] = grid[row + 1] + wij * y1
             grid[row + 2] = grid[row + 2] + wij * y2
             if ti.static(j < 2):
-                y0 += work[at + 6]
-                y1 += work[at + 7]
-                y2 += work[at + 8]
+                y0 += scratch[at + 6]
+                y1 += scratch[at + 7]
+                y2 += scratch[at + 8]
         if ti.static(i < 2):
-            x0 += work[at + 3]
-            x1 += work[at + 4]
-            x2 += work[at + 5]
+            x0 += scratch[at + 3]
+            x1 += scratch[at + 4]
+            x2 += scratch[at + 5]
 
 
 @ti.func
-def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work: ti.template(), at):
+def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), scratch: ti.template(), at):
     """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil.
 
     Args:
@@ -127,7 +134,7 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work
         stride_x: Index distance of neighbours along x.
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
-        work: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only
+        scratch: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only
             that.
         at: First entry of the result: sum of w g, then of w g times the node's offset (0, 1, 2) along x, y
             and z.
@@ -154,18 +161,18 @@ def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), work
         t12 = t1 + t2
         r0 += t12
         if ti.static(i == 0):
-            work[at] = w[i][0] * r0
-            work[at + 2] = w[i][0] * (t12 + t2)
-            work[at + 3] = w[i][0] * rz
+            scratch[at] = w[i][0] * r0
+            scratch[at + 2] = w[i][0] * (t12 + t2)
+            scratch[at + 3] = w[i][0] * rz
         else:
             r = w[i][0] * r0
-            work[at] = work[at] + r
+            scratch[at] = scratch[at] + r
             if ti.static(i == 1):
-                work[at + 1] = r
+                scratch[at + 1] = r
             else:
-                work[at + 1] = work[at + 1] + (r + r)
-            work[at + 2] = work[at + 2] + w[i][0] * (t12 + t2)
-            work[at + 3] = work[at + 3] + w[i][0] * rz
+                scratch[at + 1] = scratch[at + 1] + (r + r)
+            scratch[at + 2] = scratch[at + 2] + w[i][0] * (t12 + t2)
+            scratch[at + 3] = scratch[at + 3] + w[i][0] * rz
 
 
 @ti.func
@@ -177,7 +184,7 @@ def gather_adjoint(
     stride_y,
     w: ti.template(),
     dw: ti.template(),
-    work: ti.template(),
+    scratch: ti.template(),
     at,
 ):
     """What a particle's adjoint needs of the grid, in one pass over its stencil.
@@ -190,22 +197,22 @@ def gather_adjoint(
         stride_y: Index distance of neighbours along y.
         w: :func:`spline` weights.
         dw: :func:`spline_slope`.
-        work: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at the base
+        scratch: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at base
             node and increments along x, y, z, with the mass at the end) and that of the velocity's adjoint
             h, likewise, with 0 at the end. On return, from ``at``: moments of momentum_bar as in
             :func:`gather`, then the sum over nodes of grad_f w (momentum_bar . q + velocity . h) as three
             4-vectors, still to be summed over their entries. Entries 15 to 17 hold the weights along x,
             their slopes and the offsets 0, 1, 2.
-        at: First entry in ``work``.
+        at: First entry in ``scratch``.
     """
     zero = velocity[node] * 0.0
     for i in ti.static(range(7)):
-        work[at + i] = zero
+        scratch[at + i] = zero
     # A loop at run time: unrolled threefold, this is most of the compile time of the gradient.
     for i in range(3):
-        wx = work[at + 15][i]
-        dwx = work[at + 16][i]
-        offset = work[at + 17][i]
+        wx = scratch[at + 15][i]
+        dwx = scratch[at + 16][i]
+        offset = scratch[at + 17][i]
         r0 = zero
         ry = zero
         rz = zero
@@ -214,16 +221,16 @@ def gather_adjoint(
         cz = zero
         for j in ti.static(range(3)):
             row = node + i * stride_x + j * stride_y
-            qj = work[at + 7] + offset * work[at + 8] + float(j) * work[at + 9]
-            hj = work[at + 11] + offset * work[at + 12] + float(j) * work[at + 13]
+            qj = scratch[at + 7] + offset * scratch[at + 8] + float(j) * scratch[at + 9]
+            hj = scratch[at + 11] + offset * scratch[at + 12] + float(j) * scratch[at + 13]
             s0 = zero
             s1 = zero
             t0 = zero
             t1 = zero
             for k in ti.static(range(3)):
                 p = momentum_bar[row + k]
-                chi = p * (qj + float(k) * work[at + 10]) + velocity[row + k] * (
-                    hj + float(k) * work[at + 14]
+                chi = p * (qj + float(k) * scratch[at + 10]) + velocity[row + k] * (
+                    hj + float(k) * scratch[at + 14]
                 )
                 t0 += w[k][2] * chi
                 t1 += dw[k][2] * chi
@@ -238,10 +245,10 @@ def gather_adjoint(
             rz += w[j][1] * s1
             if ti.static(j > 0):
                 ry += (float(j) * w[j][1]) * s0
-        work[at] = work[at] + wx * r0
-        work[at + 1] = work[at + 1] + (offset * wx) * r0
-        work[at + 2] = work[at + 2] + wx * ry
-        work[at + 3] = work[at + 3] + wx * rz
-        work[at + 4] = work[at + 4] + dwx * c0
-        work[at + 5] = work[at + 5] + wx * cy
-        work[at + 6] = work[at + 6] + wx * cz
+        scratch[at] = scratch[at] + wx * r0
+        scratch[at + 1] = scratch[at + 1] + (offset * wx) * r0
+        scratch[at + 2] = scratch[at + 2] + wx * ry
+        scratch[at + 3] = scratch[at + 3] + wx * rz
+        scratch[at + 4] = scratch[at + 4] + dwx * c0
+        scratch[at + 5] = scratch[at + 5] + wx * cy
+        scratch[at + 6] = scratch[at + 6] + wx * cz

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from plab.config import RlConfig
+from plab.envs.tensors import TensorEnv
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
 from plab.runners.population.agents import Agents
 from plab.runners.rl_models import Spaces, cycle_steps, total_steps
-from plab.torch import TensorEnv
 
 if TYPE_CHECKING:
     from plab.config import Config

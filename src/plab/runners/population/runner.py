@@ -17,6 +17,7 @@ import torch
 
 from plab.config import OffPolicyConfig, RlConfig
 from plab.envs.core import spaces
+from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
@@ -29,7 +30,6 @@ from plab.runners.population.replay import Sizes, require_file
 from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import Spaces, total_steps
 from plab.runners.runner import Runner, Step, Track
-from plab.torch import TensorEnv
 
 __all__ = ["PopulationRunner"]
 

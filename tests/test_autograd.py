@@ -10,14 +10,15 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 
+from plab.autograd import policy_gradient, rollout
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import BUDGETS, RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
-from plab.torch import TensorEnv, policy_gradient, rollout
 from same_runs import assert_same_numbers, stopped_at
 
 pytestmark = pytest.mark.physics

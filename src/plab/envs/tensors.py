@@ -1,0 +1,63 @@
+"""A batch of episodes with tensors in and out, for loops of your own in PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from plab.envs.core import EpisodeBatch, Transition
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = ["TensorEnv"]
+
+
+class TensorEnv:
+    """A batch of episodes, all in the same step, with tensors in and out.
+
+    On CUDA the tensors are on the simulator's device, and nothing but the actions' check and the simulator's
+    fault flags passes through the host.
+
+    Attributes:
+        batch: The environments; spaces, horizon and problem are theirs.
+        device: Where the tensors are.
+    """
+
+    def __init__(self, cfgs: Sequence[Config], *, contact: str = "hard") -> None:
+        """Build everything; arguments and errors as for :class:`plab.envs.core.EpisodeBatch`."""
+        self.batch = EpisodeBatch(cfgs, contact=contact)
+        self.device = torch.device(self.batch.problem.simulator.device)
+        self._like = torch.empty(0, device=self.device)
+
+    def reset(self) -> torch.Tensor:
+        """Put all environments into their initial states; returns observations, shape [batch, entry]."""
+        observation, _info = self.batch.reset(self._like)
+        return torch.as_tensor(observation)
+
+    def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
+        """Advance all environments by one step.
+
+        Args:
+            actions: Actions, shape [batch, action]; clipped to [-1, 1].
+            strict: Whether an environment that breaks off is an error; see
+                :meth:`plab.envs.core.EpisodeBatch.step`.
+
+        Returns:
+            Tensors; observations are float32, the others have the type of the actions.
+
+        Raises:
+            ValueError: If the shape is wrong or an action is not finite.
+            gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
+            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
+        """
+        actions = actions.detach().to(self.device)
+        if self.device.type == "cuda":
+            return self.batch.step(actions, strict=strict)
+        done = self.batch.step(actions.double().numpy(), strict=strict)
+        info = {name: torch.as_tensor(values).to(actions) for name, values in done.info.items()}
+        reward = torch.as_tensor(done.reward).to(actions)
+        return replace(done, observation=torch.as_tensor(done.observation), reward=reward, info=info)
