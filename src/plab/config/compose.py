@@ -387,8 +387,8 @@ def _choose_profile(method: DictConfig) -> None:
 
 
 def _choose_by_task(method: DictConfig) -> None:
-    """Put learning rate, contact weight and limit of the gradient where they are referred to, and forget those
-    of other tasks and numbers."""
+    """Put learning rate, contact weight and limit of the norm where they are referred to, and forget those of
+    other tasks and numbers."""
     if "lr_by_task" in method:
         OmegaConf.resolve(method)
         method.lr_by_task = method.contact_by_task = method.max_gradient_norm_by_numbers = {}

@@ -305,7 +305,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     def tally_distances(self, e, c, particle, x):
         """Add a particle of a chunk to the tallies of its distances."""
         if ti.static(len(self.distance_terms) > 0):
-            for shape, start, stop in ti.static(self.runs):
+            for shape, start, stop in ti.static(self.shape_ranges):
                 if ti.static(self.moves(shape)):
                     for m in range(start, stop):
                         d = self.end_distance(shape, e, m, x)
@@ -352,7 +352,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             entry = self.tile_entry(0, e, tile)
             for lane in range(self.lanes_of(tile)):
                 x = self.vector(state, source, lane)
-                for shape, start, stop in ti.static(self.runs):
+                for shape, start, stop in ti.static(self.shape_ranges):
                     if ti.static(self.acts(shape)):
                         for m in range(start, stop):
                             x_bar, pose_bar = self.distance_gradient(shape, e, m, tile * self.lanes + lane, x)

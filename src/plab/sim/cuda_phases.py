@@ -285,7 +285,7 @@ class CudaPhases(OrderPhases, PosePhases):
         mask = 0
         if ti.static(not self.skips.far_manipulators):
             mask = ti.static((1 << self.manipulators) - 1)
-        for shape, start, stop in ti.static(self.runs):
+        for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
@@ -353,7 +353,7 @@ class CudaPhases(OrderPhases, PosePhases):
     @ti.func
     def note_distances(self, e, particle, x):
         """Write one particle's distances from the moving manipulators."""
-        for shape, start, stop in ti.static(self.runs):
+        for shape, start, stop in ti.static(self.shape_ranges):
             if ti.static(self.moves(shape)):
                 for m in range(start, stop):
                     at = (e * self.manipulators + m) * (self.tiles * self.lanes) + particle

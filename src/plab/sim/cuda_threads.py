@@ -196,7 +196,7 @@ class ThreadPhases(CudaPhases):
         lane = particle % self.lanes
         x = self.vector(state, self.tile_entry(slot, e, tile), lane)
         entry = self.tile_entry(0, e, tile)
-        for shape, start, stop in ti.static(self.runs):
+        for shape, start, stop in ti.static(self.shape_ranges):
             if ti.static(self.acts(shape)):
                 for m in range(start, stop):
                     x_bar, pose_bar = self.distance_gradient(shape, e, m, particle, x)

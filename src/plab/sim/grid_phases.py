@@ -72,7 +72,7 @@ class GridPhases(Storage):
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
         if alpha > 0.0:
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
-        for shape, start, stop in ti.static(self.runs):
+        for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 p = self.into_frame(shape, e, s, m, centre - self.frame_centre[e, s, m])
                 d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
@@ -281,7 +281,7 @@ class GridPhases(Storage):
     def after_manipulators(self, e, s, x, v, near, count):
         """Velocity of a node after contact with the first ``count`` manipulators, where they are near."""
         out = v
-        for shape, start, stop in ti.static(self.runs):
+        for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, ti.min(stop, count)):
                 if near & (1 << m):
                     out = self.contact(shape, e, s, m, x, out)
@@ -318,7 +318,7 @@ class GridPhases(Storage):
             v_out = self.walls(i, v, friction)
             v_bar = self.walls_adjoint(i, v, friction, bar)
             if near != 0:
-                for shape, start, stop in ti.static(tuple(reversed(self.runs))):
+                for shape, start, stop in ti.static(tuple(reversed(self.shape_ranges))):
                     for back in range(stop - start):
                         m = stop - 1 - back
                         if near & (1 << m):

@@ -163,13 +163,13 @@ class Storage:
         self.action_dims = tuple(dims)
         self.actions_per_step = sum(dims)
         # Consecutive manipulators of one shape share one loop, hence one compiled body.
-        runs: list[tuple[str, int, int]] = []
+        ranges: list[tuple[str, int, int]] = []
         for number, shape in enumerate(self.shapes):
-            if runs and runs[-1][0] == shape:
-                runs[-1] = (shape, runs[-1][1], number + 1)
+            if ranges and ranges[-1][0] == shape:
+                ranges[-1] = (shape, ranges[-1][1], number + 1)
             else:
-                runs.append((shape, number, number + 1))
-        self.runs = tuple(runs)
+                ranges.append((shape, number, number + 1))
+        self.shape_ranges = tuple(ranges)
 
     def moves(self, shape: str) -> bool:
         """Whether manipulators of this shape can move; decided while compiling, as what follows."""

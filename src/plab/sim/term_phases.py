@@ -274,7 +274,7 @@ class TermPhases(Storage):
         """Add the gradient of terms that look at the nearest particle alone to its adjoint and the poses'."""
         for k, _column, term in ti.static(self.distance_terms):
             if ti.static(term.nearest_only):
-                for shape, start, stop in ti.static(self.runs):
+                for shape, start, stop in ti.static(self.shape_ranges):
                     if ti.static(self.acts(shape)):
                         for m in range(start, stop):
                             particle = ti.cast(self.tally[k, e, m][1], ti.i32)
