@@ -622,7 +622,7 @@ def test_folders_archives_and_example_are_taken_in_the_same_way(folder: Path, ca
     assert status(["example", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["runs"]) > 0
     assert main(["check", "targets"]) == 0
-    assert capsys.readouterr().out == "445 run(s) checked, all well\n"
+    assert capsys.readouterr().out == "450 run(s) checked, all well\n"
 
 
 def test_several_sources_are_taken_in_the_same_way(tmp_path: Path, capsys) -> None:
