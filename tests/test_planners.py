@@ -387,6 +387,42 @@ def test_contact_starts_reach_the_body(task: str) -> None:
     assert distance.max() < 0.03
 
 
+def solid(target: np.ndarray, center: np.ndarray, half: float, mass: float) -> None:
+    """Spread a mass over the nodes of a cube."""
+    low, high = np.ceil((center - half) * 64).astype(int), np.floor((center + half) * 64).astype(int) + 1
+    target[low[0] : high[0], low[1] : high[1], low[2] : high[2]] += mass / np.prod(high - low)
+
+
+def carried(task: str, variant: str, target: np.ndarray, scale: float) -> np.ndarray:
+    """Ways of two spheres that hold a body between them, in the mean: what they press cancels; [body, 3]."""
+    scene = build_scene(load_config([f"task={task}", f"variant={variant}"]))
+    carry = ContactStarts(scene, target).draw(2, seed=0)[1]
+    return carry.reshape(len(carry), -1, 2, 3).sum(axis=0).mean(axis=1) * scale
+
+
+def test_what_no_manipulator_is_near_to_stays() -> None:
+    """On Assembly ways of points are shortest if the block goes up and the ball takes its place."""
+    target = np.zeros((64, 64, 64))
+    solid(target, np.array([0.6, 0.08, 0.5]), 0.08, 0.6)
+    solid(target, np.array([0.6, 0.21, 0.5]), 0.05, 0.4)
+    np.testing.assert_allclose(carried("Assembly", "1", target, 0.009), [[0.3, 0.15, 0.0]], atol=0.02)
+
+
+@pytest.mark.parametrize("variant", "12345")
+def test_each_body_is_carried_whole_to_a_place_of_its_own(variant: str) -> None:
+    """On TripleMove some ways of points are shortest from two boxes to one place."""
+    cfg = load_config(["task=TripleMove", f"variant={variant}"])
+    target = np.zeros((64, 64, 64))
+    goals = np.array([body["center"] for body in cfg.task.target["bodies"].values()])
+    for goal in goals:
+        solid(target, goal, 0.05, 1.0)
+    reached = np.array([body.center for body in build_scene(cfg).bodies])
+    reached += carried("TripleMove", variant, target, 0.01)
+    chosen = np.linalg.norm(reached[:, None] - goals[None], axis=2).argmin(axis=1)
+    assert sorted(chosen) == [0, 1, 2]
+    np.testing.assert_allclose(reached, goals[chosen], atol=0.015)
+
+
 def test_starts_follow_their_seed_and_reach_by_shape() -> None:
     cfg = load_config(["task=Rope", "sim.particles_scale=0.05"])
     scene, target = build_scene(cfg), np.zeros((64, 64, 64))

@@ -2,8 +2,9 @@
 
 Some points of the body are assigned to as many of the target so that the ways are shortest in all (optimal
 transport). A start either pushes, each manipulator behind one of the points and along its way, or carries:
-each manipulator goes to the body nearest to it, presses, and takes the body's mean way. Of the target nothing
-is known but its mass tensor. Ways are straight: what stands in between is met earlier.
+each manipulator goes to the body nearest to it, presses, and takes the body's middle way. Of the target
+nothing is known but its mass tensor. Ways are straight, so that what stands in between is met earlier; where
+there are several bodies, some lead over it. Bodies that no manipulator is near to are taken to stay.
 """
 
 from __future__ import annotations
@@ -24,11 +25,20 @@ __all__ = ["ContactStarts", "support"]
 POINTS = 256
 """Points of the body, and of the target."""
 
+ALIGNMENTS = 10
+"""Assignments of several bodies, each after moving them by their middle ways; the last change nothing."""
+
 TUBE = 0.04
 """Half width of what a manipulator is taken to meet on its way [domain units]."""
 
 PRESS = (0.0, 0.03)
 """Range of how far manipulators press into a body before they carry it [domain units]."""
+
+ARCH = (0.0, 0.15)
+"""Range of how far half of the ways of what is carried go up first, and down again [domain units]."""
+
+LEFT_ALONE = 100.0
+"""Points of a body that no manipulator is near to cost so many times their squared way."""
 
 OVERSHOOT = (0.5, 1.5)
 """Range of how far they push, in ways of the point that they push."""
@@ -78,25 +88,33 @@ class ContactStarts:
     @cached_property
     def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points of the bodies, shape [point, 3], their ways, likewise, and the numbers of their bodies."""
-        rng, scene = np.random.default_rng(0), self._scene
+        scene = self._scene
         body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
-        chosen = rng.choice(len(body), min(POINTS, len(body)), replace=False)
-        points = sample_particles(scene)[chosen]
-        mass = np.maximum(self._target, 0.0).ravel()
-        nodes = rng.choice(mass.size, len(points), p=mass / mass.sum())
+        # Evenly over particles and mass, so that each body and each part of the target has its share.
+        chosen = np.linspace(0, len(body), min(POINTS, len(body)), endpoint=False, dtype=int)
+        points, body = sample_particles(scene)[chosen], body[chosen]
+        mass = np.maximum(self._target, 0.0).ravel().cumsum()
+        nodes = np.searchsorted(mass, (np.arange(len(points)) + 0.5) / len(points) * mass[-1])
         goals = np.stack(np.unravel_index(nodes, self._target.shape), axis=1) * scene.dx
-        _, assigned = linear_sum_assignment(cdist(points, goals, "sqeuclidean"))
-        return points, goals[assigned] - points, body[chosen]
+        moved = np.zeros_like(points)
+        held = {self._owner(tool) for tool in self._tools}
+        weight = np.where(np.isin(body, list(held)), 1.0, LEFT_ALONE)[:, None]
+        for _ in range(ALIGNMENTS if len(scene.bodies) > 1 else 1):
+            _, assigned = linear_sum_assignment(weight * cdist(points + moved, goals, "sqeuclidean"))
+            ways = goals[assigned] - points
+            # Bodies stay whole: the next assignment is of what each one's middle way leaves over.
+            moved = _middle_ways(ways, body)[body]
+        return points, ways, body
 
     def _push(self, rng: np.random.Generator) -> np.ndarray:
-        points, ways, _ = self._transport
+        points, ways, body = self._transport
         lengths = np.linalg.norm(ways, axis=1)
         tracks = []
         for tool in self._tools:
             k = rng.choice(len(points), p=lengths**2 / (lengths**2).sum())
             direction = ways[k] / lengths[k]
             track = Track(tool)
-            track.go(_action(tool, self._to_touch(tool, points[k], direction)))
+            track.go(_action(tool, self._to_touch(tool, points[body == body[k]], points[k], direction)))
             left = max(1, int((self._scene.horizon - len(track)) * rng.uniform(0.5, 1.0)))
             track.go(_action(tool, rng.uniform(*OVERSHOOT) * ways[k]), left)
             tracks.append(track)
@@ -104,29 +122,39 @@ class ContactStarts:
 
     def _carry(self, rng: np.random.Generator) -> np.ndarray:
         points, ways, body = self._transport
-        centres = np.stack([points[body == b].mean(0) for b in np.unique(body)])
-        means = np.stack([ways[body == b].mean(0) for b in np.unique(body)])
-        press, tracks, owners = rng.uniform(*PRESS), [], []
+        middle = _middle_ways(ways, body)
+        press, tracks = rng.uniform(*PRESS), []
         for tool in self._tools:
-            offsets = centres - np.asarray(tool.position)
-            owner = int(np.linalg.norm(offsets, axis=1).argmin())
+            own = points[body == self._owner(tool)]
             track = Track(tool)
             if not MANIPULATOR_SHAPES[tool.shape].grips:
-                direction = offsets[owner] / np.linalg.norm(offsets[owner])
-                way = self._to_touch(tool, centres[owner], direction) + press * direction
-                track.go(_action(tool, way))
+                offset = own.mean(0) - np.asarray(tool.position)
+                direction = offset / np.linalg.norm(offset)
+                track.go(_action(tool, self._to_touch(tool, own, own.mean(0), direction) + press * direction))
             tracks.append(track)
-            owners.append(owner)
         together = max(map(len, tracks))
-        for track, tool, owner in zip(tracks, self._tools, owners, strict=True):
+        # Those that hold a body between them must keep pace.
+        left = max(2, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
+        # Over other bodies, every other time.
+        rise = rng.uniform(*ARCH) if len(self._scene.bodies) > 1 and rng.integers(2) else 0.0
+        arch = np.array([0.0, rise, 0.0])
+        for track, tool in zip(tracks, self._tools, strict=True):
+            half = middle[self._owner(tool)] / 2
             track.wait(together)
-            left = max(1, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
-            track.go(_action(tool, means[owner]), left)
+            track.go(_action(tool, half + arch), left // 2)
+            track.go(_action(tool, half - arch), left - left // 2)
         return self._actions(tracks)
 
-    def _to_touch(self, tool: Manipulator, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the way to where a manipulator meets the body on its way to a point in a direction."""
-        points, _, _ = self._transport
+    def _owner(self, tool: Manipulator) -> int:
+        """Return the number of the body nearest to a manipulator, by the bodies' centres."""
+        centres = np.array([body.center for body in self._scene.bodies])
+        return int(np.linalg.norm(centres - np.asarray(tool.position), axis=1).argmin())
+
+    def _to_touch(
+        self, tool: Manipulator, points: np.ndarray, point: np.ndarray, direction: np.ndarray
+    ) -> np.ndarray:
+        """Return the way to where a manipulator meets a body, given by points, on its way to one of them in a
+        direction."""
         along = (points - point) @ direction
         aside = np.linalg.norm(points - point - along[:, None] * direction, axis=1)
         met = point + along[aside < TUBE].min(initial=0.0) * direction
@@ -135,6 +163,11 @@ class ContactStarts:
 
     def _actions(self, tracks: Sequence[Track]) -> np.ndarray:
         return np.concatenate([track.first(self._scene.horizon) for track in tracks], axis=1)
+
+
+def _middle_ways(ways: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Return the way of each body, shape [body, 3]: medians, as some of its points may be sent elsewhere."""
+    return np.stack([np.median(ways[body == b], axis=0) for b in np.unique(body)])
 
 
 def _rotation(tool: Manipulator) -> Rotation:
