@@ -244,6 +244,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool =
         _reject_unknown(composed, "")
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
+        _require_tables(composed.method)
         _require_effect(composed, overrides, alone)
         _choose_profile(composed.method)
         _choose_by_task(composed.method)
@@ -344,13 +345,25 @@ def _typed_method(method: DictConfig) -> DictConfig:
     return method
 
 
+_BY_TASK = {"lr_by_task": "numbers", "contact_by_task": "contact"}
+"""Tables of a method that hold values by a choice of the protocol, and task."""
+
+
+def _require_tables(method: DictConfig) -> None:
+    """Refuse a value where those of the tasks belong."""
+    for section in _BY_TASK:
+        for choice, tasks in method.get(section, {}).items():
+            if not isinstance(tasks, DictConfig):
+                raise ConfigError(f"method.{section}.{choice} must be a table of tasks, not {tasks}")
+
+
 def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool) -> None:
     """Refuse overrides of what goes with another variant, profile or task than the chosen ones."""
     task, method, variant = composed.task, composed.method, composed.variant
     used: dict[str, tuple[str, str | None]] = {}
     if alone:
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
-        for section, key in ("lr_by_task", "numbers"), ("contact_by_task", "contact"):
+        for section, key in _BY_TASK.items():
             chosen = composed.protocol[key]
             used[f"method.{section}."] = f"protocol.{key}={chosen}", chosen
             tasks = method.get(section, {}).get(chosen, {})
