@@ -51,7 +51,14 @@ PYTHON = {
     "environments": (
         "Environments",
         "",
-        ("plab.envs.single", "plab.envs.vector", "plab.envs.sb3", "plab.envs.tensors", "plab.envs", "plab.submissions.recording"),
+        (
+            "plab.envs.single",
+            "plab.envs.vector",
+            "plab.envs.sb3",
+            "plab.envs.tensors",
+            "plab.envs",
+            "plab.submissions.recording",
+        ),
     ),
     "results": (
         "Results",
