@@ -121,7 +121,7 @@ def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult],
     result = finished[method]
     policy = load_policy(result.path)
     last = result.iterations.iloc[-1]
-    (batch,) = shared_batches(CACHE, make_config(result.path.parents[2], method), (1, "hard"))
+    (batch,) = shared_batches(CACHE, ([make_config(result.path.parents[2], method)], 1, "hard"))
     done = policy_episode(batch, policy)
     assert {name: done.measures[name] for name in COLUMNS} == {name: last[name] for name in COLUMNS}
 
@@ -196,7 +196,7 @@ def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
 
 
 def trainer_of(cfg: Config, folder: Path) -> Trainer:
-    batch, _ = shared_batches(CACHE, cfg, (cfg.method.num_envs, "hard"), (1, "hard"))
+    batch, _ = shared_batches(CACHE, ([cfg], cfg.method.num_envs, "hard"), ([cfg], 1, "hard"))
     return Trainer(cfg, batch, folder / "replay", None)
 
 

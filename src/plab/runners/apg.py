@@ -33,7 +33,7 @@ class ApgRunner(Runner):
 
     def build(self) -> None:
         """Make the environment."""
-        (self._episode,) = shared_batches(self.cache, self.tracks[0].cfg, (1, self._method.contact))
+        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], 1, self._method.contact))
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:

@@ -122,27 +122,31 @@ def environment_key(cfg: Config) -> str:
     return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles])
 
 
-def shared_batches(cache: SimulatorCache, cfg: Config, *kinds: tuple[int, str]) -> list[EpisodeBatch]:
-    """Return environments of a configuration, those kept from the last run if they fit.
+def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
+    """Return batches of environments, those kept from the last run if they fit.
 
     Args:
         cache: Simulators of earlier runs.
-        cfg: The configuration.
-        kinds: Number of environments and contact model of each batch.
+        kinds: Of each batch: configurations, which environments have in turn; number of environments; contact
+            model.
 
     Returns:
         One batch per kind, in its initial state.
     """
 
     def build() -> list[EpisodeBatch]:
-        return [EpisodeBatch([cfg] * size, contact=contact) for size, contact in kinds]
+        return [
+            EpisodeBatch([cfgs[k % len(cfgs)] for k in range(size)], contact=contact)
+            for cfgs, size, contact in kinds
+        ]
 
     def start_again(batches: list[EpisodeBatch]) -> None:
-        for batch, (_, contact) in zip(batches, kinds, strict=True):
+        for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
             batch.reset()
-            batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
+            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
 
-    return cache.get((environment_key(cfg), kinds), build, check=start_again)
+    key = tuple((tuple(map(environment_key, cfgs)), size, contact) for cfgs, size, contact in kinds)
+    return cache.get(key, build, check=start_again)
 
 
 @contextmanager

@@ -46,10 +46,10 @@ class RlRunner(Runner):
 
     def build(self) -> None:
         """Make the environments of the training, and the one in the hard contact model that judges."""
-        cfg = self.tracks[0].cfg
+        cfgs = [self.tracks[0].cfg]
         check_torch_device(self._method)
-        kinds = (self._method.num_envs, self._method.contact), (1, "hard")
-        self._training, self._evaluation = shared_batches(self.cache, cfg, *kinds)
+        kinds = (cfgs, self._method.num_envs, self._method.contact), (cfgs, 1, "hard")
+        self._training, self._evaluation = shared_batches(self.cache, *kinds)
         self.problem = self._evaluation.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:

@@ -25,7 +25,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import create_mlp
 
 from plab.autograd import Stretch, policy_gradient
-from plab.config import ConfigError, RlConfig, ShacConfig, drawn_configs
+from plab.config import Config, ConfigError, RlConfig, ShacConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
 from plab.runners.common import policy_episode, shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
@@ -105,15 +105,12 @@ class ShacRunner(Runner):
                 f"the gradient of shac goes from the simulator's device to that of its networks: set "
                 f"method.torch_device={cfg.sim.device}, as sim.device"
             )
+        scenes: Sequence[Config] = [cfg]
         if method.scenes:
             count = min(method.scenes, method.num_envs)
             scenes = drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + count))
-            environments = [scenes[k % count] for k in range(method.num_envs)]
-            self._training_batch = EpisodeBatch(environments, contact=method.contact)
-            (self._evaluation,) = shared_batches(self.cache, cfg, (1, "hard"))
-        else:
-            kinds = (method.num_envs, method.contact), (1, "hard")
-            self._training_batch, self._evaluation = shared_batches(self.cache, cfg, *kinds)
+        kinds = (scenes, method.num_envs, method.contact), ([cfg], 1, "hard")
+        self._training_batch, self._evaluation = shared_batches(self.cache, *kinds)
         self.problem = self._evaluation.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
