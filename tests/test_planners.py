@@ -408,6 +408,14 @@ def test_what_no_manipulator_is_near_to_stays() -> None:
     np.testing.assert_allclose(carried("Assembly", "1", target, 0.009), [[0.3, 0.15, 0.0]], atol=0.02)
 
 
+def test_a_body_of_few_particles_has_its_start_too() -> None:
+    few = load_config(["task=Assembly", "task.bodies.block.particles=10000", "task.bodies.ball.particles=3"])
+    target = np.zeros((64, 64, 64))
+    solid(target, np.array([0.6, 0.08, 0.5]), 0.08, 1.0)
+    starts = ContactStarts(build_scene(few), target).draw(4, seed=0)
+    assert np.isfinite(starts).all() and (np.abs(starts).max(axis=(1, 2)) > 0.0).all()
+
+
 @pytest.mark.parametrize("variant", "12345")
 def test_each_body_is_carried_whole_to_a_place_of_its_own(variant: str) -> None:
     """On TripleMove some ways of points are shortest from two boxes to one place."""

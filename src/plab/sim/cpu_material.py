@@ -25,13 +25,13 @@ from plab.sim.storage import AT_C, AT_F, STATE, STRAINS
 __all__ = ["MaterialTiles"]
 
 # Entries of a tile's intermediate results in ``strains``; G comes first.
-AT_D = 9
-AT_W = 15
-AT_Z = 21
-AT_SCALARS = 27
-AT_D_BAR = 31
-AT_BARS = 37
-AT_G_BAR = 40
+STRAIN_D = 9
+STRAIN_W = 15
+STRAIN_Z = 21
+STRAIN_SCALARS = 27
+STRAIN_D_BAR = 31
+STRAIN_BARS = 37
+STRAIN_G_BAR = 40
 
 
 class MaterialTiles(ParticlePhases):
@@ -70,7 +70,7 @@ class MaterialTiles(ParticlePhases):
         for i in ti.static(range(9)):
             self.strains[at + i] = g[i]
         for i in ti.static(range(6)):
-            self.strains[at + 9 + i] = d[i]
+            self.strains[at + STRAIN_D + i] = d[i]
         _q, _det, _norm, k = yield_factor(d, p[2])
         if self.all_served(z2, j):
             tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
@@ -79,7 +79,7 @@ class MaterialTiles(ParticlePhases):
                 self.affine[entry9 + i] = a[i]
             if ti.static(update):
                 if self.flows(k.min()):
-                    strain = [self.strains[at + 9 + i] for i in range(6)]
+                    strain = [self.strains[at + STRAIN_D + i] for i in range(6)]
                     trial = [self.strains[at + i] for i in range(9)]
                     f_new = flow(strain, trial, p[2], self.series)
                     for i in ti.static(range(9)):
@@ -104,7 +104,7 @@ class MaterialTiles(ParticlePhases):
                 self.flow_tile_adjoint(bar, target, p[2], at)
             else:
                 for i in ti.static(range(9)):
-                    self.strains[at + AT_G_BAR + i] = bar[target + AT_F + i]
+                    self.strains[at + STRAIN_G_BAR + i] = bar[target + AT_F + i]
             if ti.static(self.full_gradient):
                 self.parameter_tile_adjoint(entry9, p[2], at)
             self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
@@ -124,25 +124,25 @@ class MaterialTiles(ParticlePhases):
         for i in ti.static(range(9)):
             self.strains[at + i] = g[i]
         for i in ti.static(range(6)):
-            self.strains[at + AT_D + i] = d[i]
-            self.strains[at + AT_W + i] = w[i]
-            self.strains[at + AT_Z + i] = z[i]
-        self.strains[at + AT_SCALARS] = j
-        self.strains[at + AT_SCALARS + 1] = c2
-        self.strains[at + AT_SCALARS + 2] = a1
-        self.strains[at + AT_SCALARS + 3] = a2
+            self.strains[at + STRAIN_D + i] = d[i]
+            self.strains[at + STRAIN_W + i] = w[i]
+            self.strains[at + STRAIN_Z + i] = z[i]
+        self.strains[at + STRAIN_SCALARS] = j
+        self.strains[at + STRAIN_SCALARS + 1] = c2
+        self.strains[at + STRAIN_SCALARS + 2] = a1
+        self.strains[at + STRAIN_SCALARS + 3] = a2
         return self.all_served(z2, j)
 
     @ti.func
     def stress_tile_adjoint(self, entry9, mu, lam, yield_strain, at):
         """Adjoint of a tile's stress, within ``strains``; whether any of its particles yields."""
-        d = [self.strains[at + AT_D + i] for i in range(6)]
+        d = [self.strains[at + STRAIN_D + i] for i in range(6)]
         a_bar = [self.affine[entry9 + i] for i in range(9)]
         tau_bar = self.stress_symmetric(a_bar)
         d_bar, k_bar, c2_bar, j_bar = stress_adjoint(
             d,
-            self.strains[at + AT_SCALARS],
-            self.strains[at + AT_SCALARS + 1],
+            self.strains[at + STRAIN_SCALARS],
+            self.strains[at + STRAIN_SCALARS + 1],
             tau_bar,
             mu,
             lam,
@@ -151,37 +151,37 @@ class MaterialTiles(ParticlePhases):
         )
         _q, _det, _norm, k = yield_factor(d, yield_strain)
         for i in ti.static(range(6)):
-            self.strains[at + AT_D_BAR + i] = d_bar[i]
-        self.strains[at + AT_BARS] = k_bar
-        self.strains[at + AT_BARS + 1] = c2_bar
-        self.strains[at + AT_BARS + 2] = j_bar
+            self.strains[at + STRAIN_D_BAR + i] = d_bar[i]
+        self.strains[at + STRAIN_BARS] = k_bar
+        self.strains[at + STRAIN_BARS + 1] = c2_bar
+        self.strains[at + STRAIN_BARS + 2] = j_bar
         return self.flows(k.min())
 
     @ti.func
     def flow_tile_adjoint(self, bar: ti.template(), target, yield_strain, at):
         """Adjoint of a tile's plastic flow, from ``strains`` to ``strains``."""
-        d = [self.strains[at + AT_D + i] for i in range(6)]
+        d = [self.strains[at + STRAIN_D + i] for i in range(6)]
         g = [self.strains[at + i] for i in range(9)]
         f_new_bar = [bar[target + AT_F + i] for i in range(9)]
         d_bar, k_bar, g_bar = flow_adjoint(d, g, f_new_bar, yield_strain, self.series)
         for i in ti.static(range(6)):
-            self.strains[at + AT_D_BAR + i] = self.strains[at + AT_D_BAR + i] + d_bar[i]
-        self.strains[at + AT_BARS] = self.strains[at + AT_BARS] + k_bar
+            self.strains[at + STRAIN_D_BAR + i] = self.strains[at + STRAIN_D_BAR + i] + d_bar[i]
+        self.strains[at + STRAIN_BARS] = self.strains[at + STRAIN_BARS] + k_bar
         for i in ti.static(range(9)):
-            self.strains[at + AT_G_BAR + i] = g_bar[i]
+            self.strains[at + STRAIN_G_BAR + i] = g_bar[i]
 
     @ti.func
     def parameter_tile_adjoint(self, entry9, yield_strain, at):
         """Add a tile's adjoints of the material's parameters, from ``strains``."""
-        d = [self.strains[at + AT_D + i] for i in range(6)]
+        d = [self.strains[at + STRAIN_D + i] for i in range(6)]
         a_bar = [self.affine[entry9 + i] for i in range(9)]
         tau_bar = self.stress_symmetric(a_bar)
         mu_bar, lam_bar, yield_bar = parameter_adjoint(
             d,
-            self.strains[at + AT_SCALARS],
-            self.strains[at + AT_SCALARS + 1],
+            self.strains[at + STRAIN_SCALARS],
+            self.strains[at + STRAIN_SCALARS + 1],
             tau_bar,
-            self.strains[at + AT_BARS],
+            self.strains[at + STRAIN_BARS],
             yield_strain,
             self.series,
         )
@@ -208,37 +208,37 @@ class MaterialTiles(ParticlePhases):
         """Adjoint of a tile's strain, from ``strains`` to C and F in ``bar``."""
         # A loop of one round, which LLVM cannot know: it keeps the two parts in blocks of their own.
         for _ in range(self.once[None]):
-            z = [self.strains[at + AT_Z + i] for i in range(6)]
-            d = [self.strains[at + AT_D + i] for i in range(6)]
-            d_bar = [self.strains[at + AT_D_BAR + i] for i in range(6)]
+            z = [self.strains[at + STRAIN_Z + i] for i in range(6)]
+            d = [self.strains[at + STRAIN_D + i] for i in range(6)]
+            d_bar = [self.strains[at + STRAIN_D_BAR + i] for i in range(6)]
             z_bar = log_adjoint(
                 z,
-                self.strains[at + AT_SCALARS + 2],
-                self.strains[at + AT_SCALARS + 3],
+                self.strains[at + STRAIN_SCALARS + 2],
+                self.strains[at + STRAIN_SCALARS + 3],
                 d,
                 d_bar,
-                self.strains[at + AT_BARS],
+                self.strains[at + STRAIN_BARS],
                 yield_strain,
                 self.series,
             )
             for i in ti.static(range(6)):
-                self.strains[at + AT_Z + i] = z_bar[i]
+                self.strains[at + STRAIN_Z + i] = z_bar[i]
         for _ in range(self.once[None]):
             c = [state[source + AT_C + i] for i in range(9)]
             f = [state[source + AT_F + i] for i in range(9)]
             g = [self.strains[at + i] for i in range(9)]
-            w = [self.strains[at + AT_W + i] for i in range(6)]
-            z_bar = [self.strains[at + AT_Z + i] for i in range(6)]
-            g_bar = [self.strains[at + AT_G_BAR + i] for i in range(9)]
-            j = self.strains[at + AT_SCALARS]
-            c2 = self.strains[at + AT_SCALARS + 1]
-            c2_bar = self.strains[at + AT_BARS + 1]
-            j_bar = self.strains[at + AT_BARS + 2]
+            w = [self.strains[at + STRAIN_W + i] for i in range(6)]
+            z_bar = [self.strains[at + STRAIN_Z + i] for i in range(6)]
+            g_bar = [self.strains[at + STRAIN_G_BAR + i] for i in range(9)]
+            j = self.strains[at + STRAIN_SCALARS]
+            c2 = self.strains[at + STRAIN_SCALARS + 1]
+            c2_bar = self.strains[at + STRAIN_BARS + 1]
+            j_bar = self.strains[at + STRAIN_BARS + 2]
             c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
             for i in ti.static(range(9)):
                 self.strains[at + i] = c_out[i]
-                self.strains[at + 9 + i] = f_out[i]
+                self.strains[at + STRAIN_D + i] = f_out[i]
         for i in ti.static(range(9)):
             bar[target + AT_C + i] = self.strains[at + i] + self.mass * self.affine[entry9 + i]
         for i in ti.static(range(9)):
-            bar[target + AT_F + i] = self.strains[at + 9 + i]
+            bar[target + AT_F + i] = self.strains[at + STRAIN_D + i]

@@ -90,8 +90,10 @@ class ContactStarts:
         """Points of the bodies, shape [point, 3], their ways, likewise, and the numbers of their bodies."""
         scene = self._scene
         body = np.repeat(np.arange(len(scene.bodies)), [b.particles for b in scene.bodies])
-        # Evenly over particles and mass, so that each body and each part of the target has its share.
-        chosen = np.linspace(0, len(body), min(POINTS, len(body)), endpoint=False, dtype=int)
+        # Evenly over particles and mass, so that each body and each part of the target has its share; and the
+        # first of each body, however small it is.
+        evenly = np.linspace(0, len(body), min(POINTS, len(body)), endpoint=False, dtype=int)
+        chosen = np.union1d(evenly, np.unique(body, return_index=True)[1])
         points, body = sample_particles(scene)[chosen], body[chosen]
         mass = np.maximum(self._target, 0.0).ravel().cumsum()
         nodes = np.searchsorted(mass, (np.arange(len(points)) + 0.5) / len(points) * mass[-1])
