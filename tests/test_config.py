@@ -527,6 +527,8 @@ def test_refused(override, message):
         ("ppo", "minibatches=1251", "method.minibatches must be at most steps_per_update / 2 = 1250"),
         ("ppo", "gae_lambda=1.1", "method.gae_lambda must be in [0, 1], not 1.1"),
         ("ppo", "value_clip_range=0", "method.value_clip_range must be positive and finite, not 0"),
+        ("ppo", "policy_gain=0", "method.policy_gain must be positive and finite, not 0"),
+        ("ppo", "statistics_episodes=0", "method.statistics_episodes must be at least 1, not 0"),
         ("apg", "hidden=[16,-1]", "method.hidden must be at least 1, not -1"),
         ("apg", "torch_threads=0", "method.torch_threads must be at least 1, not 0"),
     ],

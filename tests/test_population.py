@@ -22,7 +22,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from torch.distributions import normal
 
 from plab.bench import rl as bench
@@ -37,7 +37,8 @@ from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
 from plab.runners.population.population import Population
 from plab.runners.population.replay import Replay, Sizes
-from plab.runners.rl_models import CLIP, Spaces, model_kind
+from plab.runners.rl_models import Spaces, model_kind
+from plab.runners.rl_trainer import scaled
 from plab.sweep.plan import plan
 from plab.tally import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
@@ -52,7 +53,10 @@ STEPS = 40
 LEARNERS = {
     "sac": ("method=sac", "method.batch_size=16", "method.learning_starts=12", "method.buffer_size=1000"),
     "td3": ("method=td3", "method.batch_size=16", "method.learning_starts=12", "method.buffer_size=1000"),
-    "ppo": ("method=ppo", "method.steps_per_update=20", "method.minibatches=3", "method.epochs=2"),
+    "ppo": (
+        *("method=ppo", "method.steps_per_update=20", "method.minibatches=3", "method.epochs=2"),
+        "method.statistics_episodes=6",
+    ),
     "ppo, paper": (
         "method=ppo",
         "method.profile=paper",
@@ -68,9 +72,9 @@ class Script(gymnasium.Env):
 
     observation_space, action_space = SPACES
 
-    def __init__(self, observations: np.ndarray, rewards: np.ndarray) -> None:
+    def __init__(self, observations: np.ndarray, rewards: np.ndarray, truncates: bool) -> None:
         self._observations, self._rewards = iter(observations), iter(rewards)
-        self._step = 0
+        self._step, self._truncates = 0, truncates
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         self._step = 0
@@ -78,7 +82,9 @@ class Script(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         self._step += 1
-        return next(self._observations), next(self._rewards), False, self._step == HORIZON, {}
+        over = self._step == HORIZON
+        ends = over and not self._truncates, over and self._truncates
+        return next(self._observations), next(self._rewards), *ends, {}
 
 
 class OneByOne:
@@ -142,11 +148,11 @@ def play(agents: Agents, scripts: list[tuple[np.ndarray, np.ndarray]]) -> None:
 def library(name: str, cfg: Config, script: tuple[np.ndarray, np.ndarray]) -> BaseAlgorithm:
     """Stable-Baselines3's model, as a single run would have it."""
     observations, rewards = script
+    truncates = getattr(cfg.method, "bootstrap", True)
     env: VecEnv = DummyVecEnv(
-        [lambda n=n: Script(observations[:, n], rewards[:, n].astype(float)) for n in range(ENVS)]
+        [lambda n=n: Script(observations[:, n], rewards[:, n].astype(float), truncates) for n in range(ENVS)]
     )
-    if getattr(cfg.method, "normalise", False):
-        env = VecNormalize(env, gamma=cfg.method.gamma, clip_obs=CLIP, clip_reward=CLIP)
+    env = scaled(cfg, env) or env
     model = model_kind("rl", cfg.method.algorithm).make(cfg.method, env, cfg.seed)
     model.set_logger(Logger(folder=None, output_formats=[]))
     return model

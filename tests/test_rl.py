@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -109,7 +110,7 @@ def test_file_holds_the_whole_run(finished: dict[str, RunResult], method: str) -
     np.testing.assert_allclose(rows["loss"], terms @ [10.0, 10.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-6)
     judged = scores(result.masses["initial"], result.masses["final"], result.masses["target"])
-    assert result.evaluation["score"] == judged.score > 0
+    assert result.evaluation["score"] == judged.score and judged.iou_final > 0.1
     assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"}
     assert result.resume is None
     assert_nothing_else_is_left(result)
@@ -193,6 +194,32 @@ def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
     cfg = load_config([*COARSE, "method=sac", "method.profile=paper", "method.tau=0.25"])
     model = trainer_of(cfg, tmp_path).model
     assert (model.tau, model.learning_starts) == (0.25, 1000)
+
+
+def test_sac_begins_with_the_weights_of_the_authors_code(tmp_path: Path) -> None:
+    policy = trainer_of(load_config([*COARSE, "method=sac"]), tmp_path).model.policy
+    for part in (policy.actor, policy.critic):
+        for layer in (m for m in part.modules() if isinstance(m, torch.nn.Linear)):
+            bound = math.sqrt(6.0 / sum(layer.weight.shape))
+            # Eight weights at least.
+            assert 0.6 * bound < layer.weight.abs().max() <= bound and not layer.bias.any()
+    own, target = (dict(part.named_parameters()) for part in (policy.critic, policy.critic_target))
+    assert all(torch.equal(own[name], target[name]) for name in own)
+
+
+def test_ppo_begins_and_ends_episodes_as_the_profile_says(tmp_path: Path) -> None:
+    gains, ends = {"paper": (0.01, 1.0), "release": (1.0, math.sqrt(2.0))}, {"paper": True, "release": False}
+    for profile, (policy_gain, value_gain) in gains.items():
+        cfg = load_config([*COARSE, "method=ppo", f"method.profile={profile}", "method.num_envs=2"])
+        model = trainer_of(cfg, tmp_path).model
+        # The rows are orthogonal, and as long as the gain.
+        for layer, gain in ((model.policy.action_net, policy_gain), (model.policy.value_net, value_gain)):
+            weight = layer.weight.detach()
+            torch.testing.assert_close(weight @ weight.T, gain**2 * torch.eye(len(weight)), rtol=1e-4, atol=1e-6)
+        model.env.reset()
+        for _ in range(HORIZON):
+            *_, infos = model.env.step(np.zeros((2, 6)))
+        assert [info["TimeLimit.truncated"] for info in infos] == [ends[profile]] * 2
 
 
 def trainer_of(cfg: Config, folder: Path) -> Trainer:

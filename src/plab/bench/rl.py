@@ -105,6 +105,8 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
     """
     method, horizon = cfg.method_as(RlConfig), cfg.sim.horizon
     cfgs = [replace(cfg, seed=seed) for seed in range(agents)]
+    if torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
     with torch_settings(method.torch_threads):
         training = TensorEnv([one for one in cfgs for _ in range(method.num_envs)], contact=method.contact)
         evaluation = TensorEnv(cfgs)

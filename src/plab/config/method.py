@@ -305,6 +305,12 @@ class PpoConfig(RlConfig):
         max_gradient_norm: Longer gradients are scaled down to this norm.
         adam_eps: Added to adam's denominator.
         normalise: Scale observations and rewards by running statistics.
+        statistics_episodes: Episodes after which the statistics of observations stay as they are; None:
+            never.
+        bootstrap: Add the value of an episode's last observation to its rewards; else the episode is taken to
+            end there.
+        policy_gain: Gain of the first weights, which are orthogonal, of the policy's last layer.
+        value_gain: The same of the value function's.
     """
 
     lr_decay: bool
@@ -319,6 +325,10 @@ class PpoConfig(RlConfig):
     max_gradient_norm: float
     adam_eps: float
     normalise: bool
+    statistics_episodes: int | None
+    bootstrap: bool
+    policy_gain: float
+    value_gain: float
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
@@ -331,9 +341,11 @@ class PpoConfig(RlConfig):
             raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
         at_least(f"{path}.epochs", self.epochs, 1)
         unit(f"{path}.gae_lambda", self.gae_lambda)
-        for name in ("clip_range", "max_gradient_norm", "adam_eps"):
+        for name in ("clip_range", "max_gradient_norm", "adam_eps", "policy_gain", "value_gain"):
             positive(f"{path}.{name}", getattr(self, name))
         if self.value_clip_range is not None:
             positive(f"{path}.value_clip_range", self.value_clip_range)
+        if self.statistics_episodes is not None:
+            at_least(f"{path}.statistics_episodes", self.statistics_episodes, 1)
         for name in ("value_coefficient", "entropy_coefficient"):
             at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)

@@ -71,7 +71,10 @@ class PlabVecEnv(VecEnv):
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if there is one.
+        truncates: Whether infos say that it is a limit of time which ends the episodes.
     """
+
+    truncates = True
 
     def __init__(
         self, batch: EpisodeBatch, *, render_mode: str | None = None, spec: EnvSpec | None = None
@@ -125,7 +128,7 @@ class PlabVecEnv(VecEnv):
         result = self.batch.step(self._actions)
         observation, infos = result.observation, self._split(result.info)
         for number, info in enumerate(infos):
-            info["TimeLimit.truncated"] = result.truncated
+            info["TimeLimit.truncated"] = result.truncated and self.truncates
             if result.truncated:
                 info["terminal_observation"] = observation[number]
         if result.truncated:

@@ -13,8 +13,9 @@ import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.sac.policies import SACPolicy
 
 from plab.config import OffPolicyConfig, PpoConfig, RlConfig, SacConfig, Td3Config
 from plab.families import family
@@ -30,6 +31,7 @@ __all__ = [
     "Spaces",
     "cycle_steps",
     "model_kind",
+    "observed_steps",
     "off_policy",
     "rollout_steps",
     "total_steps",
@@ -37,6 +39,9 @@ __all__ = [
 
 CLIP = 10.0
 """Largest observation and reward, in units of their running standard deviations."""
+
+ACTION_GAIN = 0.01
+"""Stable-Baselines3's gain of the last layer of PPO's policy; that of the value function is 1."""
 
 
 class Spaces(NamedTuple):
@@ -61,11 +66,13 @@ class ModelKind:
         rollout_steps: Configuration to the steps of each environment between two updates, of an algorithm
             that learns from what it has just done; None of one with a replay buffer, which can pause after
             any episode.
+        begin: Changes a new policy, in place, where it is not to begin as Stable-Baselines3's does.
     """
 
     model: type[BaseAlgorithm]
     arguments: Callable[[Any, VecEnv], dict[str, Any]]
     rollout_steps: Callable[[Any], int] | None = None
+    begin: Callable[[Any, BasePolicy], None] = lambda method, policy: None
 
     def make(self, method: RlConfig, env: VecEnv, seed: int, **extra: Any) -> BaseAlgorithm:
         """Make an untrained model; seeds the random numbers of NumPy and torch."""
@@ -73,14 +80,18 @@ class ModelKind:
             # The last minibatch of an epoch may be a smaller one.
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             arguments = self.arguments(method, env) | extra
-            return self.model("MlpPolicy", env, seed=seed, device=method.torch_device, **arguments)
+            model = self.model("MlpPolicy", env, seed=seed, device=method.torch_device, **arguments)
+        self.begin(method, model.policy)
+        return model
 
     def policy(self, method: RlConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
         """Return the policy with which a model would begin, on the CPU; random numbers stay as they are."""
         options = self.arguments(method, cast(Any, spaces))["policy_kwargs"]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return self.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
+            policy = self.model.policy_aliases["MlpPolicy"](*spaces, lambda _: method.lr, **options)
+            self.begin(method, policy)
+        return policy
 
 
 class LinearDecay:
@@ -127,6 +138,11 @@ def total_steps(method: RlConfig, horizon: int) -> int:
 def rollout_steps(method: PpoConfig) -> int:
     """Return the steps of all environments of an update of PPO."""
     return math.ceil(method.steps_per_update / method.num_envs)
+
+
+def observed_steps(method: PpoConfig, horizon: int) -> float:
+    """Return the transitions up to which PPO's statistics of observations take new ones."""
+    return math.inf if method.statistics_episodes is None else method.statistics_episodes * horizon
 
 
 def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
@@ -184,7 +200,25 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
     }
 
 
-SAC = ModelKind(CapturedSAC, _sac)
+def _glorot(method: SacConfig, policy: BasePolicy) -> None:
+    """Draw the first weights as the authors' code does: Glorot's uniform ones, and no biases."""
+    networks = cast(SACPolicy, policy)
+    for part in (networks.actor, networks.critic):
+        for layer in part.modules():
+            if isinstance(layer, torch.nn.Linear):
+                torch.nn.init.xavier_uniform_(layer.weight)
+                torch.nn.init.zeros_(layer.bias)
+    networks.critic_target.load_state_dict(networks.critic.state_dict())
+
+
+def _gains(method: PpoConfig, policy: BasePolicy) -> None:
+    """Scale the last layers' first weights, which Stable-Baselines3 draws orthogonal with its own gains."""
+    last = cast(ActorCriticPolicy, policy)
+    for layer, gain in ((last.action_net, method.policy_gain / ACTION_GAIN), (last.value_net, method.value_gain)):
+        cast(torch.nn.Linear, layer).weight.data.mul_(gain)
+
+
+SAC = ModelKind(CapturedSAC, _sac, begin=_glorot)
 TD3 = ModelKind(CapturedTD3, _td3)
-PPO = ModelKind(CapturedPPO, _ppo, rollout_steps)
+PPO = ModelKind(CapturedPPO, _ppo, rollout_steps, _gains)
 """The learning algorithms; the names that ``method.algorithm`` gives them are in :mod:`plab.families`."""

@@ -17,17 +17,24 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from plab.config import OffPolicyConfig, RlConfig
+from plab.config import OffPolicyConfig, PpoConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.model_state import model_arrays, restore_model
 from plab.runners.replay import EpisodeReplay
-from plab.runners.rl_models import CLIP, LinearDecay, cycle_steps, model_kind, total_steps
+from plab.runners.rl_models import (
+    CLIP,
+    LinearDecay,
+    cycle_steps,
+    model_kind,
+    observed_steps,
+    total_steps,
+)
 
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["Trainer"]
+__all__ = ["Trainer", "scaled"]
 
 
 class Trainer:
@@ -64,8 +71,10 @@ class Trainer:
         self._episode_actions: list[np.ndarray] = []
         self._rewards: list[float] = []
         self._scores: list[float] = []
-        self._monitor = VecMonitor(PlabVecEnv(batch))
-        self._statistics = _statistics(cfg, self._monitor)
+        envs = PlabVecEnv(batch)
+        envs.truncates = not isinstance(method, PpoConfig) or method.bootstrap
+        self._monitor = VecMonitor(envs)
+        self._statistics = scaled(cfg, self._monitor)
         self._env = self._monitor if self._statistics is None else self._statistics
         extra = self._replay_arguments(cfg, state)
         if state is not None:
@@ -186,11 +195,29 @@ class Trainer:
         _restore_random(self.model, state["random"])
 
 
-def _statistics(cfg: Config, env: VecEnv) -> VecNormalize | None:
+def scaled(cfg: Config, env: VecEnv) -> VecNormalize | None:
     """Return the wrapper that scales observations and rewards, if the method wants one."""
-    if not getattr(cfg.method, "normalise", False):
+    method = cfg.method
+    if not isinstance(method, PpoConfig) or not method.normalise:
         return None
-    return VecNormalize(env, gamma=cfg.method_as(RlConfig).gamma, clip_obs=CLIP, clip_reward=CLIP)
+    wrapper = VecNormalize(env, gamma=method.gamma, clip_obs=CLIP, clip_reward=CLIP)
+    observed = _Observed(env.observation_space.shape, observed_steps(method, cfg.sim.horizon))
+    wrapper.obs_rms = cast(Any, observed)
+    return wrapper
+
+
+class _Observed(RunningMeanStd):
+    """Statistics of the first observations, those of the very first start and of some transitions."""
+
+    def __init__(self, shape: tuple[int, ...] | None, transitions: float) -> None:
+        super().__init__(shape=shape or ())
+        self._transitions = transitions
+
+    def update(self, arr: np.ndarray) -> None:
+        """Take rows, shape [env, entry]."""
+        # The start's rows are no transitions, and a count begins a little above 0.
+        if self.count < self._transitions + 1.0:
+            super().update(arr)
 
 
 def _statistics_state(env: VecNormalize) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from plab.config import PpoConfig
 from plab.runners.captured import require_capturable
 from plab.runners.population.agents import Agents
 from plab.runners.population.networks import adam, descend, linear, mlp
-from plab.runners.rl_models import CLIP, Spaces, rollout_steps
+from plab.runners.rl_models import CLIP, Spaces, observed_steps, rollout_steps
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -70,6 +70,7 @@ class PpoAgents(Agents):
         super().__init__(cfgs, spaces, device)
         agents, envs = self.count, self.sizes.envs
         self._length = rollout_steps(self.method)
+        self._watched = observed_steps(self.method, self.sizes.horizon)
         self._seen = Statistics(agents, self.sizes.observed, device=device)
         self._earned = Statistics(agents, 1, device=device)
         self._returns = torch.zeros((agents, envs), dtype=torch.float64, device=device)
@@ -112,14 +113,15 @@ class PpoAgents(Agents):
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
         """Keep the transitions, and make an update of every ``steps_per_update``."""
         if self.method.normalise:
-            self._seen.update(observations)
+            if self.steps < self._watched:
+                self._seen.update(observations)
             self._returns.mul_(self.method.gamma).add_(rewards)
             self._earned.update(self._returns.unsqueeze(2))
             scale = (self._earned.var + EPSILON).sqrt()
             rewards = (rewards / scale).clamp(-CLIP, CLIP).float()
         if over:
-            # An episode ends by truncation only: the value of its last observation counts.
-            rewards = rewards + self.method.gamma * self._values(last)
+            if self.method.bootstrap:
+                rewards = rewards + self.method.gamma * self._values(last)
             self._returns.zero_()
         self.rollout["rewards"][:, :, len(self._over)] = rewards
         self._over.append(over)
