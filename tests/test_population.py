@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -30,13 +32,18 @@ from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.families import family
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
-from plab.runners import run_batch, run_config
+from plab.runners import Job, _runner, run_batch, run_config
 from plab.runners.common import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
 from plab.runners.population.population import Population
+from plab.runners.population.ppo import PpoAgents
 from plab.runners.population.replay import Replay, Sizes
+from plab.runners.population.runner import PopulationRunner
+from plab.runners.population.sac import SacAgents
+from plab.runners.population.td3 import Td3Agents
+from plab.runners.rl import RlRunner
 from plab.runners.rl_models import Spaces, model_kind
 from plab.runners.rl_trainer import scaled
 from plab.sweep.plan import plan
@@ -578,6 +585,44 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
         assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
         assert np.isfinite(result.iterations[1:].to_numpy()).all()
         assert load_policy(result.path, "cuda").network.device.type == "cuda"
+    single = configs(tmp_path / "single", method, "sim.device=cuda", "method.torch_device=cuda")[0]
+    run_config(single)
+    assert read(result_path(single)).provenance["population"]
+
+
+def test_a_single_run_is_a_population_of_one_where_its_networks_are_on_cuda(tmp_path: Path) -> None:
+    def carries_out(method: str, device: str, population: bool | None = None) -> type:
+        cfg = configs(tmp_path, method, f"method.torch_device={device}")[0]
+        begun = None if population is None else {"steps": 0}
+        result = SimpleNamespace(resume=begun, provenance={"population": population})
+        return _runner(Job(cfg, SimpleNamespace(result=result)), in_sweep=False)
+
+    assert carries_out("sac", "cpu") is RlRunner and carries_out("sac", "cuda") is PopulationRunner
+    # Whoever has begun goes on.
+    assert (
+        carries_out("ppo", "cuda", False) is RlRunner and carries_out("ppo", "cpu", True) is PopulationRunner
+    )
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", METHODS)
+def test_losses_of_each_agent_are_logged(tmp_path: Path, method: str) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    cfgs = configs(tmp_path, method, "logger=tensorboard")
+    assert [one.status for one in carry(cfgs)] == ["finished"] * 3
+    kinds = {"sac": SacAgents, "td3": Td3Agents, "ppo": PpoAgents}
+    means = []
+    for cfg in cfgs:
+        events = EventAccumulator(str(result_path(cfg).with_suffix(".tensorboard"))).Reload()
+        losses = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"] if tag.startswith("train/")}
+        assert set(losses) == {f"train/{name}" for name in kinds[method].LOSSES}
+        rows = read(result_path(cfg)).iterations["steps"].tolist()
+        for points in losses.values():
+            assert points and {point.step for point in points} <= set(rows[1:])
+            assert all(math.isfinite(point.value) for point in points)
+        means.append([points[-1].value for points in losses.values()])
+    assert means[0] != means[1] != means[2]
 
 
 @pytest.mark.physics

@@ -1,14 +1,15 @@
 """Where the time of reinforcement learning goes, and how it grows with the number of environments.
 
     python -m plab.bench.rl task=Move --methods ppo sac --envs 1 16
-    python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256
+    python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256 --agents 1
     python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
 
 prints a row per method and number of environments: transitions per second, and the milliseconds that each
 part takes per step of all environments; each is waited for before the next one begins. What runs is the
 training of plab.run, an update after every batch of episodes for ppo, in minibatches of the profile's size.
-With --agents it is populations, as in sweeps: the transitions per second are those of all agents together and
-of a training that waits for nothing, evaluations and states of checkpoints included, without their files.
+With --agents it is populations, as in sweeps and wherever networks are on CUDA: the transitions per second
+are those of all agents together and of a training that waits for nothing, evaluations and states of
+checkpoints included, without their files.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+import stable_baselines3
 import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -19,7 +20,6 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from plab.config import OffPolicyConfig, PpoConfig, RlConfig, SacConfig, Td3Config
 from plab.families import family
-from plab.runners.captured import CapturedPPO, CapturedSAC, CapturedTD3
 
 __all__ = [
     "CLIP",
@@ -214,11 +214,14 @@ def _glorot(method: SacConfig, policy: BasePolicy) -> None:
 def _gains(method: PpoConfig, policy: BasePolicy) -> None:
     """Scale the last layers' first weights, which Stable-Baselines3 draws orthogonal with its own gains."""
     last = cast(ActorCriticPolicy, policy)
-    for layer, gain in ((last.action_net, method.policy_gain / ACTION_GAIN), (last.value_net, method.value_gain)):
+    for layer, gain in (
+        (last.action_net, method.policy_gain / ACTION_GAIN),
+        (last.value_net, method.value_gain),
+    ):
         cast(torch.nn.Linear, layer).weight.data.mul_(gain)
 
 
-SAC = ModelKind(CapturedSAC, _sac, begin=_glorot)
-TD3 = ModelKind(CapturedTD3, _td3)
-PPO = ModelKind(CapturedPPO, _ppo, rollout_steps, _gains)
+SAC = ModelKind(stable_baselines3.SAC, _sac, begin=_glorot)
+TD3 = ModelKind(stable_baselines3.TD3, _td3)
+PPO = ModelKind(stable_baselines3.PPO, _ppo, rollout_steps, _gains)
 """The learning algorithms; the names that ``method.algorithm`` gives them are in :mod:`plab.families`."""

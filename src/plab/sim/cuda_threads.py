@@ -86,13 +86,13 @@ class ThreadPhases(CudaPhases):
     @ti.func
     def grid_thread(self, w, q, s):
         """Grid update of node q of the active blocks by thread w; the node's momentum is cleared."""
-        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
-        total = self.take_nodes(self.momentum, stage, w, e, block, r)
+        total = self.take_nodes(self.momentum, shared, w, e, block, r)
         # A test of which manipulators are near would cost a thread as much as contact with them.
         near = ti.static((1 << self.manipulators) - 1)
         v = self.update_node(e, s, self.node_of_block(block, r), near, total)
-        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
+        self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
 
     @ti.func
     def scatter_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q, stamp):
@@ -122,19 +122,19 @@ class ThreadPhases(CudaPhases):
     def grid_thread_adjoint(self, w, q, s):
         """Grid update of node q of the active blocks by thread w, and its adjoint; the scattered sums are
         cleared."""
-        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         i = self.node_of_block(block, r)
-        total = self.take_nodes(self.momentum, stage, w, e, block, r)
-        bar4 = self.take_nodes(self.velocity_bar, stage, w, e, block, r)
+        total = self.take_nodes(self.momentum, shared, w, e, block, r)
+        bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r)
         near = 0
         if total[3] > MASS_MIN:
             near = self.touching(e, s, self.position(i))
         v, total_bar = self.update_node_adjoint(
             e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
         )
-        self.put_nodes(self.velocity, stage, w, e, block, r, widen(v, 0.0 * v[0]))
-        self.put_nodes(self.momentum_bar, stage, w, e, block, r, total_bar)
+        self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
+        self.put_nodes(self.momentum_bar, shared, w, e, block, r, total_bar)
 
     @ti.func
     def gather_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q):
@@ -169,11 +169,11 @@ class ThreadPhases(CudaPhases):
     @ti.func
     def node_terms_thread(self, w, q):
         """Terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
-        stage = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
+        shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
-        mass = self.take_nodes(self.momentum, stage, w, e, block, r)[3]
+        mass = self.take_nodes(self.momentum, shared, w, e, block, r)[3]
         part, slope = self.node_measures(e, self.node_of_block(block, r), mass)
-        self.put_nodes(self.velocity, stage, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
+        self.put_nodes(self.velocity, shared, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
         last = ti.static(len(self.node_terms))
         # All lanes of a warp have nodes of the same environment.
         for k in ti.static(range(RUN_BITS)):

@@ -132,12 +132,12 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         return self.linear(self.node_of_block(block, r))
 
     @ti.func
-    def take_nodes(self, grid: ti.template(), stage: ti.template(), w, e, block, r):
+    def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r):
         """Read and clear 32 nodes, one for each lane of a warp.
 
         Args:
             grid: Field of 4-vectors.
-            stage: Shared memory, ``WARP_BLOCK * NODE_STRIDE`` numbers.
+            shared: Shared memory, ``WARP_BLOCK * NODE_STRIDE`` numbers.
             w: Number of the thread.
             e: Environment.
             block: Block of the grid.
@@ -148,35 +148,35 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         for turn in ti.static(range(4)):
             near = turn * 8 + lane // 4
             node = e * self.nodes + self.linear_in_block(block, r - lane + near)
-            stage[corner + near * NODE_STRIDE + lane % 4] = grid[node][lane % 4]
+            shared[corner + near * NODE_STRIDE + lane % 4] = grid[node][lane % 4]
             grid[node][lane % 4] = 0.0
         self.wait_for_warp()
         out = ti.Vector.zero(self.real, 4)
         for c in ti.static(range(4)):
-            out[c] = stage[corner + lane * NODE_STRIDE + c]
+            out[c] = shared[corner + lane * NODE_STRIDE + c]
         self.wait_for_warp()
         return out
 
     @ti.func
-    def put_nodes(self, grid: ti.template(), stage: ti.template(), w, e, block, r, value):
+    def put_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, value):
         """Write a 4-vector for each lane of a warp to a gathered grid; arguments as for
         :meth:`take_nodes`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for c in ti.static(range(4)):
-            stage[corner + lane * NODE_STRIDE + c] = value[c]
+            shared[corner + lane * NODE_STRIDE + c] = value[c]
         self.wait_for_warp()
         if ti.static(self.real == ti.f32):
             for turn in ti.static(range(2)):
                 near = turn * 16 + lane // 2
                 node = e * self.nodes + self.linear_in_block(block, r - lane + near)
                 at = corner + near * NODE_STRIDE + 2 * (lane % 2)
-                grid[2 * node + lane % 2] = packed(stage[at], stage[at + 1])
+                grid[2 * node + lane % 2] = packed(shared[at], shared[at + 1])
         else:
             for turn in ti.static(range(4)):
                 near = turn * 8 + lane // 4
                 node = e * self.nodes + self.linear_in_block(block, r - lane + near)
-                grid[node][lane % 4] = stage[corner + near * NODE_STRIDE + lane % 4]
+                grid[node][lane % 4] = shared[corner + near * NODE_STRIDE + lane % 4]
         self.wait_for_warp()
 
     # -- sums over a warp ---------------------------------------------------------------------------

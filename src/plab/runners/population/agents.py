@@ -15,8 +15,8 @@ from torch.optim import Adam
 
 from plab.config import OffPolicyConfig, RlConfig
 from plab.families import family
-from plab.runners.captured import CapturedUpdate
 from plab.runners.population.draws import Block, Draws
+from plab.runners.population.graphs import CapturedUpdate
 from plab.runners.population.networks import Networks, fill, flat
 from plab.runners.population.replay import Replay, Sizes
 from plab.runners.rl_models import Spaces, model_kind, total_steps
@@ -64,12 +64,17 @@ class Agents:
         networks: Their parameters.
         optimizers: Adam of parts of them, by name.
         tensors: What else a checkpoint has to hold, by name, each of shape [agent, ...].
+        watched: Whether losses are kept for :meth:`take_losses`.
     """
 
     PARTS: ClassVar[Mapping[str, Sequence[str]]]
     """Modules of Stable-Baselines3's policy, by the parts of :class:`Networks`."""
 
+    LOSSES: ClassVar[Sequence[str]]
+    """Names of what an update returns, as in Stable-Baselines3's logs."""
+
     optimizers: dict[str, Adam]
+    watched = False
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
         """Begin with untrained networks.
@@ -90,6 +95,7 @@ class Agents:
         self.tensors: dict[str, Tensor] = {}
         self._blocks: list[Block] = []
         self._updates: dict[str, CapturedUpdate] = {}
+        self._losses: dict[str, list[Tensor]] = {}
 
     def begin(self, observations: Tensor) -> None:
         """Take the observations with which the training begins, shape [agent, env, entry]."""
@@ -161,6 +167,18 @@ class Agents:
             self.draws.restore([state["random"] for state in states])
         except RuntimeError as error:
             raise ValueError(f"its random numbers are none ({error})") from error
+
+    def take_losses(self) -> list[dict[str, float]]:
+        """Return each agent's means over the updates since the last call, by :attr:`LOSSES`."""
+        means = {name: torch.stack(rows).mean(0).tolist() for name, rows in self._losses.items()}
+        self._losses = {}
+        return [{name: row[agent] for name, row in means.items()} for agent in range(self.count)]
+
+    def _note(self, losses: Tensor) -> None:
+        """Keep what an update returned, shape [loss, agent]; the last of :attr:`LOSSES` may be missing."""
+        if self.watched:
+            for name, row in zip(self.LOSSES, losses, strict=False):
+                self._losses.setdefault(name, []).append(row.clone())
 
     def _optimizer_steps(self, name: str) -> int:
         optimizer = self.optimizers[name]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Adam
 
-from plab.runners.captured import require_capturable
+from plab.runners.population.graphs import require_capturable
 
 __all__ = ["Networks", "Part", "adam", "descend", "fill", "flat", "follow", "linear", "mlp", "twin_values"]
 

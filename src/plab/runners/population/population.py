@@ -148,6 +148,15 @@ class Population:
         agents = range(ended.shape[2])
         return [{n: float(np.mean(ended[:, i, k].copy())) for i, n in enumerate(names)} for k in agents]
 
+    def watch(self) -> None:
+        """Keep the losses of the updates from now on."""
+        for stack in self.stacks:
+            stack.watched = True
+
+    def take_losses(self) -> list[dict[str, float]]:
+        """Return each agent's mean losses over the updates since the last call, if they are kept."""
+        return [losses for stack in self.stacks for losses in stack.take_losses()]
+
     def take_failures(self) -> dict[int, str]:
         """Return why agents broke off in training since the last call, by their numbers."""
         numbers = self._numbers.tolist()

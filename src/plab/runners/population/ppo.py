@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from plab.config import PpoConfig
-from plab.runners.captured import require_capturable
 from plab.runners.population.agents import Agents
+from plab.runners.population.graphs import require_capturable
 from plab.runners.population.networks import adam, descend, linear, mlp
 from plab.runners.rl_models import CLIP, Spaces, observed_steps, rollout_steps
 
@@ -62,6 +62,8 @@ class PpoAgents(Agents):
         "value": ("value_net",),
         "log_std": ("log_std",),
     }
+
+    LOSSES: ClassVar = ("policy_gradient_loss", "value_loss", "entropy_loss")
 
     method: PpoConfig
 
@@ -205,7 +207,7 @@ class PpoAgents(Agents):
         rows = math.ceil(self._size / self.method.minibatches)
         for _ in range(self.method.epochs):
             for numbers in self.draws.permutation(self._size).split(rows, dim=1):
-                self._captured(self.minibatch, numbers.contiguous())
+                self._note(self._captured(self.minibatch, numbers.contiguous()))
             self.updates += 1
 
     def _decay(self) -> None:

@@ -107,7 +107,7 @@ class PopulationRunner(Runner):
             failures = population.take_failures()
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
-        states = population.states()
+        losses, states = population.take_losses(), population.states()
         share = (time.perf_counter() - start) / len(members)
         self._rate = (population.steps - before) / share
         for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
@@ -117,6 +117,8 @@ class PopulationRunner(Runner):
                 continue
             try:
                 self._write_replay(population, place, track)
+                trained_by = {f"train/{name}": loss for name, loss in losses[place].items()}
+                track.log.write(trained_by, population.steps)
             except ResultsError as error:
                 track.job.fail(error)
                 continue
@@ -167,6 +169,8 @@ class PopulationRunner(Runner):
                     f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
                 ) from error
             self._members = members
+            if any(track.log.wanted for track in members):
+                self._population.watch()
             paths = [_replay_path(track) for track in members]
             for stack in self._population.stacks:
                 own, paths = paths[: stack.count], paths[stack.count :]

@@ -36,6 +36,8 @@ class SacAgents(OffPolicyAgents):
         "targets": ("critic_target.qf0", "critic_target.qf1"),
     }
 
+    LOSSES: ClassVar = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
+
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
         """Begin with untrained networks and empty buffers."""
         super().__init__(cfgs, spaces, device)
@@ -62,7 +64,8 @@ class SacAgents(OffPolicyAgents):
 
     def update(self) -> None:
         """Make one update."""
-        self._captured(self.descent, self._numbers.next(), self._now.next(), self._next.next())
+        drawn = self._numbers.next(), self._now.next(), self._next.next()
+        self._note(self._captured(self.descent, *drawn))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets.

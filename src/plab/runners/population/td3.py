@@ -32,6 +32,8 @@ class Td3Agents(OffPolicyAgents):
         "targets": ("critic_target.qf0", "critic_target.qf1"),
     }
 
+    LOSSES: ClassVar = ("critic_loss", "actor_loss")
+
     method: Td3Config
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
@@ -58,7 +60,8 @@ class Td3Agents(OffPolicyAgents):
     def update(self) -> None:
         """Make one update of the critics, and of the actor if it is its turn."""
         delayed = self.updates % self.method.policy_delay != 0
-        self._captured(self.critics if delayed else self.both, self._numbers.next(), self._smoothing.next())
+        update = self.critics if delayed else self.both
+        self._note(self._captured(update, self._numbers.next(), self._smoothing.next()))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update the critics.
@@ -68,9 +71,9 @@ class Td3Agents(OffPolicyAgents):
             noise: Standard normal noise of the target policy, shape [agent, row, action].
 
         Returns:
-            Their losses, shape [agent].
+            Their losses, shape [1, agent].
         """
-        return self._update_critics(self.replay.sample(numbers), noise)
+        return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
     def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update critics, actor and targets; arguments as of :meth:`critics`, losses of shape [2, agent]."""
