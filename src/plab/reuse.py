@@ -44,5 +44,6 @@ class SimulatorCache:
 
     def clear(self) -> None:
         """Let go of what is kept."""
-        self._kept.clear()
-        gc.collect()
+        if self._kept:
+            self._kept.clear()
+            gc.collect()

@@ -302,6 +302,7 @@ class PpoConfig(RlConfig):
         value_clip_range: Largest change of the value; None sets no limit.
         value_coefficient: Weight of the value function's mean squared error.
         entropy_coefficient: Weight of the policy's entropy.
+        entropy_mean: Take the mean of the entropies of an action's components; else their sum.
         max_gradient_norm: Longer gradients are scaled down to this norm.
         adam_eps: Added to adam's denominator.
         normalise: Scale observations and rewards by running statistics.
@@ -322,6 +323,7 @@ class PpoConfig(RlConfig):
     value_clip_range: float | None
     value_coefficient: float
     entropy_coefficient: float
+    entropy_mean: bool
     max_gradient_norm: float
     adam_eps: float
     normalise: bool

@@ -30,6 +30,7 @@ __all__ = [
     "ModelKind",
     "Spaces",
     "cycle_steps",
+    "entropy_weight",
     "model_kind",
     "observed_steps",
     "off_policy",
@@ -140,6 +141,11 @@ def rollout_steps(method: PpoConfig) -> int:
     return math.ceil(method.steps_per_update / method.num_envs)
 
 
+def entropy_weight(method: PpoConfig, actions: int) -> float:
+    """Return the weight of the sum of the entropies of an action's components, of which there are some."""
+    return method.entropy_coefficient / (actions if method.entropy_mean else 1)
+
+
 def observed_steps(method: PpoConfig, horizon: int) -> float:
     """Return the transitions up to which PPO's statistics of observations take new ones."""
     return math.inf if method.statistics_episodes is None else method.statistics_episodes * horizon
@@ -180,6 +186,7 @@ def _td3(method: Td3Config, env: VecEnv) -> dict[str, Any]:
 
 def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
     steps = rollout_steps(method)
+    (actions,) = env.action_space.shape or ()
     return {
         "learning_rate": LinearDecay(method.lr) if method.lr_decay else method.lr,
         "gamma": method.gamma,
@@ -190,7 +197,7 @@ def _ppo(method: PpoConfig, env: VecEnv) -> dict[str, Any]:
         "clip_range": method.clip_range,
         "clip_range_vf": method.value_clip_range,
         "vf_coef": method.value_coefficient,
-        "ent_coef": method.entropy_coefficient,
+        "ent_coef": entropy_weight(method, actions),
         "max_grad_norm": method.max_gradient_norm,
         "policy_kwargs": {
             "net_arch": list(method.hidden),

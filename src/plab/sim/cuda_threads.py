@@ -173,7 +173,9 @@ class ThreadPhases(CudaPhases):
         e, block, r = self.node_of(q)
         mass = self.take_nodes(self.momentum, shared, w, e, block, r)[3]
         part, slope = self.node_measures(e, self.node_of_block(block, r), mass)
-        self.put_nodes(self.velocity, shared, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope]))
+        self.put_nodes(
+            self.velocity, shared, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
+        )
         last = ti.static(len(self.node_terms))
         # All lanes of a warp have nodes of the same environment.
         for k in ti.static(range(RUN_BITS)):

@@ -13,7 +13,7 @@ from plab.config import PpoConfig
 from plab.runners.population.agents import Agents
 from plab.runners.population.graphs import require_capturable
 from plab.runners.population.networks import adam, descend, linear, mlp
-from plab.runners.rl_models import CLIP, Spaces, observed_steps, rollout_steps
+from plab.runners.rl_models import CLIP, Spaces, entropy_weight, observed_steps, rollout_steps
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -73,6 +73,7 @@ class PpoAgents(Agents):
         agents, envs = self.count, self.sizes.envs
         self._length = rollout_steps(self.method)
         self._watched = observed_steps(self.method, self.sizes.horizon)
+        self._entropy = entropy_weight(self.method, self.sizes.actions)
         self._seen = Statistics(agents, self.sizes.observed, device=device)
         self._earned = Statistics(agents, 1, device=device)
         self._returns = torch.zeros((agents, envs), dtype=torch.float64, device=device)
@@ -193,7 +194,7 @@ class PpoAgents(Agents):
         value_loss = (returns - values).square().mean(1)
         log_std = self.networks["log_std"][""]
         entropy_loss = -(0.5 + 0.5 * math.log(2.0 * math.pi) + log_std).sum(1)
-        loss = policy_loss + m.entropy_coefficient * entropy_loss + m.value_coefficient * value_loss
+        loss = policy_loss + self._entropy * entropy_loss + m.value_coefficient * value_loss
         descend(self.optimizers["policy"], loss, m.max_gradient_norm)
         return torch.stack([part.detach() for part in (policy_loss, value_loss, entropy_loss)])
 
