@@ -124,7 +124,7 @@ def _observation(state: dict[str, Any]) -> Any:
 MISFITS: dict[Callable[[dict[str, Any]], Any], str] = {
     _pickled: r"its networks are pickled, as by earlier versions of plab",
     _shape: r"weight has shape \[1, 1\], not \[",
-    _type: r"weight holds float64, not torch\.float32",
+    _type: r"weight holds float64, not float32",
     _name: r"its networks are others: other\.weight",
     _moment: r"exp_avg has shape \[3\], not \[",
     _number: r"the optimiser has no parameter 99",

@@ -100,16 +100,22 @@ def test_a_method_without_a_family_is_said(folder: Path) -> None:
 OPTIMISER = """
 from dataclasses import replace
 
-import torch
+import numpy as np
 
 from plab.families import FAMILIES, Rule
+from plab.runners.trajectory import UpdateRule
 
 
-def rprop(parameter, method):
-    return torch.optim.Rprop([parameter], lr=method.lr)
+class Rprop(UpdateRule):
+    def update(self, actions, gradient):
+        rate = self.state.get("rate", np.full_like(actions, self.method.lr))
+        agreement = np.sign(gradient * self.state.get("gradient", 0 * gradient))
+        rate = rate * np.choose(agreement.astype(int) + 1, [0.5, 1.0, 1.2])
+        self.state = {"rate": rate, "gradient": gradient}
+        return actions - rate * np.sign(gradient)
 
 
-FAMILY = replace(FAMILIES["trajectory"], rules={"rprop": Rule(rprop)})
+FAMILY = replace(FAMILIES["trajectory"], rules={"rprop": Rule(Rprop)})
 """
 
 RPROP = """# Adam's numbers, another update.

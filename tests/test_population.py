@@ -33,7 +33,7 @@ from plab.envs.core import EpisodeBatch
 from plab.families import family
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import Job, _runner, run_batch, run_config
-from plab.runners.common import policy_episode, torch_settings
+from plab.runners.environments import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block

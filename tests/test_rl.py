@@ -24,7 +24,8 @@ from plab.families import FAMILIES
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
 from plab.runners import RunError, rl, run_config
-from plab.runners.common import episode_columns, policy_episode, shared_batches
+from plab.runners.common import episode_columns
+from plab.runners.environments import policy_episode, shared_batches
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import LinearDecay, cycle_steps

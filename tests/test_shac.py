@@ -87,7 +87,7 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path)
     # Simulators are kept from run to run, that of the drawn scenes included.
-    monkeypatch.setattr("plab.runners.common.EpisodeBatch", None)
+    monkeypatch.setattr("plab.runners.environments.EpisodeBatch", None)
     for written in (1, 2):
         with stopped_at(1):
             run_config(cfg, CACHE)

@@ -72,21 +72,28 @@ def method(tmp_path: Path):
 
 
 def test_first_actions_are_uniform_and_follow_the_seed(method) -> None:
-    first = ActionSequence(method, 50, 6, seed=7).numpy()
+    first = ActionSequence(method, 50, 6, seed=7).actions
     assert first.shape == (50, 6) and first.dtype == np.float64
     assert np.abs(first).max() <= method.action_init
     assert np.abs(first).max() > 0.9 * method.action_init and abs(first.mean()) < 0.1 * method.action_init
-    assert np.array_equal(first, ActionSequence(method, 50, 6, seed=7).numpy())
-    assert not np.array_equal(first, ActionSequence(method, 50, 6, seed=8).numpy())
+    assert np.array_equal(first, ActionSequence(method, 50, 6, seed=7).actions)
+    assert not np.array_equal(first, ActionSequence(method, 50, 6, seed=8).actions)
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**32 + 5])
+def test_first_actions_are_drawn_as_torch_draws(method, seed: int) -> None:
+    unit = torch.rand((50, 6), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).numpy()
+    drawn = ActionSequence(method, 50, 6, seed).actions
+    assert np.array_equal(drawn, (2.0 * unit - 1.0) * method.action_init)
 
 
 def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
     def moved(largest: float | None, gradient: np.ndarray) -> np.ndarray:
         settings = replace(method, optimizer="gd", lr=0.1, momentum=0.0, max_gradient_norm=largest)
         actions = ActionSequence(settings, 2, 2, seed=0)
-        before = actions.numpy()
+        before = actions.actions
         actions.step(gradient)
-        return before - actions.numpy()
+        return before - actions.actions
 
     long = np.array([[3.0, 0.0], [0.0, 4.0]])
     np.testing.assert_allclose(moved(None, long), 0.1 * long)
@@ -98,30 +105,30 @@ def test_gd_is_momentum_on_weighted_gradients(method) -> None:
     """v <- 0.9 v + 0.1 g from v = 0, the first step included; actions <- clip(actions - lr v)."""
     actions = ActionSequence(replace(method, optimizer="gd", lr=0.5, momentum=0.9), 2, 2, seed=0)
     gradients = [np.array([[1.0, -2.0], [0.5, 30.0]]), np.array([[3.0, 1.0], [0.0, 0.0]]), np.ones((2, 2))]
-    expected, v = actions.numpy(), np.zeros((2, 2))
+    expected, v = actions.actions, np.zeros((2, 2))
     for gradient in gradients:
         actions.step(gradient)
         v = 0.9 * v + 0.1 * gradient
         expected = np.clip(expected - 0.5 * v, -1.0, 1.0)
-        np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-14, atol=1e-16)
-    assert actions.numpy()[1, 1] == -1.0
+        np.testing.assert_allclose(actions.actions, expected, rtol=1e-14, atol=1e-16)
+    assert actions.actions[1, 1] == -1.0
 
 
 def test_adam_is_adam(method) -> None:
     actions = ActionSequence(replace(method, optimizer="adam", lr=0.1), 1, 3, seed=0)
     gradients = [np.array([[1.0, -2e-3, 1e-9]]), np.array([[-0.5, 4.0, 0.0]])]
-    expected, m, s = actions.numpy(), np.zeros((1, 3)), np.zeros((1, 3))
+    expected, m, s = actions.actions, np.zeros((1, 3)), np.zeros((1, 3))
     for step, gradient in enumerate(gradients, start=1):
         actions.step(gradient)
         m, s = 0.9 * m + 0.1 * gradient, 0.999 * s + 0.001 * gradient**2
         expected = expected - 0.1 * (m / (1 - 0.9**step)) / (np.sqrt(s / (1 - 0.999**step)) + 1e-8)
-        np.testing.assert_allclose(actions.numpy(), expected, rtol=1e-12)
+        np.testing.assert_allclose(actions.actions, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "gd"])
-def test_rules_give_the_bits_of_torchs_optimisers(method, optimizer: str) -> None:
+def test_rules_are_torchs_optimisers(method, optimizer: str) -> None:
     ours = ActionSequence(replace(method, optimizer=optimizer, lr=0.03, momentum=0.8), 5, 4, seed=0)
-    theirs = torch.tensor(ours.numpy(), requires_grad=True)
+    theirs = torch.tensor(ours.actions, requires_grad=True)
     if optimizer == "adam":
         rule: torch.optim.Optimizer = torch.optim.Adam([theirs], 0.03, method.betas, method.eps)
     else:
@@ -136,7 +143,7 @@ def test_rules_give_the_bits_of_torchs_optimisers(method, optimizer: str) -> Non
         rule.step()
         with torch.no_grad():
             theirs.clamp_(-1.0, 1.0)
-        assert np.array_equal(ours.numpy(), theirs.detach().numpy())
+        np.testing.assert_allclose(ours.actions, theirs.detach().numpy(), rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("optimizer", sorted(FAMILIES["trajectory"].rules))
@@ -150,7 +157,7 @@ def test_restored_actions_go_on_alike(method, optimizer: str) -> None:
         gradient = rng.normal(size=(3, 2))
         one.step(gradient)
         other.step(gradient)
-        assert np.array_equal(one.numpy(), other.numpy())
+        assert np.array_equal(one.actions, other.actions)
 
 
 # ---------------------------------------------------------------- whole runs

@@ -36,7 +36,7 @@ from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_confi
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.families import FAMILIES
-from plab.runners.common import torch_settings
+from plab.runners.environments import torch_settings
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.population import Population
 from plab.runners.rl_trainer import Trainer

@@ -17,7 +17,7 @@ import torch
 
 from plab.autograd import policy_gradient
 from plab.config import ApgConfig
-from plab.runners.common import shared_batches, torch_settings
+from plab.runners.environments import shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.runner import Runner, Step, Track
 

@@ -1,17 +1,13 @@
-"""What the runners share: episodes of a policy, what an episode is measured by, threads, errors."""
+"""What all runners share: what an episode is measured by, the simulator of a batch of runs, errors."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from plab.envs.core import EpisodeBatch
 from plab.errors import ConfigError, out_of_memory
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
@@ -24,15 +20,11 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "LAST",
-    "PolicyEpisode",
-    "environment_key",
+    "checked_array",
     "episode_columns",
     "measures",
-    "policy_episode",
-    "shared_batches",
     "shared_problem",
     "simulation_errors",
-    "torch_settings",
 ]
 
 COLUMNS = ("loss", "reward", "iou", "score")
@@ -66,42 +58,6 @@ def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
     return (first, *(f"loss_{name}" for name in term_names), *rest)
 
 
-@dataclass(frozen=True)
-class PolicyEpisode:
-    """What an episode of a policy gave.
-
-    Attributes:
-        observations: Observations before each step, shape [T, entry].
-        actions: Actions, shape [T, A].
-        measures: Values of :func:`episode_columns`.
-    """
-
-    observations: np.ndarray
-    actions: np.ndarray
-    measures: dict[str, float]
-
-
-def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> PolicyEpisode:
-    """Run an episode of a policy in a batch of one.
-
-    Args:
-        batch: The environment.
-        policy: Maps observations, shape [1, entry], to actions, shape [1, A].
-    """
-    observation, _ = batch.reset()
-    sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
-    observations, actions = [], []
-    for _ in range(batch.horizon):
-        observations.append(observation)
-        actions.append(policy(observation))
-        step = batch.step(actions[-1])
-        observation, values = step.observation, step.info | {"reward": step.reward}
-        for name in sums:
-            sums[name] += float(values[name][0])
-    last = {name: float(values[name][0]) for name in LAST}
-    return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
-
-
 def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
     """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
     scenes, sim, method = tuple(build_scenes(cfgs)), cfgs[0].sim, cfgs[0].method
@@ -114,55 +70,23 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
     return Problem(cfgs, cache.get(key, build, check=Simulator.reset))
 
 
-def environment_key(cfg: Config) -> str:
-    """Return a text that is the same for configurations whose environments are alike."""
-    method = asdict(cfg.method)
-    loss = [method["loss_weights"], method["loss_terms"]]
-    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles])
-
-
-def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
-    """Return batches of environments, those kept from the last run if they fit.
+def checked_array(array: Any, shape: Sequence[int], dtype: str, name: str) -> np.ndarray:
+    """Return an array of a state to go on from.
 
     Args:
-        cache: Simulators of earlier runs.
-        kinds: Of each batch: configurations, which environments have in turn; number of environments; contact
-            model.
+        array: The array.
+        shape: Shape that it has to have.
+        dtype: Type of its numbers that it has to have.
+        name: What it is, for the message.
 
-    Returns:
-        One batch per kind, in its initial state.
+    Raises:
+        ValueError: If its shape or type is another.
     """
-
-    def build() -> list[EpisodeBatch]:
-        return [
-            EpisodeBatch([cfgs[k % len(cfgs)] for k in range(size)], contact=contact)
-            for cfgs, size, contact in kinds
-        ]
-
-    def start_again(batches: list[EpisodeBatch]) -> None:
-        for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
-            batch.reset()
-            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
-
-    key = tuple((tuple(map(environment_key, cfgs)), size, contact) for cfgs, size, contact in kinds)
-    return cache.get(key, build, check=start_again)
-
-
-@contextmanager
-def torch_settings(threads: int) -> Iterator[None]:
-    """Let torch use some CPU threads, and not check distributions' arguments, inside the ``with`` block.
-
-    The checks cost a tenth of an update; states and losses are checked for NaN anyway.
-    """
-    before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
-    torch.set_num_threads(threads)
-    torch.distributions.Distribution.set_default_validate_args(False)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        torch.distributions.Distribution.set_default_validate_args(checks)
+    if not isinstance(array, np.ndarray) or array.shape != tuple(shape):
+        raise ValueError(f"{name} has shape {list(np.shape(array))}, not {list(shape)}")
+    if array.dtype != dtype:
+        raise ValueError(f"{name} holds {array.dtype}, not {dtype}")
+    return array
 
 
 @contextmanager

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from plab.runners.common import checked_array
+
 if TYPE_CHECKING:
     # Open-loop methods do without the library.
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -48,12 +50,8 @@ def alike(array: Any, own: Tensor, name: str) -> Tensor:
     Raises:
         ValueError: If its shape or type is another.
     """
-    if not isinstance(array, np.ndarray) or array.shape != tuple(own.shape):
-        raise ValueError(f"{name} has shape {list(np.shape(array))}, not {list(own.shape)}")
-    tensor = torch.tensor(array, device=own.device)
-    if tensor.dtype != own.dtype:
-        raise ValueError(f"{name} holds {array.dtype}, not {own.dtype}")
-    return tensor
+    dtype = str(own.dtype).removeprefix("torch.")
+    return torch.tensor(checked_array(array, own.shape, dtype, name), device=own.device)
 
 
 def moments(state: Mapping[str, Any], parameter: Tensor) -> dict[str, Tensor]:

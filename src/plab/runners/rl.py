@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.common import PolicyEpisode, policy_episode, shared_batches, torch_settings
+from plab.runners.environments import PolicyEpisode, policy_episode, shared_batches, torch_settings
 from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
 from plab.runners.policy import save_policy

@@ -27,7 +27,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from plab.autograd import Stretch, policy_gradient
 from plab.config import Config, ConfigError, RlConfig, ShacConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
-from plab.runners.common import policy_episode, shared_batches, torch_settings
+from plab.runners.environments import policy_episode, shared_batches, torch_settings
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.policy import Policy, save_policy
 from plab.runners.rl import check_torch_device

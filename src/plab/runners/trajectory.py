@@ -15,15 +15,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
-import torch
 
 from plab.config import TrajectoryConfig
 from plab.families import family
-from plab.runners.common import measures, shared_problem
-from plab.runners.model_state import alike, moments
+from plab.runners.common import checked_array, measures, shared_problem
 from plab.runners.runner import Runner, Step, Track
 
-__all__ = ["ActionSequence", "Adam", "Momentum", "TrajectoryRunner"]
+__all__ = ["ActionSequence", "Adam", "Momentum", "TrajectoryRunner", "UpdateRule"]
 
 
 class TrajectoryRunner(Runner):
@@ -53,7 +51,7 @@ class TrajectoryRunner(Runner):
         start = time.perf_counter()
         tried = self.actions_at_rest()
         for track in tracks:
-            tried[track.number] = self._sequences[track.number].numpy()
+            tried[track.number] = self._sequences[track.number].actions
         episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
         share = (time.perf_counter() - start) / len(tracks)
         for track in tracks:
@@ -80,68 +78,63 @@ class TrajectoryRunner(Runner):
             )
 
 
-class Rule:
-    """An update rule of one tensor, with the two things that :class:`ActionSequence` needs of an optimiser.
+class UpdateRule:
+    """How actions change by a gradient, with the two things that :class:`ActionSequence` needs of a rule.
 
-    torch's own optimisers, which fit as well, import its compiler: a second of a run's first ten.
+    In NumPy: importing torch takes a tenth of the time until a run's first gradient.
 
     Attributes:
-        state: What is kept between updates, by its names, of the tensor.
+        method: Rates.
+        state: What is kept between updates, by its names: arrays of the actions' shape or numbers. An update
+            puts new ones in the place of the old.
     """
 
-    def __init__(self, parameter: torch.Tensor, method: TrajectoryConfig) -> None:
+    def __init__(self, method: TrajectoryConfig) -> None:
         """Keep nothing yet.
 
         Args:
-            parameter: The tensor; its ``grad`` is set before each :meth:`step`.
             method: Rates.
         """
-        self._parameter, self._method = parameter, method
-        self.state: dict[torch.Tensor, dict[str, torch.Tensor]] = {parameter: {}}
-
-    @torch.no_grad()
-    def step(self) -> None:
-        """Change the tensor by its gradient."""
-        self.update(self._parameter, cast(torch.Tensor, self._parameter.grad), self.state[self._parameter])
+        self.method = method
+        self.state: dict[str, np.ndarray] = {}
 
     @abstractmethod
-    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
-        """Change the tensor, and what is kept, in place."""
+    def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Return the actions after a step, and keep what the next one needs; all of shape [T, A], float64."""
 
 
-class Adam(Rule):
-    """Adam (arXiv:1412.6980), in the order of ``torch.optim.Adam``'s operations, which gives its bits."""
+class Adam(UpdateRule):
+    """Adam (arXiv:1412.6980), in the order of ``torch.optim.Adam``'s operations, which agrees to rounding."""
 
-    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
-        """Change the tensor, and what is kept, in place."""
-        if not kept:
-            kept["step"] = torch.tensor(0.0)
-            kept["exp_avg"], kept["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        first, second = self._method.betas
-        kept["step"] += 1
-        step = kept["step"].item()
-        kept["exp_avg"].lerp_(gradient, 1 - first)
-        kept["exp_avg_sq"].mul_(second).addcmul_(gradient, gradient, value=1 - second)
-        root = (kept["exp_avg_sq"].sqrt() / (1 - second**step) ** 0.5).add_(self._method.eps)
-        parameter.addcdiv_(kept["exp_avg"], root, value=-self._method.lr / (1 - first**step))
+    def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Return the actions after a step."""
+        zeros = np.zeros_like(actions)
+        first, second = self.method.betas
+        step = self.state.get("step", np.zeros(())) + 1
+        mean, square = self.state.get("exp_avg", zeros), self.state.get("exp_avg_sq", zeros)
+        mean = mean + (1 - first) * (gradient - mean)
+        square = second * square + (1 - second) * gradient * gradient
+        self.state = {"step": np.asarray(step), "exp_avg": mean, "exp_avg_sq": square}
+        root = np.sqrt(square) / (1 - second**step) ** 0.5 + self.method.eps
+        return actions - self.method.lr / (1 - first**step) * mean / root
 
 
-class Momentum(Rule):
+class Momentum(UpdateRule):
     """Gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
 
-    def update(self, parameter: torch.Tensor, gradient: torch.Tensor, kept: dict[str, torch.Tensor]) -> None:
-        """Change the tensor, and what is kept, in place."""
-        m = self._method.momentum
-        v = kept.setdefault("momentum_buffer", torch.zeros_like(parameter))
-        v.mul_(m).add_(gradient, alpha=1 - m)
-        parameter.add_(v, alpha=-self._method.lr)
+    def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """Return the actions after a step."""
+        m = self.method.momentum
+        v = m * self.state.get("momentum_buffer", np.zeros_like(actions)) + (1 - m) * gradient
+        self.state = {"momentum_buffer": v}
+        return actions - self.method.lr * v
 
 
 class ActionSequence:
-    """The actions of an episode and the optimiser that improves them.
+    """The actions of an episode and the rule that improves them.
 
     Attributes:
-        parameter: Actions, each in [-1, 1], shape [T, A], float64.
+        actions: Each in [-1, 1], shape [T, A], float64. A step puts new ones in their place.
     """
 
     def __init__(self, method: TrajectoryConfig, horizon: int, action_dim: int, seed: int) -> None:
@@ -153,39 +146,47 @@ class ActionSequence:
             action_dim: Length A of the action vector.
             seed: Seed of the draw.
         """
-        self._generator = torch.Generator().manual_seed(seed)
-        unit = torch.rand((horizon, action_dim), generator=self._generator, dtype=torch.float64)
-        self.parameter = ((2.0 * unit - 1.0) * method.action_init).requires_grad_()
+        self.actions = (2.0 * uniform(seed, (horizon, action_dim)) - 1.0) * method.action_init
         rule: Any = family(method.family).rule(method.optimizer, Callable)  # type: ignore[arg-type]
-        self._optimizer = rule(self.parameter, method)
+        self._rule = rule(method)
         self._largest = method.max_gradient_norm
-
-    def numpy(self) -> np.ndarray:
-        """Return a copy of the actions, shape [T, A]."""
-        return self.parameter.detach().numpy().copy()
 
     def step(self, gradient: np.ndarray) -> None:
         """Update the actions by a gradient of shape [T, A], no longer than ``method.max_gradient_norm``, and
         clip them to [-1, 1]."""
-        self.parameter.grad = torch.from_numpy(np.array(gradient, dtype=np.float64))
+        gradient = np.array(gradient, dtype=np.float64)
         if self._largest is not None:
-            torch.nn.utils.clip_grad_norm_(self.parameter, self._largest)
-        self._optimizer.step()
-        with torch.no_grad():
-            self.parameter.clamp_(-1.0, 1.0)
+            gradient *= min(1.0, self._largest / (float(np.linalg.norm(gradient)) + 1e-6))
+        self.actions = np.clip(self._rule.update(self.actions, gradient), -1.0, 1.0)
 
     def state(self) -> dict[str, Any]:
         """Return everything that the next steps depend on, as arrays."""
-        buffers = self._optimizer.state[self.parameter]
-        return {
-            "actions": self.numpy(),
-            "optimizer": {name: buffer.numpy().copy() for name, buffer in buffers.items()},
-            "random": self._generator.get_state().numpy(),
-        }
+        return {"actions": self.actions, "optimizer": dict(self._rule.state)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
-        with torch.no_grad():
-            self.parameter.copy_(alike(state["actions"], self.parameter, "actions"))
-        self._optimizer.state[self.parameter] = moments(state["optimizer"], self.parameter)
-        self._generator.set_state(torch.from_numpy(state["random"]))
+        """Return to a :meth:`state`.
+
+        Raises:
+            ValueError: If it is that of other actions.
+        """
+        if not isinstance(state["optimizer"], Mapping):
+            raise ValueError("the optimiser's state is none")
+        shape = self.actions.shape
+        self._rule.state = {
+            name: checked_array(
+                np.asarray(value, np.float64), shape if np.ndim(value) else (), "float64", name
+            )
+            for name, value in state["optimizer"].items()
+        }
+        self.actions = checked_array(state["actions"], shape, "float64", "actions")
+
+
+def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Draw numbers uniform in [0, 1), float64: those of ``torch.rand`` from a generator of the same seed.
+
+    They are the lower 53 bits of two outputs of the Mersenne Twister, the first of which comes first.
+    """
+    twister = np.random.RandomState(seed % 2**32)
+    words = twister.randint(0, 2**32, (*shape, 2), dtype=np.uint32).astype(np.uint64)
+    bits = (words[..., 0] << np.uint64(32) | words[..., 1]) & np.uint64(2**53 - 1)
+    return bits * 2.0**-53

@@ -21,7 +21,8 @@ from torch import Tensor
 from plab.config import MethodConfig, PlannerConfig, StagesConfig
 from plab.families import family
 from plab.problem import Episodes, build_scenes
-from plab.runners.common import shared_problem, torch_settings
+from plab.runners.common import shared_problem
+from plab.runners.environments import torch_settings
 from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import Runner, Step, Track
 from plab.scene import Scene

@@ -21,7 +21,7 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.common import environment_key, torch_settings
+from plab.runners.environments import environment_key, torch_settings
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
 from plab.runners.population.agents import OffPolicyAgents, trained_policy

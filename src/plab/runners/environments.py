@@ -1,0 +1,115 @@
+"""What the runners share whose methods act in environments: batches of them, episodes of a policy, torch's
+settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from plab.envs.core import EpisodeBatch
+from plab.reuse import SimulatorCache
+from plab.runners.common import LAST, episode_columns
+
+if TYPE_CHECKING:
+    from plab.config import Config
+
+__all__ = [
+    "PolicyEpisode",
+    "environment_key",
+    "policy_episode",
+    "shared_batches",
+    "torch_settings",
+]
+
+
+@dataclass(frozen=True)
+class PolicyEpisode:
+    """What an episode of a policy gave.
+
+    Attributes:
+        observations: Observations before each step, shape [T, entry].
+        actions: Actions, shape [T, A].
+        measures: Values of :func:`plab.runners.common.episode_columns`.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    measures: dict[str, float]
+
+
+def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> PolicyEpisode:
+    """Run an episode of a policy in a batch of one.
+
+    Args:
+        batch: The environment.
+        policy: Maps observations, shape [1, entry], to actions, shape [1, A].
+    """
+    observation, _ = batch.reset()
+    sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
+    observations, actions = [], []
+    for _ in range(batch.horizon):
+        observations.append(observation)
+        actions.append(policy(observation))
+        step = batch.step(actions[-1])
+        observation, values = step.observation, step.info | {"reward": step.reward}
+        for name in sums:
+            sums[name] += float(values[name][0])
+    last = {name: float(values[name][0]) for name in LAST}
+    return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
+
+
+def environment_key(cfg: Config) -> str:
+    """Return a text that is the same for configurations whose environments are alike."""
+    method = asdict(cfg.method)
+    loss = [method["loss_weights"], method["loss_terms"]]
+    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles])
+
+
+def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
+    """Return batches of environments, those kept from the last run if they fit.
+
+    Args:
+        cache: Simulators of earlier runs.
+        kinds: Of each batch: configurations, which environments have in turn; number of environments; contact
+            model.
+
+    Returns:
+        One batch per kind, in its initial state.
+    """
+
+    def build() -> list[EpisodeBatch]:
+        return [
+            EpisodeBatch([cfgs[k % len(cfgs)] for k in range(size)], contact=contact)
+            for cfgs, size, contact in kinds
+        ]
+
+    def start_again(batches: list[EpisodeBatch]) -> None:
+        for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
+            batch.reset()
+            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
+
+    key = tuple((tuple(map(environment_key, cfgs)), size, contact) for cfgs, size, contact in kinds)
+    return cache.get(key, build, check=start_again)
+
+
+@contextmanager
+def torch_settings(threads: int) -> Iterator[None]:
+    """Let torch use some CPU threads, and not check distributions' arguments, inside the ``with`` block.
+
+    The checks cost a tenth of an update; states and losses are checked for NaN anyway.
+    """
+    before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
+    torch.set_num_threads(threads)
+    torch.distributions.Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        torch.distributions.Distribution.set_default_validate_args(checks)
