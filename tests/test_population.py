@@ -664,13 +664,18 @@ def test_runs_that_learn_alike_make_a_population() -> None:
     words = ["task=Move", "method=sac"]
     cfgs = [replace(load_config([*words, f"variant={v}"]), seed=s) for v in (1, 2) for s in (0, 1)]
     cfgs += [load_config([*words, "task.yield_stress=20"])]
-    assert [len(batch) for batch in plan(cfgs)] == [2, 3]
-    assert [len(batch) for batch in plan(cfgs, 5)] == [5]
+    assert [len(batch) for batch in plan(cfgs)] == [5]
+    assert [len(batch) for batch in plan(cfgs, 3)] == [2, 3]
     other = [load_config([*words, "method.tau=0.1"]), load_config(["task=Move", "method=td3"])]
     assert [len(batch) for batch in plan(cfgs + other, 50)] == [5, 1, 1]
     # Each of several processes is to have a part, if there are runs enough.
     assert [len(batch) for batch in plan(cfgs, 50, processes=2)] == [2, 3]
     assert [len(batch) for batch in plan(cfgs + other, 50, processes=8)] == [1, 2, 2, 1, 1]
-    one = load_config([*words, "sim.device=cuda", "method.num_envs=16"])
-    many = [replace(one, seed=s) for s in range(9)]
-    assert [len(batch) for batch in plan(many)] == [1, 2, 2, 2, 2]
+
+
+@pytest.mark.parametrize(("gigabytes", "batches"), [(80, [9]), (4, [4, 5]), (0.1, [1] * 9), (math.inf, [9])])
+def test_a_population_fits_half_of_the_device(monkeypatch, gigabytes: float, batches: list[int]) -> None:
+    """An environment of Move takes 20 MB on CUDA; the budget of gradients does not count."""
+    monkeypatch.setattr("plab.sizes.computer_bytes", lambda device: gigabytes * 1e9)
+    one = load_config(["task=Move", "method=ppo", "sim.device=cuda", "method.num_envs=16", "sim.memory_mb=1"])
+    assert [len(batch) for batch in plan([replace(one, seed=s) for s in range(9)])] == batches

@@ -15,7 +15,15 @@ from pathlib import Path
 
 from plab.scene import Scene, SceneError
 
-__all__ = ["OBSERVED", "computer_bytes", "gigabytes", "largest", "require_memory", "scene_bytes"]
+__all__ = [
+    "OBSERVED",
+    "computer_bytes",
+    "gigabytes",
+    "largest",
+    "most_environments",
+    "require_memory",
+    "scene_bytes",
+]
 
 _REAL_BYTES = {"float32": 4, "float64": 8}
 
@@ -60,6 +68,34 @@ def scene_bytes(
     return float(particles) * _PARTICLE_NUMBERS * real + grid + poses + history
 
 
+def most_environments(scene: Scene, precision: str, device: str) -> int:
+    """Return how many environments of a scene half of a device's memory has room for, without a gradient.
+
+    Args:
+        scene: The scene.
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+
+    Returns:
+        Number of environments, at least 1; very many where nobody can tell how much memory there is.
+    """
+    room = min(computer_bytes(device) / 2, 1e15)
+    return max(1, int(room // _own_bytes(scene, precision, device)))
+
+
+def _own_bytes(scene: Scene, precision: str, device: str) -> float:
+    """Return :func:`scene_bytes` of a scene."""
+    return scene_bytes(
+        particles=scene.particle_count,
+        grid_size=scene.grid_size,
+        substeps=scene.substeps,
+        horizon=scene.horizon,
+        tools=len(scene.manipulators),
+        precision=precision,
+        device=device,
+    )
+
+
 def require_memory(scenes: int, scene: Scene, precision: str, device: str) -> None:
     """Refuse scenes that do not fit into the memory.
 
@@ -72,16 +108,7 @@ def require_memory(scenes: int, scene: Scene, precision: str, device: str) -> No
     Raises:
         SceneError: If they do not fit; says how many would.
     """
-    one = scene_bytes(
-        particles=scene.particle_count,
-        grid_size=scene.grid_size,
-        substeps=scene.substeps,
-        horizon=scene.horizon,
-        tools=len(scene.manipulators),
-        precision=precision,
-        device=device,
-    )
-    limit = computer_bytes(device)
+    one, limit = _own_bytes(scene, precision, device), computer_bytes(device)
     if one > limit:
         raise SceneError(
             f"the scene needs at least {gigabytes(one)}, and there are {gigabytes(limit)}: "

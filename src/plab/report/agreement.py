@@ -38,11 +38,16 @@ def compared_cells(runs: Runs) -> pd.DataFrame:
 
 
 def agreement(runs: Runs) -> list[Table]:
-    """Return the agreement per method and over all of them; nothing where no cell is in both."""
+    """Return the agreement per method, per kind of method if there are both, and over all of them; nothing
+    where no cell is in both."""
     cells = compared_cells(runs)
     if cells.empty:
         return []
     groups = [(method(name).label, own) for name, own in cells.groupby("method", sort=False)]
+    kinds = [
+        (f"all {kind}", own) for kind, own in cells.groupby(cells["method"].map(lambda n: method(n).kind))
+    ]
+    groups += kinds if len(kinds) > 1 else []
     data = pd.DataFrame([{"method": label} | in_all(own) for label, own in [*groups, ("all", cells)]])
     shown = pd.DataFrame(
         {

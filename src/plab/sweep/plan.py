@@ -8,10 +8,12 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from plab.config import RlConfig
 from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
 from plab.sim.memory import batch_limit
+from plab.sizes import most_environments
 
 if TYPE_CHECKING:
     from plab.config import Config
@@ -29,7 +31,8 @@ def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) ->
 
     Args:
         cfgs: The composed and checked configurations.
-        size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
+        size: Runs of a batch, at most; if None as many as fit: trajectories and planners ``sim.memory_mb``,
+            agents half of the device's memory.
         processes: How many carry out batches at a time: each is to have one, if there are runs enough.
 
     Returns:
@@ -67,8 +70,12 @@ def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
         return 1
     if size is not None:
         return size
-    environments = batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
-    return max(1, environments // getattr(cfg.method, "num_envs", 1))
+    if own.batching:
+        return batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
+    # Agents need no gradient, so sim.memory_mb, the budget of one, is none of theirs.
+    return max(
+        1, most_environments(scene, cfg.sim.precision, cfg.sim.device) // cfg.method_as(RlConfig).num_envs
+    )
 
 
 def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
