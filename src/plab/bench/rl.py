@@ -38,7 +38,7 @@ from plab.envs.tensors import TensorEnv
 from plab.families import FAMILIES
 from plab.runners.environments import torch_settings
 from plab.runners.population.agents import OffPolicyAgents
-from plab.runners.population.population import Population
+from plab.runners.population.population import Population, population_settings
 from plab.runners.rl_trainer import Trainer
 
 __all__ = ["main", "measure", "measure_population"]
@@ -108,7 +108,7 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
     cfgs = [replace(cfg, seed=seed) for seed in range(agents)]
     if torch.cuda.is_initialized():
         torch.cuda.reset_peak_memory_stats()
-    with torch_settings(method.torch_threads):
+    with population_settings(method):
         training = TensorEnv([one for one in cfgs for _ in range(method.num_envs)], contact=method.contact)
         evaluation = TensorEnv(cfgs)
         population = Population(cfgs, range(agents), training, evaluation, [None] * agents)

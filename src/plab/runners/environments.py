@@ -100,16 +100,24 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
 
 
 @contextmanager
-def torch_settings(threads: int) -> Iterator[None]:
+def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
     """Let torch use some CPU threads, and not check distributions' arguments, inside the ``with`` block.
 
     The checks cost a tenth of an update; states and losses are checked for NaN anyway.
+
+    Args:
+        threads: CPU threads.
+        tf32: Whether products of float32 matrices on CUDA may be TF32's, of factors with 11 significant bits.
     """
     before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
+    precision = torch.get_float32_matmul_precision()
     torch.set_num_threads(threads)
+    if tf32:
+        torch.set_float32_matmul_precision("high")
     torch.distributions.Distribution.set_default_validate_args(False)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+        torch.set_float32_matmul_precision(precision)
         torch.distributions.Distribution.set_default_validate_args(checks)

@@ -151,5 +151,4 @@ def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> No
 def follow(targets: list[Tensor], sources: list[Tensor], tau: float) -> None:
     """Let targets follow: target <- (1 - tau) target + tau source."""
     with torch.no_grad():
-        torch._foreach_mul_(targets, 1.0 - tau)
-        torch._foreach_add_(targets, sources, alpha=tau)
+        torch._foreach_lerp_(targets, sources, tau)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from plab.config import RlConfig
 from plab.envs.tensors import TensorEnv
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
+from plab.runners.environments import torch_settings
 from plab.runners.population.agents import Agents
 from plab.runners.rl_models import Spaces, cycle_steps, total_steps
 
@@ -21,9 +23,17 @@ if TYPE_CHECKING:
     from plab.config import Config
     from plab.envs.core import Transition
 
-__all__ = ["Evaluation", "Population"]
+__all__ = ["Evaluation", "Population", "population_settings"]
 
 NOT_FINITE = "the policy's actions are not finite"
+
+
+def population_settings(method: RlConfig) -> AbstractContextManager[None]:
+    """Return torch's settings for a population: on CUDA products of matrices are TF32's.
+
+    The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
+    """
+    return torch_settings(method.torch_threads, tf32=method.torch_device == "cuda")
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,11 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import environment_key, torch_settings
+from plab.runners.environments import environment_key
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
 from plab.runners.population.agents import OffPolicyAgents, trained_policy
-from plab.runners.population.population import Population
+from plab.runners.population.population import Population, population_settings
 from plab.runners.population.replay import Sizes, require_file
 from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import Spaces, total_steps
@@ -45,8 +45,8 @@ class PopulationRunner(Runner):
     _rate = 0.0
 
     def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
-        return torch_settings(self._method.torch_threads)
+        """Give torch its settings."""
+        return population_settings(self._method)
 
     def build(self) -> None:
         """Make the environments of the training, and those in the hard contact model that judge."""

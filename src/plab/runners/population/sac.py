@@ -112,7 +112,8 @@ class SacAgents(OffPolicyAgents):
         mean, log_std = self._gaussian(observations)
         plain = mean + log_std.exp() * noise
         actions = torch.tanh(plain)
-        density = -0.5 * ((plain - mean) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
+        # Of the normal distribution at mean + std noise.
+        density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         return actions, (density - torch.log(1.0 - actions.square() + EPSILON)).sum(2)
 
 
