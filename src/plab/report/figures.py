@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -30,6 +31,9 @@ __all__ = [
     "save",
     "style",
 ]
+
+ENTRY = 0.72
+"""Width of a legend's entry [inch]."""
 
 _STYLE = {
     "pdf.fonttype": 42,  # TrueType: text stays text, and journals take it
@@ -140,12 +144,14 @@ def legend(figure: Figure, columns: int | None = None) -> None:
 
 
 def legend_of_methods(figure: Figure, names: Sequence[str]) -> None:
-    """Put a legend of methods, as dots, above all axes."""
+    """Put a legend of methods, as dots, above all axes, in as many rows as the width asks for."""
     looks = [method(name) for name in names]
     dots = [Line2D([], [], marker="o", linestyle="none", color=look.colour) for look in looks]
     if dots:
         labels = [look.label for look in looks]
-        figure.legend(dots, labels, loc="outside upper center", ncols=len(dots), handletextpad=0.1)
+        rows = math.ceil(len(dots) * ENTRY / figure.get_figwidth())
+        columns = math.ceil(len(dots) / rows)
+        figure.legend(dots, labels, loc="outside upper center", ncols=columns, handletextpad=0.1)
 
 
 def fix_layout(figure: Figure) -> None:
