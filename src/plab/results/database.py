@@ -54,6 +54,7 @@ _MORE = ("score_best", "protocol", "targets")
 _NAME = ".plab.sqlite"
 
 _LAYOUT = f"""
+-- What rows say, edition 2: with protocol.score=last a policy's score is that of its training episodes.
 CREATE TABLE contents (path BLOB PRIMARY KEY, rows TEXT);
 CREATE TABLE sections (section INTEGER PRIMARY KEY, name TEXT, body TEXT);
 CREATE TABLE section_keys (section INTEGER, key TEXT, value, PRIMARY KEY (section, key)) WITHOUT ROWID;

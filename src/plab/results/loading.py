@@ -29,6 +29,7 @@ from plab.results.schema import (
     ResultsError,
     counts_last,
     final_path,
+    last_score,
     stored_config,
     stored_hash,
 )
@@ -89,7 +90,7 @@ def load(
         best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
         of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
         ``score_best``, ``iou`` and ``loss`` are the final evaluation's, NaN before it; ``score`` is the same,
-        or that of the last iteration with ``protocol.score=last``.
+        or that of the last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
 
     Raises:
         ResultsError: If there is nothing at ``source``, or ``keys`` is a text.
@@ -315,5 +316,5 @@ def _row(file: h5py.File, path: Path) -> Row:
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):
-        values["score"] = float(columns(file, "iterations")["score"][-1])
+        values["score"] = last_score(columns(file, "iterations"))
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -37,6 +37,7 @@ __all__ = [
     "config_hash",
     "counts_last",
     "final_path",
+    "last_score",
     "loss_columns",
     "member_name",
     "parse_member",
@@ -158,11 +159,12 @@ class RunResult:
         """Score of a finished run in [0, 1], as its protocol counts it.
 
         With ``protocol.score=best`` that of the final evaluation; with ``last`` that of the last iteration,
-        in the contact model of the iterations, as the PlasticineLab release logs it. Methods that choose by
-        the score themselves, such as planners, and those outside plab always have that of the final one.
+        in the contact model of the iterations, as the PlasticineLab release logs it: of a policy the mean of
+        its last training episodes, which explore. Methods that choose by the score themselves, such as
+        planners, and those outside plab always have that of the final one.
         """
         if counts_last(self.config):
-            return float(self.iterations["score"].iloc[-1])
+            return last_score({name: column.to_numpy() for name, column in self.iterations.items()})
         return self.evaluation["score"]
 
 
@@ -277,6 +279,13 @@ def counts_last(config: Mapping[str, Any]) -> bool:
     """Return whether a run's score is that of its last iteration: see :attr:`RunResult.score`."""
     own = FAMILIES.get(config["method"]["family"])
     return config["protocol"]["score"] == "last" and own is not None and own.ranking == "loss"
+
+
+def last_score(rows: Mapping[str, np.ndarray]) -> float:
+    """Return the score of the last of some iterations, given their columns, as it was simulated."""
+    trained = rows.get("train_score", [np.nan])[-1]
+    # No episode of training may have ended.
+    return float(rows["score"][-1] if np.isnan(trained) else trained)
 
 
 def loss_columns(config: Mapping[str, Any]) -> tuple[str, ...]:
