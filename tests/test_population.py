@@ -37,7 +37,7 @@ from plab.runners.environments import policy_episode, torch_settings
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
-from plab.runners.population.population import Population
+from plab.runners.population.population import Population, population_settings
 from plab.runners.population.ppo import PpoAgents
 from plab.runners.population.replay import Replay, Sizes
 from plab.runners.population.runner import PopulationRunner
@@ -50,6 +50,15 @@ from plab.sweep.plan import plan
 from plab.tally import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import COARSE as SMALL_RUN
+
+
+@pytest.mark.parametrize(("device", "precision"), [("cpu", "highest"), ("cuda", "high")])
+def test_products_are_tf32_on_cuda_alone(device: str, precision: str) -> None:
+    method = replace(load_config(["task=Move", "method=sac"]).method, torch_device=device)
+    with population_settings(method):
+        assert torch.get_float32_matmul_precision() == precision
+    assert torch.get_float32_matmul_precision() == "highest"
+
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
 
