@@ -293,8 +293,10 @@ def test_counts_hide_nothing(folder: Path) -> None:
 def test_bars_are_of_tasks_with_runs_and_never_alone(folder: Path) -> None:
     with style():
         (drawing,) = rl_scores(collect(folder, select(["method=ppo"], NAMES)))
-        labels = [label.get_text() for label in drawing.figure.axes[0].get_xticklabels()]
-        assert labels == ["Move", "Rope"]
+        panel = drawing.figure.axes[0]
+        assert [label.get_text() for label in panel.get_xticklabels()] == ["Move", "Rope"]
+        papers = [m.get_offsets()[0][1] for m in panel.collections if m.get_label() == "the paper"]
+        assert papers == [0.69, 0.38]
         assert rl_scores(collect(folder, select(["method=ppo", "task=Rope"], NAMES))) == []
 
 

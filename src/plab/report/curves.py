@@ -15,12 +15,14 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 
+from plab.config.selection import lookup
 from plab.report.aggregate import improvement, interquartile_mean, performance_profile, shared_strata
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
 from plab.report.methods import RL, method
+from plab.report.reference import paper_table
 from plab.report.series import Rows, band
 from plab.report.table import number
 from plab.report.tables import ordered_tasks, settings_note
@@ -208,15 +210,14 @@ def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, ti
 
 
 def rl_scores(runs: Runs) -> list[Drawing]:
-    """Return the final scores of the RL methods per task that they have runs of, with their limit; nothing
-    where that would be a single bar."""
+    """Return the final scores of the RL methods per task that they have runs of, beside the paper's and with
+    their limit; nothing where that would be a single bar."""
     own = runs.table[[method(name).kind == RL for name in runs.table["method"]]]
     tasks = [task for task in ordered_tasks(runs.tasks) if task in set(own["task"])]
     methods = [name for name in runs.methods if name in set(own["method"])]
     if len(own[["task", "method"]].drop_duplicates()) < 2:
         return []
-    with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
-        known = pd.read_csv(file).groupby("task")["score"].mean()
+    paper = paper_table("iou_per_task").set_index(["task", "method"])["iou_mean"]
     figure, axes = grid(1, 1, width=1.0 + 0.6 * max(len(tasks), 3), height=2.4)
     panel = axes[0, 0]
     width = 0.8 / max(len(methods), 1)
@@ -231,23 +232,24 @@ def rl_scores(runs: Runs) -> list[Drawing]:
             panel.bar(x, scores.mean(), width * 0.9, color=look.colour, alpha=0.45, label=look.label)
             spread = np.linspace(-0.3, 0.3, len(scores)) * width
             panel.scatter(x + spread, np.sort(scores), s=5, color=look.colour, linewidths=0, zorder=3)
+            mark = {"marker": "D", "s": 14, "facecolor": "white", "edgecolor": "black", "linewidths": 0.7}
+            panel.scatter(x, paper.get((task, name), np.nan), label="the paper", zorder=4, **mark)
     panel.axhline(1.0, color="#555555", linestyle="--", linewidth=1, label="theoretical limit")
-    best = [known.get(task, np.nan) for task in tasks]
-    mark = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
-    panel.scatter(range(len(tasks)), best, label="best actions known", **mark)
+    notes = ["Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs."]
+    if all(lookup(config, "targets.source") is None for config in runs.configs):
+        with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
+            known = pd.read_csv(file).groupby("task")["score"].mean()
+        best = [known.get(task, np.nan) for task in tasks]
+        panel.scatter(range(len(tasks)), best, marker="_", s=250, color="black", label="best actions known")
+        notes.append("Black: mean over the variants of what the reference demonstrations reach.")
     panel.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
     panel.set_ylim(0.0, 1.08)
     panel.set_ylabel("normalised incremental IoU")
     panel.grid(axis="x", visible=False)
     panel.set_axisbelow(True)
     legend(figure)
-    notes = [
-        "Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs.",
-        "The limit is the target itself; black: mean over the variants of what the reference demonstrations "
-        "reach.",
-        *settings_note(runs),
-    ]
-    return [Drawing("rl_scores", figure, notes)]
+    notes.append("The limit is the target itself. Diamonds: the paper's means of five variants, three seeds.")
+    return [Drawing("rl_scores", figure, [*notes, *settings_note(runs)])]
 
 
 # --------------------------------------------------------------------------------------------------- ablation
