@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -19,7 +20,7 @@ from plab.report.aggregate import common_strata, improvement, interquartile_mean
 from plab.report.budgets import at_budgets, score_at_budget, scores_at
 from plab.report.collect import NAMES, collect, collect_ablation
 from plab.report.curves import budget_curves, rewards, rl_scores, score_curves
-from plab.report.figures import grid, log_axis, style
+from plab.report.figures import grid, legend_of_methods, log_axis, style
 from plab.report.methods import method, ordered
 from plab.report.series import band, load_series, rows_on_axes
 
@@ -290,6 +291,16 @@ def test_counts_hide_nothing(folder: Path) -> None:
                 )
 
 
+def test_a_legend_of_methods_is_as_wide_as_its_figure_at_most() -> None:
+    with style():
+        figure, _ = grid(1, 1, width=3.4, height=3.3)
+        legend_of_methods(figure, ["sac", "td3", "ppo", "adam", "gd", "adam_h"])
+        figure.draw_without_rendering()
+        (own,) = figure.legends
+        whole, box = figure.bbox, own.get_window_extent()
+        assert len(own.get_texts()) == 6 and whole.x0 <= box.x0 < box.x1 <= whole.x1
+
+
 def test_bars_are_of_tasks_with_runs_and_never_alone(folder: Path) -> None:
     with style():
         (drawing,) = rl_scores(collect(folder, select(["method=ppo"], NAMES)))
@@ -297,6 +308,12 @@ def test_bars_are_of_tasks_with_runs_and_never_alone(folder: Path) -> None:
         assert [label.get_text() for label in panel.get_xticklabels()] == ["Move", "Rope"]
         papers = [m.get_offsets()[0][1] for m in panel.collections if m.get_label() == "the paper"]
         assert papers == [0.69, 0.38]
+        # Of the suite's targets, hence not beside runs on others.
+        assert "best actions known" in panel.get_legend_handles_labels()[1]
+        runs = collect(folder, select(["method=ppo"], NAMES))
+        elsewhere = [config | {"targets": {"source": "files"}} for config in runs.configs]
+        (drawing,) = rl_scores(replace(runs, configs=elsewhere))
+        assert "best actions known" not in drawing.figure.axes[0].get_legend_handles_labels()[1]
         assert rl_scores(collect(folder, select(["method=ppo", "task=Rope"], NAMES))) == []
 
 

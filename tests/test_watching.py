@@ -124,12 +124,12 @@ def test_the_bar_of_a_run_says_what_is_compiled_and_the_contact_model(tmp_path, 
 # ------------------------------------------------------------------------------------------------- last lines
 
 
-def finished(folder: Path, shown: float, judged: float, *words: str) -> Job:
-    """A run whose best iteration has one score, and whose final evaluation has another."""
+def finished(folder: Path, shown: float, judged: float, *words: str, **more: float) -> Job:
+    """A run whose best iteration has one score and more columns, and whose final evaluation another score."""
     cfg = load_config([*words, f"results_dir={folder}"])
     run = RunFile(cfg)
     row = {"iteration": 0, "episodes": 0, "steps": 0, "loss": 1.5, "reward": 2.0, "iou": 0.4, "score": shown}
-    run.record(row, {}, best_actions=np.zeros((50, 6)), best_iteration=0, best_loss=1.5)
+    run.record(row | more, {}, best_actions=np.zeros((50, 6)), best_iteration=0, best_loss=1.5)
     numbers = dict.fromkeys(("loss", "reward", "iou", "score_printed", "iou_initial", "iou_target_self"), 0.5)
     run.finish(numbers | {"score": judged}, {})
     return Job(cfg, run)
@@ -151,6 +151,19 @@ def test_a_score_in_the_same_contact_model_needs_no_words(tmp_path, shown, judge
 
 def test_the_releases_score_is_that_of_the_last_iteration(tmp_path) -> None:
     assert finished(tmp_path, 0.7, 0.6, "protocol=release").told == "score 0.7000"
+
+
+@pytest.mark.parametrize(
+    ("trained", "told"),
+    [
+        (0.5, "score 0.5000 in its last training episodes (0.7000 without exploration)"),
+        (np.nan, "score 0.7000"),
+    ],
+)
+def test_the_releases_score_of_a_policy_is_that_of_its_training(tmp_path, trained: float, told: str) -> None:
+    words = "protocol=release", "method=ppo"
+    columns = {"train_reward": 1.0, "train_score": trained}
+    assert finished(tmp_path, 0.7, 0.6, *words, **columns).told == told
 
 
 def test_a_run_ends_with_two_lines_of_what_to_do_next() -> None:

@@ -220,6 +220,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     paper = paper_table("iou_per_task").set_index(["task", "method"])["iou_mean"]
     figure, axes = grid(1, 1, width=1.0 + 0.6 * max(len(tasks), 3), height=2.4)
     panel = axes[0, 0]
+    diamond = {"marker": "D", "s": 14, "facecolor": "white", "edgecolor": "black", "lw": 0.7, "zorder": 4}
     width = 0.8 / max(len(methods), 1)
     table = runs.table
     for rank, name in enumerate(methods):
@@ -232,15 +233,16 @@ def rl_scores(runs: Runs) -> list[Drawing]:
             panel.bar(x, scores.mean(), width * 0.9, color=look.colour, alpha=0.45, label=look.label)
             spread = np.linspace(-0.3, 0.3, len(scores)) * width
             panel.scatter(x + spread, np.sort(scores), s=5, color=look.colour, linewidths=0, zorder=3)
-            mark = {"marker": "D", "s": 14, "facecolor": "white", "edgecolor": "black", "linewidths": 0.7}
-            panel.scatter(x, paper.get((task, name), np.nan), label="the paper", zorder=4, **mark)
+            if (task, name) in paper.index:
+                panel.scatter(x, paper[task, name], label="the paper", **diamond)
     panel.axhline(1.0, color="#555555", linestyle="--", linewidth=1, label="theoretical limit")
     notes = ["Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs."]
     if all(lookup(config, "targets.source") is None for config in runs.configs):
         with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
             known = pd.read_csv(file).groupby("task")["score"].mean()
         best = [known.get(task, np.nan) for task in tasks]
-        panel.scatter(range(len(tasks)), best, marker="_", s=250, color="black", label="best actions known")
+        line = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
+        panel.scatter(range(len(tasks)), best, label="best actions known", **line)
         notes.append("Black: mean over the variants of what the reference demonstrations reach.")
     panel.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
     panel.set_ylim(0.0, 1.08)

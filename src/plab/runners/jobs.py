@@ -64,9 +64,13 @@ class Job:
     @property
     def told(self) -> str:
         """What is said of it when it has finished: its score, and how that differs from the score of the row
-        with the best actions, if it does."""
+        with the best actions, or of the last one where that counts, if it does."""
         result = self.run.result
         text = f"score {result.score:.4f}"
+        if counts_last(result.config) and "train_score" in result.iterations:
+            shown = float(result.iterations["score"].iloc[-1])
+            if shown != result.score:
+                return f"{text} in its last training episodes ({shown:.4f} without exploration)"
         # Runners that do everything themselves may have rows without a score.
         if counts_last(result.config) or self.contact == "hard" or "score" not in result.iterations:
             return text
