@@ -10,9 +10,10 @@ from pathlib import Path
 
 __all__ = ["EXAMPLES", "example_archive", "measurements", "resolve"]
 
-EXAMPLES = ("example", "release", "targets")
+EXAMPLES = ("example", "release", "targets", "authors")
 """Words that stand for an archive of this folder where a folder of results is asked for: of plab's own suite,
-of the paper's benchmark on the release's terms, and of plab's terms on the release's targets."""
+of the paper's benchmark on the release's terms, of plab's terms on the release's targets, and of `solve` on
+these from the release's start."""
 
 
 def example_archive(name: str = EXAMPLES[0]) -> Path:
