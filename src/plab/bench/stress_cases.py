@@ -199,7 +199,7 @@ def crushing(plan: Plan) -> Iterator[Case]:
         "ball and pillar": ([sphere(0.65, 0.1, 0.5), pillar], (-1, 0, 0)),
         "six balls": (
             [sphere(0.5 + dx, 0.12 + dy, 0.5 + dz) for dx, dy, dz in six * 0.15],
-            -six.reshape(-1),
+            (-six.reshape(-1)).tolist(),
         ),
     }
     for (name, (used, action)), flow, contact in itertools.product(
