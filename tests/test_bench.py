@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.bench import bound, everyday, paper, skips, speed, workload
+from plab.bench import bound, everyday, skips, speed, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
 from plab.cli.tables import report
 from plab.config import build_scene, load_config
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.objective import target_sdf
+from plab.report.reference import paper_table
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
 from plab.sim.memory import array_bytes
@@ -136,14 +137,14 @@ def test_rows_are_kept_when_a_benchmark_breaks_off(tmp_path: Path) -> None:
 
 
 def test_paper_table_is_whole() -> None:
-    table = paper.paper_table()
+    table = paper_table("timing").set_index("task")
     assert sorted(table.index) == suite_tasks()
     assert (table["forward_backward_ms"] > table["forward_ms"]).all() and (table["forward_ms"] > 10.0).all()
 
 
 def test_the_paper_table_is_written_to_a_new_folder(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "table.md"
-    paper.write_markdown(path, [dict.fromkeys(paper.COLUMNS, 1.0)])
+    speed.write_markdown(path, [dict.fromkeys(speed.PAPER_COLUMNS, 1.0)])
     assert path.read_text(encoding="utf-8").endswith("| 1.0 |\n")
 
 

@@ -44,7 +44,7 @@ from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, DEVICES, Simulator, Skips
+from plab.sim import CONTACT_MODELS, DEVICES, PRECISIONS, Simulator, Skips
 
 __all__ = ["Setting", "attempts_at", "lattice", "main"]
 
@@ -57,22 +57,9 @@ EFFORT = 0.7
 """Factor on the demonstration's actions."""
 
 COLUMNS = (
-    "axis",
-    "task",
-    "contact",
-    "precision",
-    "material",
-    "grid",
-    "particles",
-    "substeps",
-    "ms_per_step",
-    "positions",
-    "mass",
-    "score",
-    "gradient",
-    "angle_deg",
-    "outcome",
-)
+    "axis", "task", "contact", "precision", "material", "grid", "particles", "substeps", "ms_per_step",
+    "positions", "mass", "score", "gradient", "angle_deg", "outcome",
+)  # fmt: skip
 
 
 class UncheckedScene(Scene):
@@ -130,10 +117,8 @@ class Plan:
 
     def settings(self) -> list[Setting]:
         """All settings but the references."""
-        out = [Setting("substeps", self.grid, s, p) for p in ("float32", "float64") for s in self.substeps]
-        out += [
-            Setting("substeps", self.grid, self.usual, p, "singular values") for p in ("float32", "float64")
-        ]
+        out = [Setting("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
+        out += [Setting("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
         return out + [Setting("grid", n, self._substeps_of(n)) for n in self.grids[:-1]]
 
     def references(self) -> dict[str, Setting]:
@@ -149,16 +134,7 @@ class Plan:
         return round(self.usual * grid / self.grid)
 
 
-QUICK = Plan(
-    grid=32,
-    substeps=(3, 5, 10, 20),
-    usual=10,
-    reference=80,
-    grids=(24, 32, 40),
-    steps=20,
-    particles=1000,
-    repeats=1,
-)
+QUICK = Plan(32, (3, 5, 10, 20), 10, reference=80, grids=(24, 32, 40), steps=20, particles=1000, repeats=1)
 
 
 @dataclass(frozen=True)
@@ -246,12 +222,8 @@ class Attempt:
             scene = common_scene(scene, plan.particles, self._places)
             x = sample_particles(scene)
         values = {field.name: getattr(scene, field.name) for field in fields(Scene)}
-        values |= {
-            "grid_size": setting.grid,
-            "substeps": setting.substeps,
-            "dt": STEP_TIME / setting.substeps,
-        }
-        return UncheckedScene(**values), x
+        values |= {"grid_size": setting.grid, "substeps": setting.substeps}
+        return UncheckedScene(**values | {"dt": STEP_TIME / setting.substeps}), x
 
 
 def _volume(body: Body) -> float:
@@ -315,18 +287,8 @@ def _roll(simulator: Simulator, attempt: Attempt, repeats: int, mass: float) -> 
 
 
 def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, grid: int) -> dict[str, float]:
-    """Compare a result with the reference's.
-
-    Args:
-        setting: The setting.
-        attempt: The task.
-        result: Its result.
-        exact: The reference's.
-        grid: Grid on which mass tensors are compared.
-
-    Returns:
-        Errors by column; NaN where there is nothing to compare.
-    """
+    """Return the errors of a result by column, NaN where there is nothing to compare; mass tensors are
+    compared on so many grid nodes per axis."""
     start = attempt.start(setting)[1]
     target = spread_mass(attempt.targets[setting.axis], grid, 1.0 / len(attempt.targets[setting.axis]))
     errors = dict.fromkeys(("positions", "mass", "score", "gradient", "angle_deg"), float("nan"))
@@ -359,15 +321,10 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
             errors = judge(
                 setting, attempt, result, exact[setting.axis, attempt.task, contact], grids[setting.axis]
             )
-            yield {
-                "axis": setting.axis,
+            yield vars(setting) | {
                 "task": attempt.task,
                 "contact": contact,
-                "precision": setting.precision,
-                "material": setting.material,
-                "grid": setting.grid,
                 "particles": len(result.x),
-                "substeps": setting.substeps,
                 "ms_per_step": f"{1e3 * result.seconds:.3f}",
                 **{name: f"{value:.3g}" for name, value in errors.items()},
                 "outcome": result.outcome,

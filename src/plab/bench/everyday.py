@@ -84,14 +84,8 @@ def measure(
                 taken[source].append(_timed(THINGS[what], place, source))
         for source in sources:
             cpu, wall = min(taken[source])
-            longest = max(cpu for cpu, _ in taken[source])
-            yield {
-                "what": what,
-                "source": source,
-                "cpu_s": round(cpu, 2),
-                "cpu_max_s": round(longest, 2),
-                "wall_s": round(wall, 2),
-            }
+            values = what, source, round(cpu, 2), round(max(taken[source])[0], 2), round(wall, 2)
+            yield dict(zip(COLUMNS, values, strict=True))
 
 
 def _set_up(folder: Path, place: Path) -> None:

@@ -33,18 +33,9 @@ from plab.targets import EPISODE_STEPS
 __all__ = ["angle", "main"]
 
 COLUMNS = (
-    "task",
-    "variant",
-    "actions",
-    "score_float32",
-    "score_float64",
-    "difference",
-    "positions_rms",
-    "gradient_norm",
-    "norm_ratio",
-    "angle_deg",
-    "failures",
-)
+    "task", "variant", "actions", "score_float32", "score_float64", "difference", "positions_rms",
+    "gradient_norm", "norm_ratio", "angle_deg", "failures",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -190,9 +181,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def markdown(table: pd.DataFrame, particles: int) -> str:
     """Return the table of a row per task and kind of actions: the worst of its variants, and the median."""
-    numbers = table.copy()
-    for name in ("difference", "angle_deg", "norm_ratio", "positions_rms"):
-        numbers[name] = numbers[name].astype(float)
+    numbers = table.astype({"difference": float, "angle_deg": float})
     lines = [
         f"float32 against float64, {particles} particles, 50 steps, five variants each.",
         "",

@@ -43,12 +43,7 @@ from plab.runners.rl_trainer import Trainer
 
 __all__ = ["main", "measure", "measure_population"]
 
-SIMULATOR_PARTS = (
-    ("step", "simulate"),
-    ("measure", "judge"),
-    ("observe", "observe"),
-    ("poses", "observe"),
-)
+SIMULATOR_PARTS = (("step", "simulate"), ("measure", "judge"), ("observe", "observe"), ("poses", "observe"))
 """Methods of the simulator, and the parts that they are of."""
 
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
@@ -78,7 +73,13 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
         trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
         trainer.set_logger(Logger(folder=None, output_formats=[]))
         trainer.advance(CallbackList([]))
-        with _timed(batch, trainer, seconds):
+        simulator, model = batch.problem.simulator, trainer.model
+        parts: list[tuple[Any, str, str]] = [(simulator, name, part) for name, part in SIMULATOR_PARTS]
+        parts += [(model, "train", "update"), (model, "predict", "policy")]
+        if getattr(model, "replay_buffer", None) is None:
+            # That of the off-policy methods is called by predict, which is timed already.
+            parts.append((model.policy, "forward", "policy"))
+        with _timing(parts, seconds):
             start = time.perf_counter()
             for _ in range(batches):
                 trainer.advance(CallbackList([]))
@@ -155,22 +156,6 @@ def _memory(population: Population) -> int:
 
 
 @contextmanager
-def _timed(batch: EpisodeBatch, trainer: Trainer, seconds: dict[str, float]) -> Iterator[None]:
-    """Add up the time spent in each part inside the ``with`` block."""
-    simulator, model = batch.problem.simulator, trainer.model
-    parts: list[tuple[Any, str, str]] = [
-        *((simulator, name, part) for name, part in SIMULATOR_PARTS),
-        (model, "train", "update"),
-        (model, "predict", "policy"),
-        (model.policy, "forward", "policy"),
-    ]
-    # Those of the off-policy methods are called by predict, which is timed already.
-    parts = parts[:-1] if getattr(model, "replay_buffer", None) is not None else parts
-    with _timing(parts, seconds):
-        yield
-
-
-@contextmanager
 def _timing(parts: Sequence[tuple[Any, str, str]], seconds: dict[str, float]) -> Iterator[None]:
     """Add up the time spent in methods, given with their owners and the parts that they are of."""
     for owner, name, part in parts:
@@ -230,21 +215,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
+    overrides, batches = options.overrides, options.batches
+    kinds = [(num_envs, method) for num_envs in options.envs for method in options.methods]
     if options.agents:
-        batches = options.batches
         rows = (
-            measure_population(_config(options.overrides, method, num_envs, batches, whole=True), k, batches)
-            for k in options.agents
-            for num_envs in options.envs
-            for method in options.methods
+            measure_population(_config(overrides, method, num_envs, batches, whole=True), agents, batches)
+            for agents in options.agents
+            for num_envs, method in kinds
         )
         report(POPULATION, rows, options.csv)
         return
-    table = (
-        measure(_config(options.overrides, method, num_envs, options.batches), options.batches)
-        for num_envs in options.envs
-        for method in options.methods
-    )
+    table = (measure(_config(overrides, method, num_envs, batches), batches) for num_envs, method in kinds)
     report(COLUMNS, table, options.csv)
 
 

@@ -107,14 +107,8 @@ def rows(
         length = cfg.sim.horizon if case.from_start else steps
         progress(f"{case.skip}: building two simulators")
         with_it = build(cfg, batch, length, from_start=case.from_start)
-        without = build(
-            cfg,
-            batch,
-            length,
-            from_start=case.from_start,
-            start=with_it.simulator.state(),
-            skips=Skips(**{case.skip: False}),
-        )
+        start, skips = with_it.simulator.state(), Skips(**{case.skip: False})
+        without = build(cfg, batch, length, from_start=case.from_start, start=start, skips=skips)
         for kind in case.kinds[: 1 if quick else None]:
             progress(f"{case.skip}: {kind}, {batch} environment(s) on {cfg.sim.device}")
             try:
@@ -168,10 +162,8 @@ def _differences(a: Workload, b: Workload, gradient: bool) -> tuple[float, float
     results = [load.simulator.rollout(load.actions, gradient=gradient) for load in (a, b)]
     weights = [term.weight for term in a.simulator.terms]
     losses = [r.step_terms @ weights for r in results]
-    return (
-        _relative(*losses),
-        _relative(*(cast(np.ndarray, r.gradient) for r in results)) if gradient else 0.0,
-    )
+    gradients = [cast(np.ndarray, r.gradient) for r in results]
+    return _relative(*losses), _relative(*gradients) if gradient else 0.0
 
 
 def _relative(a: np.ndarray, b: np.ndarray) -> float:

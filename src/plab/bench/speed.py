@@ -17,14 +17,18 @@ from __future__ import annotations
 import argparse
 import gc
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
-from plab.bench import paper, scaling, skips
+import numpy as np
+
+from plab.bench import skips
 from plab.bench.bound import FOOTPRINTS, bandwidth, least_ms, traffic
 from plab.bench.workload import (
     FORWARD,
     GRADIENT,
     KINDS,
+    REWARD,
     TENSORS,
     build,
     peak_rss_mb,
@@ -33,12 +37,14 @@ from plab.bench.workload import (
 )
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import progress, report
+from plab.cli.tables import markdown, progress, report
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
 from plab.errors import tell
+from plab.report.reference import paper_table
+from plab.sim.storage import BLOCK
 
-__all__ = ["COLUMNS", "main", "rows"]
+__all__ = ["COLUMNS", "main", "rows", "write_markdown"]
 
 COLUMNS = (
     "task", "device", "precision", "batch", "what", "first_s", "median_ms", "min_ms", "max_ms",
@@ -46,6 +52,34 @@ COLUMNS = (
 )  # fmt: skip
 
 LIMIT_COLUMNS = ("device", "copied_mb", "gb_per_s")
+
+SCALING_COLUMNS = (
+    "task", "device", "precision", "grid", "particles", "what", "blocks", "first_s", "median_ms", "min_ms",
+    "max_ms", "ns_per_particle", "ns_per_block", "memory_mb",
+)  # fmt: skip
+
+PARTICLES = (1_000, 10_000, 100_000, 1_000_000)
+GRIDS = (64, 128, 256)
+
+FINEST_DT = 1e-4
+"""Time step of ``--scaling`` at 64 nodes per axis; it shrinks with the cells, for stability."""
+
+SCALING_STEPS = 2
+"""Environment steps per rollout of ``--scaling``."""
+
+PAPER_COLUMNS = (
+    "task", "device", "precision", "batch", "forward_ms", "forward_paper_ms", "forward_ratio", "gradient_ms",
+    "gradient_paper_ms", "gradient_ratio",
+)  # fmt: skip
+
+HEADING = """\
+# Time per environment step
+
+Milliseconds per environment step and environment, measured with `python -m plab.bench.speed --paper`, beside
+what the PlasticineLab paper gives for a GTX 1080 Ti, and the paper's divided by ours. The forward pass
+includes loss and reward.
+
+"""
 
 WIDE = {"what": max(map(len, KINDS)), "skip": 18, "device": 6, "batch": 5}
 """Widths of columns whose entries are not as long as most."""
@@ -141,6 +175,81 @@ def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
         yield {"device": device, "copied_mb": round(footprint / 1e6), "gb_per_s": round(speed / 1e9, 1)}
 
 
+def _scaling_rows(
+    overrides: Sequence[str], particles: int, grid: int, kinds: Sequence[str], repeats: int
+) -> Iterator[dict[str, object]]:
+    """Measure the same body with a number of particles and grid nodes per axis; yield a row per kind.
+
+    Per particle the time should not grow at all, and what a finer grid adds should go with the nodes that
+    hold mass, not with all: ``blocks`` is the number of blocks of 4^3 nodes that hold mass at the start.
+    """
+    whole = sum(body.particles for body in load_config(overrides).task.bodies.values())
+    changes = (
+        f"sim.particles_scale={particles / whole}",
+        f"sim.grid_size={grid}",
+        f"sim.dt={FINEST_DT * min(1.0, 64 / grid)}",
+    )
+    cfg = load_config([*overrides, *changes])
+    progress(f"{particles} particles, {grid}^3 grid")
+    load = build(cfg, 1, SCALING_STEPS, from_start=True)
+    simulator = load.simulator
+    simulator.reset()
+    nodes = np.argwhere(simulator.mass_tensor()[0] > 0) + 1
+    blocks = len(np.unique(nodes // BLOCK, axis=0))
+    for kind in kinds:
+        timing = time_calls(load.call(kind), repeats)
+        median, least, most = timing.ms(SCALING_STEPS)
+        per_substep = median * 1e6 / simulator.substeps
+        yield {
+            "task": cfg.task.name,
+            "device": simulator.device,
+            "precision": simulator.precision,
+            "grid": grid,
+            "particles": simulator.particle_count,
+            "what": kind,
+            "blocks": blocks,
+            "first_s": round(timing.first_s, 2),
+            "median_ms": round(median, 3),
+            "min_ms": round(least, 3),
+            "max_ms": round(most, 3),
+            "ns_per_particle": round(per_substep / simulator.particle_count, 2),
+            "ns_per_block": round(per_substep / blocks, 1),
+            "memory_mb": round(simulator.memory_bytes() / 1e6, 1),
+        }
+
+
+def _paper_row(
+    task: str, overrides: Sequence[str], batch: int, steps: int, repeats: int
+) -> dict[str, object]:
+    """Return a task's milliseconds per environment step of one environment beside the paper's."""
+    paper = paper_table("timing").set_index("task")
+    cfg = load_config([*overrides, f"task={task}"])
+    progress(f"{task} on {cfg.sim.device}")
+    load = build(cfg, batch, steps)
+    row: dict[str, object] = {
+        "task": cfg.task.name,
+        "device": cfg.sim.device,
+        "precision": cfg.sim.precision,
+        "batch": batch,
+    }
+    columns = (("forward", REWARD, "forward_ms"), ("gradient", GRADIENT, "forward_backward_ms"))
+    for name, kind, printed in columns:
+        ms = float(time_calls(load.call(kind), repeats).ms(steps)[0]) / batch
+        theirs = float(paper.loc[cfg.task.name, printed])
+        row |= {
+            f"{name}_ms": round(ms, 2),
+            f"{name}_paper_ms": theirs,
+            f"{name}_ratio": round(theirs / ms, 1),
+        }
+    return row
+
+
+def write_markdown(path: Path, table: Sequence[Mapping[str, object]]) -> None:
+    """Write the rows of ``--paper`` as a page for the documentation."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(HEADING + markdown(PAPER_COLUMNS, table), encoding="utf-8")
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = Parser("plab.bench.speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
@@ -175,25 +284,40 @@ def _options(argv: Sequence[str] | None) -> argparse.Namespace:
     options.steps = options.steps or (5 if quick else 10)
     options.repeats = options.repeats or (3 if quick else 7)
     options.kinds = options.kinds or (QUICK_KINDS if quick else tuple(KINDS))
-    options.particles = options.particles or scaling.PARTICLES[: 2 if quick else None]
-    options.grids = options.grids or scaling.GRIDS[: 2 if quick else None]
+    options.particles = options.particles or PARTICLES[: 2 if quick else None]
+    options.grids = options.grids or GRIDS[: 2 if quick else None]
     return options
 
 
 def _run(options: argparse.Namespace) -> int:
+    overrides = [*options.overrides, *(f"sim.precision={p}" for p in (options.precision or ())[:1])]
+    refused: list[str] = []
     if options.limits:
         report(LIMIT_COLUMNS, _limit_rows(options), options.csv)
     elif options.skips is not None:
-        return _run_skips(options)
+        return _run_skips(options, overrides)
     elif options.scaling:
-        _run_scaling(options)
+        chosen = [*overrides, *_task(options.task[0] if options.task else None)]
+        kinds = QUICK_KINDS[:1] if options.quick else QUICK_KINDS
+        table = (
+            row
+            for grid in options.grids
+            for count in options.particles
+            for row in _scaling_rows(chosen, count, grid, kinds, options.repeats)
+        )
+        report(SCALING_COLUMNS, table, options.csv, WIDE)
     elif options.paper:
-        _run_paper(options)
+        measured = (
+            _paper_row(task, overrides, batch, options.steps, options.repeats)
+            for batch in options.batch
+            for task in options.task
+        )
+        done = report(PAPER_COLUMNS, measured, options.csv, {"task": 10})
+        if options.markdown is not None:
+            write_markdown(options.markdown, done)
     else:
-        refused: list[str] = []
         report(COLUMNS, _all_rows(options, refused), options.csv, WIDE)
-        return _not_measured(refused)
-    return 0
+    return _not_measured(refused)
 
 
 def _not_measured(refused: Sequence[str]) -> int:
@@ -203,50 +327,18 @@ def _not_measured(refused: Sequence[str]) -> int:
     return 1 if refused else 0
 
 
-def _precision(options: argparse.Namespace) -> list[str]:
-    """The overrides, with the first precision of the list."""
-    return [*options.overrides, *(f"sim.precision={p}" for p in (options.precision or ())[:1])]
-
-
-def _run_skips(options: argparse.Namespace) -> int:
-    overrides = _precision(options)
+def _run_skips(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     cases = skips.cases_for(load_config(overrides).sim.device, options.skips)
     how = (options.steps, options.repeats, options.quick)
     refused: list[str] = []
-    table = report(
-        skips.COLUMNS,
-        (row for batch in options.batch for row in skips.rows(cases, overrides, batch, *how, refused)),
-        options.csv,
-        WIDE,
-    )
+    rows = (row for batch in options.batch for row in skips.rows(cases, overrides, batch, *how, refused))
+    table = report(skips.COLUMNS, rows, options.csv, WIDE)
     code = _not_measured(refused)
-    broken = [str(row["skip"]) for row in table if not row["equal"]]
-    if broken:
-        again = ""
-        if table[0]["device"] == "cuda" and table[0]["precision"] == "float32":
-            again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
-        tell(f"results differ by more than rounding: {', '.join(broken)}{again}")
+    if broken := [str(row["skip"]) for row in table if not row["equal"]]:
+        cuda = table[0]["device"] == "cuda" and table[0]["precision"] == "float32"
+        again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
+        tell(f"results differ by more than rounding: {', '.join(broken)}{again if cuda else ''}")
     return 1 if broken else code
-
-
-def _run_scaling(options: argparse.Namespace) -> None:
-    tasks = _task(options.task[0] if options.task else None)
-    kinds = QUICK_KINDS[:1] if options.quick else QUICK_KINDS
-    table = scaling.rows(
-        [*_precision(options), *tasks], options.particles, options.grids, kinds, options.repeats
-    )
-    report(scaling.COLUMNS, table, options.csv, WIDE)
-
-
-def _run_paper(options: argparse.Namespace) -> None:
-    table = (
-        row
-        for batch in options.batch
-        for row in paper.rows(options.task, _precision(options), batch, options.steps, options.repeats)
-    )
-    done = report(paper.COLUMNS, table, options.csv, {"task": 10})
-    if options.markdown is not None:
-        paper.write_markdown(options.markdown, done)
 
 
 @command_line

@@ -15,6 +15,7 @@ in time, and drawn into a PNG of the same name.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -83,18 +84,13 @@ def run_refusals() -> Iterator[dict[str, object]]:
         A row of :data:`COLUMNS` per scene; ``where`` is the message.
     """
     for name, scene in refusals().items():
-        row: dict[str, object] = {
-            "precision": "any",
-            "family": REFUSAL,
-            "case": name,
-            "speed": "",
-            "gradient": "",
-        }
+        outcome, why = "was not refused", ""
         try:
             scene.validate()
-            yield row | {"outcome": "was not refused", "where": ""}
         except SceneError as error:
-            yield row | {"outcome": "refused", "where": str(error)}
+            outcome, why = "refused", str(error)
+        values = ("any", REFUSAL, name, outcome, "", "", why)
+        yield dict(zip(COLUMNS, values, strict=True))
 
 
 def _groups(cases: Sequence[Case]) -> dict[tuple, list[Case]]:
@@ -209,8 +205,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--gradients", type=to_write, help=what)
     options = parser.parse_args(argv)
     cases = _cases(options)
-    rows = (row for precision in options.precision for row in run_cases(cases, precision))
-    table = list(report(COLUMNS, _chain(rows, options), options.csv))
+    rows = itertools.chain.from_iterable(run_cases(cases, precision) for precision in options.precision)
+    refused = run_refusals() if not options.family or REFUSAL in options.family else ()
+    table = report(COLUMNS, itertools.chain(rows, refused), options.csv)
     if options.gradients is not None:
         write_norms(table, options.gradients)
     return _summarise(pd.DataFrame(table))
@@ -253,12 +250,6 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
     from plab.bench.diagrams import draw_norms
 
     print(draw_norms(table, path.with_suffix(".png")))
-
-
-def _chain(rows: Iterator[dict[str, object]], options: argparse.Namespace) -> Iterator[dict[str, object]]:
-    yield from rows
-    if not options.family or REFUSAL in options.family:
-        yield from run_refusals()
 
 
 def _summarise(table: pd.DataFrame) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -75,8 +75,8 @@ class Case:
 
 def stress_cases(plan: Plan) -> list[Case]:
     """Return all cases of a plan."""
-    families = (suite_actions, long_horizons, materials, crushing, walls, overlaps, deformations)
-    return [case for family in families for case in family(plan)] + [*stiff(plan), *few_particles(plan)]
+    families = (suite_actions, materials, crushing, walls, overlaps, deformations, stiff, few_particles)
+    return [case for family in families for case in family(plan)]
 
 
 # ---------------------------------------------------------------------------------------------------- actions
@@ -105,34 +105,25 @@ def task_scene(task: str, variant: str) -> Scene:
     return build_scene(load_config([f"task={task}", f"variant={variant}"]))
 
 
+def common_case(
+    plan: Plan, family: str, name: str, scene: Scene, actions: np.ndarray, contact: str, **state: np.ndarray
+) -> Case:
+    """Return a case in the common kind of scene, from a scene and actions of its own."""
+    common, actions = common_scene(scene, plan.particles), common_actions(scene, actions)
+    return Case(family, name, common, actions, contact, state)
+
+
 def suite_actions(plan: Plan) -> Iterator[Case]:
-    """All configurations under random and bang-bang actions, in both contact models."""
-    kinds = itertools.product(suite_tasks(), plan.variants, ACTIONS, ("soft", "hard"))
-    for number, (task, variant, kind, contact) in enumerate(kinds):
+    """All configurations under random and bang-bang actions, in both contact models; some for long."""
+    short = itertools.product(["suite"], suite_tasks(), plan.variants, ACTIONS, ("soft", "hard"))
+    family = f"{plan.long_horizon} steps"
+    long = itertools.product([family], plan.long_tasks, ["1"], ACTIONS, ("soft", "hard"))
+    numbered = itertools.chain(enumerate(short), enumerate(long, start=1000))
+    for number, (family, task, variant, kind, contact) in numbered:
         scene = task_scene(task, variant)
-        own = ACTIONS[kind](np.random.default_rng(number), plan.horizon, scene.action_dim)
-        yield Case(
-            "suite",
-            f"{task}-v{variant} {kind} {contact}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, own),
-            contact,
-        )
-
-
-def long_horizons(plan: Plan) -> Iterator[Case]:
-    """The long horizon, forwards and backwards."""
-    kinds = itertools.product(plan.long_tasks, ACTIONS, ("soft", "hard"))
-    for number, (task, kind, contact) in enumerate(kinds):
-        scene = task_scene(task, "1")
-        own = ACTIONS[kind](np.random.default_rng(1000 + number), plan.long_horizon, scene.action_dim)
-        yield Case(
-            f"{plan.long_horizon} steps",
-            f"{task}-v1 {kind} {contact}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, own),
-            contact,
-        )
+        steps = plan.horizon if family == "suite" else plan.long_horizon
+        own = ACTIONS[kind](np.random.default_rng(number), steps, scene.action_dim)
+        yield common_case(plan, family, f"{task}-v{variant} {kind} {contact}", scene, own, contact)
 
 
 # ----------------------------------------------------------------------------------------------------- scenes
@@ -164,13 +155,8 @@ def materials(plan: Plan) -> Iterator[Case]:
         (50.0, 5000.0), (0.0, 0.2, 0.35), (0.0, 1.0, 50.0, 1e4, math.inf)
     ):
         scene = box_scene(*tools, youngs_modulus=young, poisson_ratio=nu, yield_stress=flow)
-        yield Case(
-            "material",
-            f"E {young:g}, nu {nu:g}, yield stress {flow:g}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, actions),
-            "soft",
-        )
+        name = f"E {young:g}, nu {nu:g}, yield stress {flow:g}"
+        yield common_case(plan, "material", name, scene, actions, "soft")
 
 
 def stiff(plan: Plan) -> Iterator[Case]:
@@ -183,66 +169,45 @@ def stiff(plan: Plan) -> Iterator[Case]:
         scene = box_scene(*tools, poisson_ratio=nu, yield_stress=flow, **time_step)
         # The stability limit falls with the root of E.
         limit = scene.youngs_modulus * (scene.stable_dt / scene.dt) ** 2
-        scene = replace(scene, youngs_modulus=0.9999 * limit, bodies=_counted(scene, plan))
+        scene = replace(counted(scene, plan.particles), youngs_modulus=0.9999 * limit)
         name = f"E {limit:.0f}, nu {nu:g}, yield stress {flow:g}, {contact}"
         yield Case("stiff", name, scene, actions[:10], contact, contact_weight=1.0)
 
 
-def _counted(scene: Scene, plan: Plan) -> tuple[Body, ...]:
-    """The scene's one body with the plan's number of particles."""
-    return (replace(scene.bodies[0], particles=plan.particles),)
+def counted(scene: Scene, particles: int, **changes: Any) -> Scene:
+    """Return a scene of one body with so many particles, and other changes to the body."""
+    return replace(scene, bodies=(replace(scene.bodies[0], particles=particles, **changes),))
 
 
 def crushing(plan: Plan) -> Iterator[Case]:
     """Manipulators that crush the cube against the floor or each other, and stay there."""
     lying = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
-    tools = {
-        "Sphere": (sphere(0.5, 0.25, 0.5), (0, -1, 0)),
-        "Capsule": (Manipulator("Capsule", (0.06, 0.04), (0.5, 0.3, 0.5), scale=(0.03,) * 3), (0, -1, 0)),
-        "RollingPin": (
-            Manipulator("RollingPin", (0.3, 0.04), (0.5, 0.25, 0.5), lying, scale=(0.7, 0.07, 0.01)),
-            (0.5, 0.2, -1),
-        ),
-        "Chopsticks": (
-            Manipulator(
-                "Chopsticks",
-                (0.2, 0.02),
-                (0.5, 0.25, 0.5),
-                scale=(0.02,) * 3 + (0.04,) * 3 + (0.02,),
-                gap=0.24,
-            ),
-            (0, -0.3, 0, 0, 0, 0, 1),
-        ),
-        "Torus": (Manipulator("Torus", (0.05, 0.03), (0.5, 0.25, 0.5), scale=(0.03,) * 3), (0, -1, 0)),
-        "Box": (
-            Manipulator("Box", (0.08, 0.05, 0.08), (0.5, 0.26, 0.5), scale=(0.03,) * 3 + (0.04,) * 3),
-            (0, -1, 0, 0, 0.5, 0),
-        ),
-    }
+    thin, six = (0.03,) * 3, np.concatenate([np.eye(3), -np.eye(3)])
+    pin = Manipulator("RollingPin", (0.3, 0.04), (0.5, 0.25, 0.5), lying, scale=(0.7, 0.07, 0.01))
+    pair = (*(0.02,) * 3, *(0.04,) * 3, 0.02)
+    sticks = Manipulator("Chopsticks", (0.2, 0.02), (0.5, 0.25, 0.5), scale=pair, gap=0.24)
+    block = Manipulator("Box", (0.08, 0.05, 0.08), (0.5, 0.26, 0.5), scale=(*thin, *(0.04,) * 3))
     pillar = Manipulator("Cylinder", (0.1, 0.3), (0.29, 0.1, 0.5))
-    scenes: dict[str, tuple[tuple[Manipulator, ...], tuple[float, ...]]] = {
-        shape: ((tool,), action) for shape, (tool, action) in tools.items()
-    }
-    scenes["two balls"] = ((sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)), (1, 0, 0, -1, 0, 0))
-    scenes["ball and pillar"] = ((sphere(0.65, 0.1, 0.5), pillar), (-1, 0, 0))
-    scenes["six balls"] = (
-        tuple(
-            sphere(0.5 + dx, 0.12 + dy, 0.5 + dz)
-            for dx, dy, dz in np.concatenate([np.eye(3), -np.eye(3)]) * 0.15
+    scenes: dict[str, tuple[Sequence[Manipulator], Sequence[float]]] = {
+        "Sphere": ([sphere(0.5, 0.25, 0.5)], (0, -1, 0)),
+        "Capsule": ([Manipulator("Capsule", (0.06, 0.04), (0.5, 0.3, 0.5), scale=thin)], (0, -1, 0)),
+        "RollingPin": ([pin], (0.5, 0.2, -1)),
+        "Chopsticks": ([sticks], (0, -0.3, 0, 0, 0, 0, 1)),
+        "Torus": ([Manipulator("Torus", (0.05, 0.03), (0.5, 0.25, 0.5), scale=thin)], (0, -1, 0)),
+        "Box": ([block], (0, -1, 0, 0, 0.5, 0)),
+        "two balls": ([sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)], (1, 0, 0, -1, 0, 0)),
+        "ball and pillar": ([sphere(0.65, 0.1, 0.5), pillar], (-1, 0, 0)),
+        "six balls": (
+            [sphere(0.5 + dx, 0.12 + dy, 0.5 + dz) for dx, dy, dz in six * 0.15],
+            (-six.reshape(-1)).tolist(),
         ),
-        tuple(-np.concatenate([np.eye(3), -np.eye(3)]).reshape(-1)),
-    )
+    }
     for (name, (used, action)), flow, contact in itertools.product(
         scenes.items(), (50.0, math.inf), ("soft", "hard")
     ):
         scene = box_scene(*used, yield_stress=flow)
-        yield Case(
-            "crush",
-            f"{name}, yield stress {flow:g}, {contact}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, np.tile(np.array(action, float), (plan.horizon, 1))),
-            contact,
-        )
+        held = np.tile(np.array(action, float), (plan.horizon, 1))
+        yield common_case(plan, "crush", f"{name}, yield stress {flow:g}, {contact}", scene, held, contact)
 
 
 def walls(plan: Plan) -> Iterator[Case]:
@@ -252,26 +217,14 @@ def walls(plan: Plan) -> Iterator[Case]:
             continue
         speed = 40.0 * np.array(direction)
         scene = box_scene(center=(0.45, 0.4, 0.45), yield_stress=math.inf if number % 2 else 50.0)
-        case = Case(
-            "walls",
-            f"thrown along {direction}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, np.zeros((plan.horizon, 0))),
-            "hard",
-        )
-        yield replace(case, state={"v": np.tile(speed, (plan.particles, 1))})
+        name, still = f"thrown along {direction}", np.zeros((plan.horizon, 0))
+        yield common_case(plan, "walls", name, scene, still, "hard", v=np.tile(speed, (plan.particles, 1)))
     for corner, contact in itertools.product(itertools.product((0.12, 0.8), repeat=2), ("soft", "hard")):
         place = (corner[0], 0.1, corner[1])
         inwards = np.array([0.5 - corner[0], 0.0, 0.5 - corner[1]])
-        scene = box_scene(sphere(*(np.array(place) + 0.4 * inwards)), center=(*place[:1], 0.1, *place[2:]))
+        scene = box_scene(sphere(*(np.array(place) + 0.4 * inwards)), center=place)
         push = np.tile(-np.sign(inwards), (plan.horizon, 1))
-        yield Case(
-            "walls",
-            f"pushed into {place}, {contact}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, push),
-            contact,
-        )
+        yield common_case(plan, "walls", f"pushed into {place}, {contact}", scene, push, contact)
 
 
 def overlaps(plan: Plan) -> Iterator[Case]:
@@ -280,35 +233,25 @@ def overlaps(plan: Plan) -> Iterator[Case]:
     ball = Body("sphere", (0.55, 0.35, 0.5), (0.12,), 1000)
     tools, actions = squeezing(plan)
     inside = (sphere(0.5, 0.3, 0.5), sphere(0.52, 0.3, 0.5))
-    starts = {
-        "two bodies": ((cube, ball), (), None),
-        "the same body twice": ((cube, cube), (), None),
-        "manipulators in the body and in each other": ((cube,), inside, None),
-        "bodies between manipulators": (
-            (replace(cube, center=(0.5, 0.1, 0.5)), replace(ball, center=(0.55, 0.15, 0.5))),
-            tools,
-            None,
-        ),
-        "all particles at one point": ((cube,), (), np.tile([0.5, 0.3, 0.5], (plan.particles, 1))),
-        "all particles in a corner": ((cube,), (), np.zeros((plan.particles, 3))),
-        "all particles in the upper corner": ((cube,), (), np.full((plan.particles, 3), 1.0 - 3.0 / 64)),
-        "all particles on a line": (
-            (cube,),
-            (),
-            np.linspace([0.3, 0.3, 0.3], [0.7, 0.3, 0.3], plan.particles),
-        ),
+    near = replace(cube, center=(0.5, 0.1, 0.5)), replace(ball, center=(0.55, 0.15, 0.5))
+    starts: dict[str, tuple[tuple[Body, ...], tuple[Manipulator, ...]]] = {
+        "two bodies": ((cube, ball), ()),
+        "the same body twice": ((cube, cube), ()),
+        "manipulators in the body and in each other": ((cube,), inside),
+        "bodies between manipulators": (near, tools),
     }
-    for (name, (bodies, used, x)), contact in itertools.product(starts.items(), ("soft", "hard")):
+    places = {
+        "all particles at one point": np.tile([0.5, 0.3, 0.5], (plan.particles, 1)),
+        "all particles in a corner": np.zeros((plan.particles, 3)),
+        "all particles in the upper corner": np.full((plan.particles, 3), 1.0 - 3.0 / 64),
+        "all particles on a line": np.linspace([0.3, 0.3, 0.3], [0.7, 0.3, 0.3], plan.particles),
+    }
+    for name, contact in itertools.product((*starts, *places), ("soft", "hard")):
+        bodies, used = starts.get(name, ((cube,), ()))
         scene = replace(box_scene(*used), bodies=bodies)
         own = actions if used else np.zeros((plan.horizon, 0))
-        yield Case(
-            "overlap",
-            f"{name}, {contact}",
-            common_scene(scene, plan.particles),
-            common_actions(scene, own),
-            contact,
-            {} if x is None else {"x": x},
-        )
+        state = {"x": places[name]} if name in places else {}
+        yield common_case(plan, "overlap", f"{name}, {contact}", scene, own, contact, **state)
 
 
 def deformations(plan: Plan) -> Iterator[Case]:
@@ -333,23 +276,16 @@ def deformations(plan: Plan) -> Iterator[Case]:
     tools, actions = squeezing(plan)
     for (name, shape), flow in itertools.product(shapes.items(), (0.0, 50.0, math.inf)):
         scene = box_scene(*tools, yield_stress=flow, substeps=DEFORMED, dt=STEP_TIME / DEFORMED)
-        yield Case(
-            "deformation",
-            f"{name}, yield stress {flow:g}",
-            replace(scene, bodies=_counted(scene, plan)),
-            actions[:3],
-            "soft",
-            {"F": turn @ shape @ turn.transpose(0, 2, 1)},
-            contact_weight=1.0,
-        )
+        scene, state = counted(scene, plan.particles), {"F": turn @ shape @ turn.transpose(0, 2, 1)}
+        title = f"{name}, yield stress {flow:g}"
+        yield Case("deformation", title, scene, actions[:3], "soft", state, contact_weight=1.0)
 
 
 def few_particles(plan: Plan) -> Iterator[Case]:
     """A single particle, and a handful."""
     tools, actions = squeezing(plan)
     for count, flow, contact in itertools.product((1, 5), (50.0, math.inf), ("soft", "hard")):
-        scene = box_scene(*tools, yield_stress=flow)
-        scene = replace(scene, bodies=(replace(scene.bodies[0], size=(0.02,) * 3, particles=count),))
+        scene = counted(box_scene(*tools, yield_stress=flow), count, size=(0.02,) * 3)
         name = f"{count} particle(s), yield stress {flow:g}, {contact}"
         yield Case("few particles", name, scene, actions, contact, contact_weight=1.0)
 
@@ -362,10 +298,9 @@ def refusals() -> dict[str, Scene]:
     nan, inf = math.nan, math.inf
     tool = sphere(0.5, 0.3, 0.5)
     scene = box_scene(tool)
-    body = scene.bodies[0]
 
     def with_body(**changes: Any) -> Scene:
-        return replace(scene, bodies=(replace(body, **changes),))
+        return replace(scene, bodies=(replace(scene.bodies[0], **changes),))
 
     def with_tool(**changes: Any) -> Scene:
         return replace(scene, manipulators=(replace(tool, **changes),))

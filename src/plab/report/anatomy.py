@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from plab.report.costs import PHASES
-from plab.report.figures import Drawing, grid, legend
+from plab.report.figures import Drawing, grid, legend, single
 from plab.report.methods import method
 from plab.results import ResultsError, RunResult
 from plab.results.schema import loss_columns
@@ -24,28 +25,22 @@ def loss_terms(run: RunResult) -> Drawing:
     """Draw the terms of the trajectory loss, weighted as the run weights them."""
     weights = run.config["method"]["loss_weights"]
     table = run.iterations
-    figure, axes = grid(1, 1, width=6.4, height=2.4)
-    panel = axes[0, 0]
+    figure, panel = single(width=6.4, height=2.4)
     panel.plot(table["episodes"] + 1, table["loss"], color="black", label="loss")
     columns = loss_columns(run.config)
     for column, colour in zip(columns, itertools.cycle(_COLOURS), strict=False):
         name = column.removeprefix("loss_")
         values = weights[name] * table[column]
         if (values > 0).any():
-            panel.plot(
-                table["episodes"] + 1,
-                values.where(values > 0),
-                color=colour,
-                label=f"{weights[name]:g} x {name}",
-            )
+            label = f"{weights[name]:g} x {name}"
+            panel.plot(table["episodes"] + 1, values.where(values > 0), color=colour, label=label)
     best = table[table["iteration"] == run.best_iteration]["episodes"] + 1
     for episode in best:
         panel.axvline(episode, color="#999999", linewidth=0.8, linestyle=":")
     panel.set_yscale("log")
     # Less than this of the loss is as good as nothing.
     panel.set_ylim(bottom=max(panel.get_ylim()[0], 1e-3 * float(table["loss"].min())))
-    panel.set_xlabel("episodes")
-    panel.set_ylabel("summed over the steps")
+    panel.set(xlabel="episodes", ylabel="summed over the steps")
     legend(figure)
     terms = [
         f"{column.removeprefix('loss_')}: {run.labels[column]}" for column in columns if column in run.labels
@@ -59,18 +54,13 @@ def loss_terms(run: RunResult) -> Drawing:
 def measures(run: RunResult) -> Drawing:
     """Draw reward, score, soft IoU and, where there is one, the gradient's norm."""
     table = run.iterations
-    columns = {
-        "reward": "reward",
-        "score": "score",
-        "iou": "soft IoU",
-        "gradient_norm": "norm of the gradient",
-    }
+    columns = {"reward": "reward", "score": "score", "iou": "soft IoU"}
+    columns["gradient_norm"] = "norm of the gradient"
     shown = {name: text for name, text in columns.items() if name in table}
     figure, axes = grid(1, len(shown), width=2.2, height=1.8)
     for panel, (name, text) in zip(axes[0], shown.items(), strict=True):
         panel.plot(table["episodes"] + 1, table[name], color=method(run.config["method"]["name"]).colour)
-        panel.set_title(text)
-        panel.set_xlabel("episodes")
+        panel.set(title=text, xlabel="episodes")
         if name == "score":
             panel.axhline(run.evaluation.get("score", np.nan), color="black", linewidth=0.8, linestyle="--")
         if name == "gradient_norm":
@@ -85,20 +75,12 @@ def actions(run: RunResult) -> Drawing:
     names = list(run.config["task"]["manipulators"])
     if run.best_actions is None:
         raise ResultsError("the run has no actions yet")
-    figure, axes = grid(1, 1, width=6.4, height=0.2 * run.best_actions.shape[1] + 0.5)
-    panel = axes[0, 0]
-    image = panel.imshow(
-        np.clip(run.best_actions, -1, 1).T,
-        vmin=-1,
-        vmax=1,
-        cmap="PuOr",
-        aspect="auto",
-        interpolation="nearest",
-    )
+    figure, panel = single(width=6.4, height=0.2 * run.best_actions.shape[1] + 0.5)
+    look: dict[str, Any] = {"vmin": -1, "vmax": 1, "cmap": "PuOr", "aspect": "auto"}
+    image = panel.imshow(np.clip(run.best_actions, -1, 1).T, interpolation="nearest", **look)
     count = run.best_actions.shape[1]
     panel.set_yticks(range(count), [str(k) for k in range(count)], fontsize=6)
-    panel.set_xlabel("environment step")
-    panel.set_ylabel("component")
+    panel.set(xlabel="environment step", ylabel="component")
     panel.grid(visible=False)
     figure.colorbar(image, ax=panel, pad=0.01, label="action")
     return Drawing(
@@ -118,9 +100,7 @@ def times(run: RunResult) -> Drawing:
     bars.invert_yaxis()
     bars.set_xlabel("seconds")
     rows.plot(run.iterations["iteration"][1:], run.iterations["seconds"][1:], color="#0072B2")
-    rows.set_ylim(bottom=0.0)
-    rows.set_xlabel("row")
-    rows.set_ylabel("seconds")
+    rows.set(ylim=(0.0, None), xlabel="row", ylabel="seconds")
     batch = run.provenance.get("batch", 1)
     share = f"; the run's share of a batch of {batch}" if batch and batch > 1 else ""
     return Drawing(

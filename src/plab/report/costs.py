@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from plab.report.collect import Runs
 from plab.report.curves import Series
-from plab.report.figures import Drawing, grid, legend, legend_of_methods, log_axis
+from plab.report.figures import Drawing, grid, legend, legend_of_methods, log_axis, single
 from plab.report.measurements import origin
 from plab.report.methods import method
 from plab.report.table import NOTHING
@@ -67,16 +67,14 @@ def phases(runs: Runs) -> Drawing | None:
     columns = [f"seconds_{name}" for name in names]
     means = runs.table.groupby(["task", "method"])[columns].mean()
     keys = [(t, m) for t in ordered_tasks(runs.tasks) for m in runs.methods if (t, m) in means.index]
-    figure, axes = grid(1, 1, width=6.4, height=0.24 * len(keys) + 0.6)
-    panel = axes[0, 0]
+    figure, panel = single(width=6.4, height=0.24 * len(keys) + 0.6)
     left = np.zeros(len(keys))
     for name, column in zip(names, columns, strict=True):
         values = means.loc[keys, column].fillna(0.0).to_numpy()
         panel.barh(range(len(keys)), values, left=left, color=PHASES[name], label=name, height=0.7)
         left += values
     panel.set_yticks(range(len(keys)), [f"{task}, {method(name).label}" for task, name in keys])
-    panel.set_ylim(len(keys) - 0.5, -0.5)
-    panel.set_xlabel("seconds of a run")
+    panel.set(ylim=(len(keys) - 0.5, -0.5), xlabel="seconds of a run")
     panel.grid(axis="y", visible=False)
     legend(figure)
     notes = ["Mean over the runs. Of runs in one batch each one's share of the time."]
@@ -176,8 +174,7 @@ def contact_models(runs: Runs, series: Series) -> Drawing | None:
     """
     if runs.table.empty:
         return None
-    figure, axes = grid(1, 1, width=3.6, height=3.1)
-    panel = axes[0, 0]
+    figure, panel = single(width=3.6, height=3.1)
     panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
     gaps: Mapping[str, list[float]] = {name: [] for name in runs.methods}
     for row, (_, rows) in zip(runs.table.to_dict("records"), series, strict=True):
@@ -188,10 +185,12 @@ def contact_models(runs: Runs, series: Series) -> Drawing | None:
                 before, row["score_best"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
             )
             gaps[row["method"]].append(row["score_best"] - before)
-    panel.set_xlim(-0.02, 1.02)
-    panel.set_ylim(-0.02, 1.02)
-    panel.set_xlabel("score of the best row, in its own contact model")
-    panel.set_ylabel("score of the final evaluation, hard contact")
+    panel.set(
+        xlim=(-0.02, 1.02),
+        ylim=(-0.02, 1.02),
+        xlabel="score of the best row, in its own contact model",
+        ylabel="score of the final evaluation, hard contact",
+    )
     legend_of_methods(figure, [name for name in runs.methods if gaps[name]])
     numbers = {
         name: {"runs": len(own), "mean": float(np.mean(own)), "largest": _largest(own)}

@@ -20,7 +20,7 @@ from plab.report.aggregate import improvement, interquartile_mean, performance_p
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
-from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis
+from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis, single
 from plab.report.methods import RL, method
 from plab.report.reference import paper_table
 from plab.report.series import Rows, band
@@ -71,24 +71,15 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
         if count < expected and name in set(runs.table["method"]):
             short.append(f"{method(name).label}\N{NO-BREAK SPACE}{count}/{expected}")
     axes.set_ylim(bottom=0.0, top=1.05 if column == "score" else None)
-    if not tables:
-        axes.set_xticks([])
-        axes.set_yticks([])
     small: dict[str, Any] = {"fontsize": 5, "color": "#666666", "ha": "center"}
     if not tables:
+        axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no runs", transform=axes.transAxes, va="center", **small)
     elif short:
         # Between title and axes, where it hides no curve.
         lines = textwrap.wrap(", ".join(short), 40, break_on_hyphens=False)
-        axes.annotate(
-            "\n".join(lines),
-            (0.5, 1.0),
-            (0, 2),
-            "axes fraction",
-            textcoords="offset points",
-            va="bottom",
-            **small,
-        )
+        small |= {"textcoords": "offset points", "va": "bottom"}
+        axes.annotate("\n".join(lines), (0.5, 1.0), (0, 2), "axes fraction", **small)
         axes.set_title(axes.get_title(), pad=3 + 7 * len(lines))
     return bool(tables)
 
@@ -218,9 +209,9 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     if len(own[["task", "method"]].drop_duplicates()) < 2:
         return []
     paper = paper_table("iou_per_task").set_index(["task", "method"])["iou_mean"]
-    figure, axes = grid(1, 1, width=1.0 + 0.6 * max(len(tasks), 3), height=2.4)
-    panel = axes[0, 0]
-    diamond = {"marker": "D", "s": 14, "facecolor": "white", "edgecolor": "black", "lw": 0.7, "zorder": 4}
+    figure, panel = single(width=1.0 + 0.6 * max(len(tasks), 3), height=2.4)
+    diamond: dict[str, Any] = {"marker": "D", "s": 14, "facecolor": "white", "edgecolor": "black"}
+    diamond |= {"lw": 0.7, "zorder": 4}
     width = 0.8 / max(len(methods), 1)
     table = runs.table
     for rank, name in enumerate(methods):
@@ -241,12 +232,11 @@ def rl_scores(runs: Runs) -> list[Drawing]:
         with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
             known = pd.read_csv(file).groupby("task")["score"].mean()
         best = [known.get(task, np.nan) for task in tasks]
-        line = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
+        line: dict[str, Any] = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
         panel.scatter(range(len(tasks)), best, label="best actions known", **line)
         notes.append("Black: mean over the variants of what the reference demonstrations reach.")
     panel.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
-    panel.set_ylim(0.0, 1.08)
-    panel.set_ylabel("normalised incremental IoU")
+    panel.set(ylim=(0.0, 1.08), ylabel="normalised incremental IoU")
     panel.grid(axis="x", visible=False)
     panel.set_axisbelow(True)
     legend(figure)
@@ -262,34 +252,18 @@ def agreement_plot(runs: Runs) -> list[Drawing]:
     cells = compared_cells(runs)
     if cells.empty:
         return []
-    figure, axes = grid(1, 1, width=3.4, height=3.3)
-    panel = axes[0, 0]
-    panel.fill_between(
-        [0, 1],
-        [-TOLERANCE, 1 - TOLERANCE],
-        [TOLERANCE, 1 + TOLERANCE],
-        color="#EDEDED",
-        zorder=0,
-        linewidth=0,
-    )
+    figure, panel = single(width=3.4, height=3.3)
+    low, high = np.array([0, 1]) - TOLERANCE, np.array([0, 1]) + TOLERANCE
+    panel.fill_between([0, 1], low, high, color="#EDEDED", zorder=0, linewidth=0)
     panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8, zorder=1)
     names = [name for name in runs.methods if name in set(cells["method"])]
     for name in names:
         own = cells[cells["method"] == name]
-        panel.plot(
-            own["paper"],
-            own["ours"],
-            "o",
-            color=method(name).colour,
-            markersize=3.2,
-            alpha=0.75,
-            clip_on=False,
-        )
-    panel.set_xlim(0.0, 1.0)
-    panel.set_ylim(0.0, 1.0)
-    panel.set_aspect("equal")
-    panel.set_xlabel("score in the paper")
-    panel.set_ylabel("score here")
+        dots: dict[str, Any] = {"color": method(name).colour, "markersize": 3.2, "alpha": 0.75}
+        panel.plot(own["paper"], own["ours"], "o", clip_on=False, **dots)
+    panel.set(
+        xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect="equal", xlabel="score in the paper", ylabel="score here"
+    )
     legend_of_methods(figure, names)
     whole = in_all(cells)
     panel.set_title(
@@ -308,8 +282,7 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
         what: Task and variant, for the heading.
         name: The method.
     """
-    figure, axes = grid(1, 1, width=4.2, height=2.8)
-    panel = axes[0, 0]
+    figure, panel = single(width=4.2, height=2.8)
     stresses = sorted(groups)
     finite = [stress for stress in stresses if 0 < stress < np.inf] or [1.0]
     scale = LogNorm(min(finite), max(max(finite), min(finite) * 1.0001), clip=True)
@@ -320,10 +293,7 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
             colour = to_hex(colormaps["viridis"](0.88 * float(scale(stress))))
             label = f"{stress:g} ({drawn.count} runs)"
             draw_band(panel, drawn, name, colour=colour, label=label)
-    panel.set_title(f"{what}, {method(name).label}")
-    panel.set_ylabel("reward")
-    panel.set_xlabel(_EPISODES)
-    panel.set_ylim(bottom=0.0)
+    panel.set(title=f"{what}, {method(name).label}", ylabel="reward", xlabel=_EPISODES, ylim=(0.0, None))
     panel.legend(title="yield stress")
     notes = ["Reward of an episode against episodes, by yield stress.", _SHADED, _CLAMPED]
     return [Drawing("yield_ablation", figure, notes)]
@@ -347,40 +317,41 @@ Strata = Mapping[str, Sequence[np.ndarray]]
 
 
 def _interquartile_means(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
-    figure, axes = grid(1, 1, width=4.2, height=0.3 * len(methods) + 0.4)
-    panel, numbers = axes[0, 0], {}
+    figure, panel = single(width=4.2, height=0.3 * len(methods) + 0.4)
+    numbers = {}
     for position, name in enumerate(methods):
         found = interquartile_mean(strata[name])
         numbers[name] = vars(found)
         reach = [[max(found.value - found.low, 0.0)], [max(found.high - found.value, 0.0)]]
         panel.errorbar(found.value, position, xerr=reach, fmt="o", color=method(name).colour, capsize=3)
     panel.set_yticks(range(len(methods)), [method(name).label for name in methods])
-    panel.set_ylim(len(methods) - 0.5, -0.5)
-    panel.set_xlim(0.0, 1.0)
-    panel.set_xlabel("interquartile mean of the normalised incremental IoU")
+    panel.set(
+        ylim=(len(methods) - 0.5, -0.5),
+        xlim=(0.0, 1.0),
+        xlabel="interquartile mean of the normalised incremental IoU",
+    )
     return Drawing("interquartile_mean", figure, ["Mean of the middle half of all scores.", *notes], numbers)
 
 
 def _profiles(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
-    figure, axes = grid(1, 1, width=4.2, height=2.8)
-    panel, thresholds = axes[0, 0], np.linspace(0.0, 1.0, 101)
+    figure, panel = single(width=4.2, height=2.8)
+    thresholds = np.linspace(0.0, 1.0, 101)
     for name in methods:
         look = method(name)
         shares, low, high = performance_profile(strata[name], thresholds)
         panel.plot(thresholds, shares, color=look.colour, linestyle=look.dashes, label=look.label)
         panel.fill_between(thresholds, low, high, color=look.colour, alpha=0.18, linewidth=0)
-    panel.set_xlim(0.0, 1.0)
-    panel.set_ylim(0.0, 1.02)
-    panel.set_xlabel("normalised incremental IoU")
-    panel.set_ylabel("share of runs above")
+    panel.set(
+        xlim=(0.0, 1.0), ylim=(0.0, 1.02), xlabel="normalised incremental IoU", ylabel="share of runs above"
+    )
     legend(figure)
     return Drawing("performance_profile", figure, ["Share of runs whose score is higher.", *notes])
 
 
 def _improvements(methods: Sequence[str], strata: Strata, notes: list[str]) -> Drawing:
     labels = [method(name).label for name in methods]
-    figure, axes = grid(1, 1, width=0.62 * len(methods) + 1.2, height=0.45 * len(methods) + 0.6)
-    panel, numbers = axes[0, 0], {}
+    figure, panel = single(width=0.62 * len(methods) + 1.2, height=0.45 * len(methods) + 0.6)
+    numbers = {}
     values = np.full((len(methods),) * 2, np.nan)
     for i, one in enumerate(methods):
         for j, other in enumerate(methods):
@@ -395,8 +366,7 @@ def _improvements(methods: Sequence[str], strata: Strata, notes: list[str]) -> D
     panel.imshow(values, vmin=0.0, vmax=1.0, cmap="PuOr", aspect="auto")
     panel.set_xticks(range(len(methods)), labels)
     panel.set_yticks(range(len(methods)), labels)
-    panel.set_xlabel("than a run of")
-    panel.set_ylabel("a run is better of")
+    panel.set(xlabel="than a run of", ylabel="a run is better of")
     panel.grid(visible=False)
     what = "Probability that a run of the method on the left scores higher than one of the method below."
     return Drawing("probability_of_improvement", figure, [what, *notes], numbers)

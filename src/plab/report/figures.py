@@ -29,6 +29,7 @@ __all__ = [
     "legend_of_methods",
     "log_axis",
     "save",
+    "single",
     "style",
 ]
 
@@ -83,6 +84,12 @@ def grid(rows: int, columns: int, *, width: float = 2.1, height: float = 1.7) ->
     # Not by pyplot, which would keep the figure and may look for a screen.
     figure = Figure(figsize=(max(width * columns, 3.2), height * rows + 0.5))
     return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def single(width: float, height: float) -> tuple[Figure, Axes]:
+    """Return a figure with a single panel, as :func:`grid` does."""
+    figure, axes = grid(1, 1, width=width, height=height)
+    return figure, axes[0, 0]
 
 
 def draw_band(

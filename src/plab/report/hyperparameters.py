@@ -53,31 +53,23 @@ def hyperparameters() -> list[Table]:
     both = shown[["method", "key", "plab", "paper"]]
     bold = np.zeros(both.shape, dtype=bool)
     bold[:, 2:] = differs.to_numpy()[:, None]
-    title = "Hyper-parameters"
+    forms = (
+        ("ours", "plab", ours, ["method", "key", "plab"], None),
+        ("paper", "the paper", theirs, ["method", "key", "paper"], None),
+        ("comparison", "compared", both, list(data), bold),
+    )
     return [
         Table(
             "hyperparameters",
-            "ours",
-            f"{title}, plab",
-            ours,
-            data[["method", "key", "plab"]],
-            None,
-            notes["ours"],
+            form,
+            f"Hyper-parameters, {whose}",
+            cells,
+            data[columns],
+            bolds,
+            notes[form],
             True,
-        ),
-        Table(
-            "hyperparameters",
-            "paper",
-            f"{title}, the paper",
-            theirs,
-            data[["method", "key", "paper"]],
-            None,
-            notes["paper"],
-            True,
-        ),
-        Table(
-            "hyperparameters", "comparison", f"{title}, compared", both, data, bold, notes["comparison"], True
-        ),
+        )
+        for form, whose, cells, columns, bolds in forms
     ]
 
 

@@ -43,16 +43,8 @@ ACCURACY = Benchmark(
     "accuracy.csv",
     "python -m plab.bench.accuracy --output {folder}",
     (
-        "axis",
-        "task",
-        "contact",
-        "precision",
-        "material",
-        "substeps",
-        "ms_per_step",
-        "positions",
-        "gradient",
-        "outcome",
+        *("axis", "task", "contact", "precision", "material", "substeps", "ms_per_step"),
+        *("positions", "gradient", "outcome"),
     ),
 )
 PRECISION = Benchmark(

@@ -22,7 +22,6 @@ from plab.report.collect import Runs, changed_settings
 from plab.report.media import Shown, best_runs, present
 from plab.report.methods import Method, method
 from plab.report.series import AXES, Band, band, rows_on_axes
-from plab.report.statistics import stratified_difference
 from plab.report.summary import aggregates, compared, finite, gallery, incomplete, per_task, sentence
 from plab.report.tables import Cells, ordered_tasks, settings_note
 from plab.report.templates import asset, render
@@ -138,16 +137,12 @@ def _look(look: Method, place: int) -> dict[str, str]:
 def _overview(runs: Runs) -> list[dict[str, Any]]:
     """Return our scores, the paper's and the difference of every configuration, by method."""
     ours, theirs = Cells("ours", runs), Cells("paper", runs)
-    listed = []
-    for task in ordered_tasks(runs.tasks):
-        for variant in runs.variants:
-            cells = {}
-            for name in runs.methods:
-                mine, printed = (source.configuration(task, variant, name) for source in (ours, theirs))
-                gap = stratified_difference([mine.summary], [printed.summary])
-                cells[name] = compared(mine, printed, gap)
-            listed.append({"name": f"{task}-v{variant}", "task": task, "variant": variant, "cells": cells})
-    return listed
+    return [
+        {"name": f"{task}-v{variant}", "task": task, "variant": variant}
+        | {"cells": compared(runs, ours, theirs, (task, variant))}
+        for task in ordered_tasks(runs.tasks)
+        for variant in runs.variants
+    ]
 
 
 # ---------------------------------------------------------------------------------------------- configuration

@@ -12,8 +12,8 @@ from plab.report.aggregate import improvement, interquartile_mean, performance_p
 from plab.report.collect import Runs
 from plab.report.media import Shown, best_of_tasks
 from plab.report.methods import method
-from plab.report.statistics import Interval
-from plab.report.tables import Cell, Cells, ordered_tasks, task_difference
+from plab.report.statistics import Interval, Summary
+from plab.report.tables import Cells, difference, ordered_tasks
 
 __all__ = ["aggregates", "compared", "finite", "gallery", "incomplete", "per_task", "sentence"]
 
@@ -25,17 +25,20 @@ def finite(value: float) -> float | None:
     return None if math.isnan(value) else round(float(value), 4)
 
 
-def compared(ours: Cell, theirs: Cell, gap: Interval) -> dict[str, Any]:
-    """Return our score, the paper's and their difference as the page has them."""
-    return {
-        "ours": _numbers(ours) | {"expected": ours.expected},
-        "paper": _numbers(theirs),
-        "difference": _ends(gap),
-    }
+def compared(runs: Runs, ours: Cells, theirs: Cells, key: tuple[str, ...]) -> dict[str, Any]:
+    """Return our score of a task, or of one of its variants, the paper's and their difference, by method."""
+    cells = {}
+    for name in runs.methods:
+        mine = ours.cell(key, name)
+        cells[name] = {
+            "ours": _numbers(mine.summary) | {"expected": mine.expected},
+            "paper": _numbers(theirs.cell(key, name).summary),
+            "difference": _ends(difference(ours, theirs, runs.variants, key, name)),
+        }
+    return cells
 
 
-def _numbers(cell: Cell) -> dict[str, Any]:
-    summary = cell.summary
+def _numbers(summary: Summary) -> dict[str, Any]:
     return {"mean": finite(summary.mean), "std": finite(summary.std), "count": summary.count}
 
 
@@ -81,19 +84,11 @@ def per_task(runs: Runs) -> list[dict[str, Any]]:
     """Return our scores, the paper's and the difference, by task and method; of tasks with runs."""
     ours, theirs = Cells("ours", runs), Cells("paper", runs)
     present = set(runs.table["task"])
-    listed = []
-    for task in ordered_tasks(runs.tasks):
-        if task in present:
-            cells = {
-                name: compared(
-                    ours.task(task, name),
-                    theirs.task(task, name),
-                    task_difference(ours, theirs, runs.variants, task, name),
-                )
-                for name in runs.methods
-            }
-            listed.append({"task": task, "cells": cells})
-    return listed
+    return [
+        {"task": task, "cells": compared(runs, ours, theirs, (task,))}
+        for task in ordered_tasks(runs.tasks)
+        if task in present
+    ]
 
 
 def gallery(shown: Sequence[Shown]) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -21,13 +21,13 @@ from plab.report.table import NOTHING, Table, number, spread
 
 __all__ = [
     "INTERVAL",
+    "difference",
     "ends",
     "iou_per_configuration",
     "iou_per_task",
     "ordered_tasks",
     "settings_note",
     "solvability",
-    "task_difference",
 ]
 
 _INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
@@ -86,28 +86,22 @@ class Cells:
             for key, own in runs.table.groupby(["task", "variant", "method"]):
                 self._scores[key] = own["score"].to_numpy(float)
 
-    def configuration(self, task: str, variant: str, name: str) -> Cell:
-        """Return the cell of a task, variant and method."""
-        key = (task, variant, name)
-        if self.source == "ours":
-            return Cell(summarise(self._scores.get(key, [])), len(self._runs.seeds))
-        return Cell(_printed("iou_per_configuration", key, PAPER_SEED_COUNT), 0)
-
-    def task(self, task: str, name: str) -> Cell:
-        """Return the cell of a task and method, over all variants."""
-        if self.source == "ours":
-            scores: list[ArrayLike] = [
-                self._scores.get((task, variant, name), []) for variant in self._runs.variants
-            ]
-            return Cell(summarise(np.concatenate(scores)), len(self._runs.variants) * len(self._runs.seeds))
-        return Cell(_printed("iou_per_task", (task, name), len(SUITE_VARIANTS) * PAPER_SEED_COUNT), 0)
+    def cell(self, key: tuple[str, ...], name: str) -> Cell:
+        """Return the cell of a task and variant, or of a task over all variants, and a method."""
+        task, *variant = key
+        if self.source == "paper":
+            return Cell(_printed((*key, name)), 0)
+        variants = variant or self._runs.variants
+        scores: list[ArrayLike] = [self._scores.get((task, one, name), []) for one in variants]
+        return Cell(summarise(np.concatenate(scores)), len(variants) * len(self._runs.seeds))
 
 
-def _printed(name: str, key: tuple[str, ...], count: int) -> Summary:
+def _printed(key: tuple[str, ...]) -> Summary:
     # Of part of a method's runs, the whole method's.
     *which, named = key
+    name, count = ("iou_per_task", len(SUITE_VARIANTS)) if len(which) == 1 else ("iou_per_configuration", 1)
     printed = _numbers_of_paper(name).get((*which, method(named).of or named))
-    return summarise([]) if printed is None else Summary(*printed, count)
+    return summarise([]) if printed is None else Summary(*printed, count * PAPER_SEED_COUNT)
 
 
 @functools.cache
@@ -128,86 +122,57 @@ def ordered_tasks(tasks: Sequence[str]) -> list[str]:
 
 def iou_per_task(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per task and method: ours, the paper's, and the two compared."""
-    what = "over variants and seeds"
     keys: list[tuple[str, ...]] = [(task,) for task in ordered_tasks(runs.tasks)]
-    ours, theirs = Cells("ours", runs), Cells("paper", runs)
-
-    def difference(key: tuple[str, ...], name: str) -> Interval:
-        return task_difference(ours, theirs, runs.variants, key[0], name)
-
-    title = "Normalised incremental IoU per task"
-    return _iou_tables(
-        runs, "iou_per_task", title, what, ("task",), keys, (ours.task, theirs.task), difference
-    )
-
-
-def task_difference(ours: Cells, theirs: Cells, variants: Sequence[str], task: str, name: str) -> Interval:
-    """Return the mean difference over the variants of a task that both have, see
-    :func:`plab.report.statistics.stratified_difference`."""
-    sides = [
-        [side.configuration(task, variant, name).summary for variant in variants] for side in (ours, theirs)
-    ]
-    return stratified_difference(*sides)
+    return _iou_tables(runs, "task", "over variants and seeds", keys)
 
 
 def iou_per_configuration(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
-    keys: list[tuple[str, ...]] = [
-        (task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants
-    ]
-    ours: Look = Cells("ours", runs).configuration
-    theirs: Look = Cells("paper", runs).configuration
+    return _iou_tables(runs, "configuration", "over seeds", _configurations(runs))
 
-    def difference(key: tuple[str, ...], name: str) -> Interval:
-        return stratified_difference([ours(*key, name).summary], [theirs(*key, name).summary])
 
-    title, names = "Normalised incremental IoU per configuration", ("task", "variant")
-    return _iou_tables(
-        runs, "iou_per_configuration", title, "over seeds", names, keys, (ours, theirs), difference
+def _configurations(runs: Runs) -> list[tuple[str, ...]]:
+    return [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
+
+
+def difference(
+    ours: Cells, theirs: Cells, variants: Sequence[str], key: tuple[str, ...], name: str
+) -> Interval:
+    """Return the difference of a cell; that of a task is the mean over the variants that both have, see
+    :func:`plab.report.statistics.stratified_difference`."""
+    strata = [key] if len(key) > 1 else [(*key, variant) for variant in variants]
+    return stratified_difference(
+        *([side.cell(one, name).summary for one in strata] for side in (ours, theirs))
     )
 
 
-Look = Callable[..., Cell]
+_OWNER = {"ours": "plab", "paper": "the paper"}
 
 
-def _iou_tables(
-    runs: Runs,
-    name: str,
-    title: str,
-    what: str,
-    names: tuple[str, ...],
-    keys: list[tuple[str, ...]],
-    looks: tuple[Look, Look],
-    difference: Callable[[tuple[str, ...], str], Interval],
-) -> list[Table]:
+def _iou_tables(runs: Runs, unit: str, what: str, keys: list[tuple[str, ...]]) -> list[Table]:
     """Return the three forms of a table of scores.
 
     Args:
         runs: Our runs.
-        name: Name of the files.
-        title: Heading.
+        unit: What there is a row per: ``task`` or ``configuration``.
         what: What means and spreads are taken over.
-        names: Columns that say what a row is about.
-        keys: Their values, a tuple per row.
-        looks: Finds our cell, and the paper's, for a key and a method.
-        difference: Compares ours and the paper's, for a key and a method.
+        keys: What a row is about: task, or task and variant.
     """
+    name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
+    names = ("task", "variant")[: 1 if unit == "task" else 2]
     notes = [f"Mean ± standard deviation {what}.", _BOLD]
+    sources = {form: Cells(form, runs) for form in _OWNER}
     made = []
-    for form, look, more in (
-        ("ours", looks[0], [_INCOMPLETE, *settings_note(runs)]),
-        ("paper", looks[1], []),
-    ):
+    for form, more in (("ours", [_INCOMPLETE, *settings_note(runs)]), ("paper", [])):
         methods = runs.methods if form == "ours" else [m for m in runs.methods if _in_paper(m)]
-        grid = [[look(*key, m) for m in methods] for key in keys]
+        grid = [[sources[form].cell(key, m) for m in methods] for key in keys]
         cells, data = _laid_out(grid, form, names, keys, methods)
         bold = np.array([[False] * len(names) + _best(line, methods) for line in grid])
         heading = f"{title}, {_OWNER[form]}"
         made.append(Table(name, form, heading, cells, data, bold, notes + more, len(keys) > 40))
-    return [*made, _compared(runs, name, title, names, keys, looks, difference)]
-
-
-_OWNER = {"ours": "plab", "paper": "the paper"}
+    compared, data = _compared(runs, names, keys, sources["ours"], sources["paper"])
+    notes = [_DIFFERENCE, *settings_note(runs)]
+    return [*made, Table(name, "comparison", f"{title}, compared", compared, data, None, notes, True)]
 
 
 def _laid_out(
@@ -234,30 +199,21 @@ def _laid_out(
 
 
 def _compared(
-    runs: Runs,
-    name: str,
-    title: str,
-    names: tuple[str, ...],
-    keys: list[tuple[str, ...]],
-    looks: tuple[Look, Look],
-    difference: Callable[[tuple[str, ...], str], Interval],
-) -> Table:
-    """Return our scores beside the paper's; the arguments are those of :func:`_iou_tables`."""
+    runs: Runs, names: tuple[str, ...], keys: list[tuple[str, ...]], ours: Cells, paper: Cells
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return our scores beside the paper's, as texts and as numbers."""
     cells, data = [], []
     for key in keys:
+        where = dict(zip(names, key, strict=True))
         for m in filter(_in_paper, runs.methods):
-            mine, theirs = looks[0](*key, m), looks[1](*key, m)
-            gap = difference(key, m)
-            where = dict(zip(names, key, strict=True))
+            mine, theirs = ours.cell(key, m), paper.cell(key, m)
+            gap = difference(ours, paper, runs.variants, key, m)
             shown = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
             cells.append(where | {"method": method(m).label} | shown | {INTERVAL: ends(gap)})
             printed = {f"paper_{k}": v for k, v in _numbers(theirs, "paper").items()}
             gaps: dict[str, Any] = {"difference": gap.value, "low": gap.low, "high": gap.high}
             data.append(where | {"method": m} | _numbers(mine, "ours") | printed | gaps)
-    notes = [_DIFFERENCE, *settings_note(runs)]
-    return Table(
-        name, "comparison", f"{title}, compared", pd.DataFrame(cells), pd.DataFrame(data), None, notes, True
-    )
+    return pd.DataFrame(cells), pd.DataFrame(data)
 
 
 INTERVAL = f"{CONFIDENCE:.0%} interval"
@@ -320,11 +276,8 @@ def solvability(runs: Runs) -> list[Table]:
         known = pd.read_csv(file, dtype={"variant": str}).set_index(["task", "variant"])["score"]
     paper = paper_table("iou_per_configuration")
     best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
-    keys: list[tuple[str, ...]] = [
-        (task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants
-    ]
     rows = []
-    for key in keys:
+    for key in _configurations(runs):
         score = float(known.get(key, np.nan))
         theirs = summarise([])
         if key in best.index:

@@ -30,7 +30,7 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
     paper = paper_table("timing").set_index("task")
     rows, compared = [], []
     for task in tasks:
-        for device in _devices(steps, task):
+        for device in sorted(set(steps[steps["task"] == task]["device"])) or [NOTHING]:
             mine = {kind: _times(steps, task, device, kind) for kind in ("gradient", "training")}
             rows.append({"task": task, "device": device} | mine)
             if task in paper.index and len(mine["gradient"]):
@@ -87,10 +87,6 @@ def _where(device: str, batch: float) -> str:
     return f"{device}, {batch:.0f} runs at once" if batch > 1 else device
 
 
-def _devices(steps: pd.DataFrame, task: str) -> list[str]:
-    return sorted(set(steps[steps["task"] == task]["device"])) or [NOTHING]
-
-
 def _times(steps: pd.DataFrame, task: str, device: str, kind: str) -> np.ndarray:
     chosen = (steps["task"] == task) & (steps["device"] == device) & (steps["kind"] == kind)
     # Runs that were computed together have the same share of the same time: one measurement.
@@ -98,7 +94,8 @@ def _times(steps: pd.DataFrame, task: str, device: str, kind: str) -> np.ndarray
 
 
 def _time_row(task: str, where: str, kind: str, ms: np.ndarray, theirs: float) -> dict[str, object]:
-    gap = _time_gap(ms, theirs)
+    # The paper gives no spread: all of the interval is ours.
+    gap = stratified_difference([summarise(ms)], [Summary(theirs, 0.0, 2)])
     mean = float(ms.mean())
     return {
         "task": task,
@@ -113,11 +110,6 @@ def _time_row(task: str, where: str, kind: str, ms: np.ndarray, theirs: float) -
         "high": gap.high,
         "ratio": theirs / mean,
     }
-
-
-def _time_gap(ms: np.ndarray, theirs: float) -> Interval:
-    # The paper gives no spread: all of the interval is ours.
-    return stratified_difference([summarise(ms)], [Summary(theirs, 0.0, 2)])
 
 
 def _measured(ms: Summary) -> str:
@@ -137,14 +129,8 @@ def _our_times(rows: Sequence[dict[str, Any]], runs: Runs) -> Table:
             )
         cells.append(shown)
     notes = [_TIMES, *settings_note(runs)]
-    return Table(
-        "timing",
-        "ours",
-        "Time per environment step, plab",
-        pd.DataFrame(cells),
-        pd.DataFrame(data),
-        notes=notes,
-    )
+    title, shown = "Time per environment step, plab", pd.DataFrame(cells)
+    return Table("timing", "ours", title, shown, pd.DataFrame(data), notes=notes)
 
 
 def _papers_times(tasks: Sequence[str], paper: pd.DataFrame) -> Table:
@@ -161,19 +147,6 @@ def _papers_times(tasks: Sequence[str], paper: pd.DataFrame) -> Table:
 
 
 def _compared_times(rows: Sequence[dict[str, Any]], runs: Runs, more: list[str]) -> Table:
-    cells = [
-        {
-            "task": row["task"],
-            "what": row["what"],
-            "measured by": row["measured"],
-            "plab [ms]": _measured(Summary(row["ms"], row["std"], row["measurements"])),
-            "paper [ms]": number(row["paper_ms"]),
-            "difference": number(row["difference"], sign=True),
-            INTERVAL: ends(Interval(row["difference"], row["low"], row["high"])),
-            "paper / plab": number(row["ratio"], 1),
-        }
-        for row in rows
-    ]
     columns = [
         "task",
         "what",
@@ -184,6 +157,17 @@ def _compared_times(rows: Sequence[dict[str, Any]], runs: Runs, more: list[str])
         INTERVAL,
         "paper / plab",
     ]
+    cells = [
+        (
+            *(row[name] for name in ("task", "what", "measured")),
+            _measured(Summary(row["ms"], row["std"], row["measurements"])),
+            number(row["paper_ms"]),
+            number(row["difference"], sign=True),
+            ends(Interval(row["difference"], row["low"], row["high"])),
+            number(row["ratio"], 1),
+        )
+        for row in rows
+    ]
     notes = [
         _TIMES,
         "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
@@ -192,7 +176,5 @@ def _compared_times(rows: Sequence[dict[str, Any]], runs: Runs, more: list[str])
         *settings_note(runs),
     ]
     data = pd.DataFrame(rows, columns=None if rows else ["task", "measured", "what", "measurements", "ms"])
-    shown = pd.DataFrame(cells, columns=columns)
-    return Table(
-        "timing", "comparison", "Time per environment step, compared", shown, data, None, notes, True
-    )
+    shown, title = pd.DataFrame(cells, columns=columns), "Time per environment step, compared"
+    return Table("timing", "comparison", title, shown, data, None, notes, True)

@@ -10,7 +10,7 @@ import pandas as pd
 
 from plab.report.agreement import TOLERANCE
 from plab.report.collect import Runs
-from plab.report.figures import Drawing, grid, legend_of_methods
+from plab.report.figures import Drawing, legend_of_methods, single
 from plab.report.methods import method
 from plab.report.table import number
 from plab.report.tables import iou_per_configuration, iou_per_task, ordered_tasks
@@ -103,29 +103,20 @@ def differences(runs: Runs) -> Drawing | None:
     tasks = [task for task in ordered_tasks(runs.tasks) if task in set(judged["task"])]
     methods = [name for name in runs.methods if name in set(judged["method"])]
     rows = len(tasks) * (len(methods) + 1)
-    figure, axes = grid(1, 1, width=6.4, height=0.16 * rows + 0.5)
-    panel = axes[0, 0]
+    figure, panel = single(width=6.4, height=0.16 * rows + 0.5)
     panel.axvspan(-TOLERANCE, TOLERANCE, color="#EDEDED", zorder=0)
     panel.axvline(0.0, color="#555555", linewidth=0.8)
     for row in judged.to_dict("records"):
         look = method(row["method"])
         y = tasks.index(row["task"]) * (len(methods) + 1) + methods.index(row["method"])
         reach = [[row["difference"] - row["low"]], [row["high"] - row["difference"]]]
-        known = not math.isnan(row["low"])
-        panel.errorbar(
-            row["difference"],
-            y,
-            xerr=reach if known else None,
-            fmt="o",
-            color=look.colour,
-            markersize=4,
-            capsize=2,
-            markerfacecolor=look.colour if row["runs"] >= row["expected"] else "white",
-        )
+        bars = None if math.isnan(row["low"]) else reach
+        inside = look.colour if row["runs"] >= row["expected"] else "white"
+        dots: dict[str, Any] = {"fmt": "o", "markersize": 4, "capsize": 2, "markerfacecolor": inside}
+        panel.errorbar(row["difference"], y, xerr=bars, color=look.colour, **dots)
     middle = (len(methods) - 1) / 2
     panel.set_yticks([place * (len(methods) + 1) + middle for place in range(len(tasks))], tasks)
-    panel.set_ylim(rows - 1.5, -1.0)
-    panel.set_xlabel("score, plab minus the paper")
+    panel.set(ylim=(rows - 1.5, -1.0), xlabel="score, plab minus the paper")
     panel.grid(axis="y", visible=False)
     legend_of_methods(figure, methods)
     notes = ["Points: differences of mean scores; bars: 95 % intervals; open: runs are missing."]
