@@ -19,11 +19,18 @@ from plab.cli.command import command_line, complain
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.examples import resolve
-from plab.submissions.card import CARD_BYTES, Card, CardError, parse_card
 from plab.submissions.collecting import from_policies, from_sources
 from plab.submissions.files import inconsistency, write
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import SUFFIX, UNSEEN, Submission
+from plab.submissions.schema import (
+    CARD_BYTES,
+    SUFFIX,
+    UNSEEN,
+    Card,
+    CardError,
+    Submission,
+    SubmissionError,
+    parse_card,
+)
 
 __all__ = ["main"]
 

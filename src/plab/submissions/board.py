@@ -18,11 +18,9 @@ from plab.report.methods import GRADIENT, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.results import ResultsError, Row, config_dict
 from plab.results.loading import readable_rows
-from plab.submissions.card import Card
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.files import read
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import UNSEEN, Configuration, Digests, Submission
+from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submission, SubmissionError
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, Verification, read_verification
 from plab.targets.store import PHYSICS_VERSION
 

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from plab.config import Config, load_config
+from plab.config import load_config
 from plab.config.selection import Selection
 from plab.render import RenderError, recording
 from plab.report.series import load_rows
 from plab.results import Row
 from plab.results.loading import readable_rows
 from plab.submissions.files import read
-from plab.submissions.members import SubmissionError
 from plab.submissions.playing import play_policy
 from plab.submissions.policies import load
-from plab.submissions.schema import SUFFIX, UNSEEN, Configuration, Digests, Entry, configuration_of
+from plab.submissions.schema import (
+    SUFFIX,
+    Configuration,
+    Digests,
+    Entry,
+    SubmissionError,
+    configuration_of,
+    variant_words,
+)
 
 __all__ = ["from_policies", "from_sources", "steps_to_best", "submission_files"]
 
@@ -109,7 +116,7 @@ def from_policies(
             files[name] = path.read_bytes()
         except OSError as error:
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
-        cfgs = list(_configs(task, variants, overrides))
+        cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
         played = play_policy(cfgs, load(name, files[name]), str(path), "float32")
         for cfg, one in zip(cfgs, played, strict=True):
             place = configuration_of(cfg)
@@ -117,10 +124,3 @@ def from_policies(
                 raise SubmissionError(f"{place.name}: the simulation broke off, {one.failure}")
             entries.append(Entry(place, Digests.of(cfg), steps, one.score, policy=name))
     return entries, files
-
-
-def _configs(task: str, variants: Sequence[str], overrides: Sequence[str]) -> Iterator[Config]:
-    for variant in variants:
-        seed = variant.removeprefix("random")
-        chosen = ["variant=random", f"seed_scene={seed}"] if variant in UNSEEN else [f"variant={variant}"]
-        yield load_config([f"task={task}", *chosen, *overrides])

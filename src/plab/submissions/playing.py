@@ -10,8 +10,8 @@ import numpy as np
 
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
-from plab.submissions.members import SubmissionError
 from plab.submissions.policies import Policy
+from plab.submissions.schema import SubmissionError
 
 __all__ = ["Played", "play_plans", "play_policy"]
 

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from plab.submissions.members import SubmissionError
+from plab.submissions.schema import SubmissionError
 
 __all__ = ["Policy", "load"]
 

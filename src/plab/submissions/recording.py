@@ -22,8 +22,7 @@ from plab.envs.vector import PlabVectorEnv
 from plab.report.budgets import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.files import encode, write
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, configuration_of
+from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, SubmissionError, configuration_of
 
 __all__ = ["Recorder", "VectorRecorder", "record"]
 

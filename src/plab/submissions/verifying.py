@@ -14,10 +14,9 @@ import plab
 from plab.config import PRECISIONS, Config
 from plab.provenance import now
 from plab.results.files import replace_file
-from plab.submissions.members import SubmissionError
 from plab.submissions.playing import Played, play_plans, play_policy
 from plab.submissions.policies import load
-from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission
+from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission, SubmissionError
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["TOLERANCE", "Verdict", "Verification", "read_verification", "verify", "write_verification"]
