@@ -17,12 +17,18 @@ from pathlib import Path
 import plab
 from plab.cli.arguments import Parser, folder
 from plab.cli.command import command_line
+from plab.config.suite import suite_tasks
 from plab.errors import tell
+from plab.report.budgets import BUDGETS
+from plab.report.templates import asset, render
 from plab.submissions.board import board
-from plab.submissions.page import write_leaderboard
+from plab.submissions.verifying import TOLERANCE
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["main"]
+
+_PACKAGE = "plab.submissions"
+"""Where the files of the page are."""
 
 
 @command_line
@@ -37,7 +43,20 @@ def main(argv: Sequence[str] | None = None) -> None:
         "overrides": options.overrides,
     }
     made = board(options.folder, options.overrides)
-    path = write_leaderboard(made, options.out, origin)
+    html = render(
+        "leaderboard.html",
+        _PACKAGE,
+        style=asset("page.css") + asset("leaderboard.css", _PACKAGE),
+        script=asset("theme.js") + asset("leaderboard.js", _PACKAGE),
+        board=made,
+        budgets=[f"{count / 1e6:g}M" if count >= 1e6 else f"{count / 1e3:g}k" for count in BUDGETS],
+        tasks=suite_tasks(),
+        tolerance=TOLERANCE,
+        origin=origin,
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "index.html"
+    path.write_text(html, encoding="utf-8", newline="\n")
     for line in made.left_out:
         tell(f"left out: {line}")
     print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")

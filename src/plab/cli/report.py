@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
@@ -31,9 +30,6 @@ from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import Page
 from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["main"]
 

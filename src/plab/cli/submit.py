@@ -46,10 +46,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except CardError as error:
         # All that is wrong with it, a line each.
         return max(map(complain, error.faults))
-    return _run(options, card)
-
-
-def _run(options: argparse.Namespace, card: Card) -> int:
     folders, words = sources_and_words(options.arguments)
     sources = [resolve(folder) for folder in folders]
     if options.policy:

@@ -75,12 +75,7 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
 
 
 def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
-    """Put a file in place in one atomic step.
-
-    Args:
-        path: File to create or replace.
-        content: What it is to hold.
-        sync: Wait until the disk has it.
+    """Create or replace a file in one atomic step; ``sync`` waits until the disk has it.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
@@ -100,12 +95,7 @@ def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
 
 
 def cause(error: OSError, size: int) -> str:
-    """Return why something could not be written, and, where a disk is full, what room it needs.
-
-    Args:
-        error: What the system answered.
-        size: What was to be written [bytes].
-    """
+    """Return why ``size`` bytes could not be written, and, where a disk is full, what room they need."""
     why = error.strerror or str(error)
     if error.errno not in _FULL:
         return why

@@ -158,7 +158,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     runs = {key: Run(*key) for key in keys}
     others = 0
     for row in fitting:
-        run = runs.get(_key(row))
+        run = runs.get(_names(row.values))
         # Of several settings of the same run the best one counts.
         others += run is None or run.state != "missing"
         if run is not None:
@@ -169,9 +169,8 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     means = _mean_seconds(runs.values())
     for run in runs.values():
         _estimate(run, means.get((run.task, run.method)))
-    groups = [
-        _group(task, method, runs.values(), means) for task, method in dict.fromkeys(_pairs(runs.values()))
-    ]
+    pairs = dict.fromkeys((run.task, run.method) for run in runs.values())
+    groups = [_group(task, method, runs.values(), means) for task, method in pairs]
     return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable], protocol)
 
 
@@ -179,10 +178,14 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
 
 def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> Iterable[Key]:
-    present = list(dict.fromkeys(_key(row) for row in found))
+    present = list(dict.fromkeys(_names(row.values) for row in found))
     if not chosen.keys:
         # Of a run without a file only its name is known.
-        present += [key for key in dict.fromkeys(begun) if key not in present and chosen(_values(key), {})]
+        present += [
+            key
+            for key in dict.fromkeys(begun)
+            if key not in present and chosen(dict(zip(NAMES, key, strict=True)), {})
+        ]
     if missing or (not present and chosen.choices):
         return _suite(present, chosen)
     # What the words name takes the place of what a run has.
@@ -202,7 +205,7 @@ def _suite(present: Sequence[Key], chosen: Selection) -> Iterable[Key]:
     open_choices = {
         "task": suite_tasks(),
         "variant": list(SUITE_VARIANTS),
-        "method": _in_order(methods, PAPER_METHODS) or list(PAPER_METHODS),
+        "method": sorted(methods, key=lambda name: _place(name, PAPER_METHODS)) or list(PAPER_METHODS),
         "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
     }
     asked = [chosen.choices.get(name, open_choices[name]) for name in NAMES]
@@ -215,11 +218,6 @@ def _require_few(count: int) -> None:
         raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
 
 
-def _in_order(names: Iterable[str], known: Sequence[str]) -> list[str]:
-    """Return names in the order of those that are known, the others after them."""
-    return sorted(names, key=lambda name: _place(name, known))
-
-
 def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
     return (known.index(name), "") if name in known else (len(known), name)
 
@@ -230,14 +228,6 @@ def _rank(key: Key) -> tuple[Any, ...]:
     number = int(seed) if seed.isdecimal() else -1
     orders = (task, suite_tasks()), (method, PAPER_METHODS), (variant, SUITE_VARIANTS)
     return *(_place(name, list(known)) for name, known in orders), number, seed
-
-
-def _values(key: Key) -> dict[str, str]:
-    return dict(zip(NAMES, key, strict=True))
-
-
-def _key(row: Row) -> Key:
-    return _names(row.values)
 
 
 def _names(values: Mapping[str, Any]) -> Key:
@@ -334,10 +324,6 @@ def _estimate(run: Run, mean: float | None) -> None:
     elif run.left is None and mean is not None:
         share = run.done / run.total if run.total else 0.0
         run.left = mean * max(1.0 - share, 0.0)
-
-
-def _pairs(runs: Iterable[Run]) -> Iterable[tuple[str, str]]:
-    return ((run.task, run.method) for run in runs)
 
 
 def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:

@@ -134,10 +134,9 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
         raise SubmissionError(f"there is no folder {folder}")
     tables: dict[tuple[str, str], list[Line]] = defaultdict(list)
     left_out: list[str] = []
-    known = _Known(tuple(overrides))
     for path in submission_files(folder):
         try:
-            for place, line in _handed_in(path, known):
+            for place, line in _handed_in(path, tuple(overrides)):
                 tables[place].append(line)
         except ResultsError as error:
             left_out.append(str(error))
@@ -207,30 +206,25 @@ def _composed(place: Configuration, overrides: tuple[str, ...]) -> Config:
     return place.config(overrides)
 
 
-class _Known:
-    """Digests of the configurations that belong to a board, composed once."""
-
-    def __init__(self, overrides: tuple[str, ...]) -> None:
-        self._overrides = overrides
-        self._digests: dict[Configuration, Digests] = {}
-
-    def fit(self, submission: Submission) -> str | None:
-        """Return the name of a configuration that is another one here, None if there is none."""
-        for entry in submission.entries:
-            place = entry.configuration
-            # The scene is the same, and the authors' files need not be here.
-            own = replace(place, targets="suite")
-            if own not in self._digests:
-                self._digests[own] = Digests.of(_composed(own, self._overrides))
-            known = self._digests[own]
-            if entry.digests.scene != known.scene:
-                return f"the scene of {place.name}"
-            if place.targets == "suite" and entry.digests.target != known.target:
-                return f"the target of {place.name}"
-        return None
+@functools.cache
+def _digests(place: Configuration, overrides: tuple[str, ...]) -> Digests:
+    return Digests.of(_composed(place, overrides))
 
 
-def _handed_in(path: Path, known: _Known) -> Iterator[tuple[tuple[str, str], Line]]:
+def _stranger(submission: Submission, overrides: tuple[str, ...]) -> str | None:
+    """Return the name of a configuration that is another one here, None if there is none."""
+    for entry in submission.entries:
+        place = entry.configuration
+        # The scene is the same, and the authors' files need not be here.
+        known = _digests(replace(place, targets="suite"), overrides)
+        if entry.digests.scene != known.scene:
+            return f"the scene of {place.name}"
+        if place.targets == "suite" and entry.digests.target != known.target:
+            return f"the target of {place.name}"
+    return None
+
+
+def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[str, str], Line]]:
     """Yield the lines of a submission, with the tables that they belong to.
 
     Raises:
@@ -243,7 +237,7 @@ def _handed_in(path: Path, known: _Known) -> Iterator[tuple[tuple[str, str], Lin
         raise SubmissionError(
             f"{path} is of physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
         )
-    if other := known.fit(submission):
+    if other := _stranger(submission, overrides):
         raise SubmissionError(f"{path}: {other} is another one than on this leaderboard")
     verification = read_verification(submission)
     status = "claimed"

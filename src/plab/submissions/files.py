@@ -50,15 +50,8 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of every member: the same submission gives the same bytes."""
 
 
-# ---------------------------------------------------------------------------------------------------- writing
-
-
 def write(submission: Submission, path: Path) -> None:
     """Write a submission in one atomic step, as of this plab.
-
-    Args:
-        submission: What to write.
-        path: File to create or replace.
 
     Raises:
         SubmissionError: If the name does not end in :data:`SUFFIX`.
@@ -107,13 +100,7 @@ def encode(submission: Submission) -> bytes:
 
 
 def read(path: str | Path) -> Submission:
-    """Read a submission; nothing in it is executed.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The submission; whether its claims hold is for :mod:`plab.submissions.verifying` to say.
+    """Read a submission; nothing in it is executed, and whether its claims hold is not judged.
 
     Raises:
         SubmissionError: If the file is cut off, too large, of another layout or not what it should be.

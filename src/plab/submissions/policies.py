@@ -18,11 +18,7 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 def load(name: str, content: bytes) -> Policy:
-    """Make a policy callable.
-
-    Args:
-        name: Name of its file; the ending says of which kind it is.
-        content: The file.
+    """Make a policy callable; the ending of its file's name says of which kind it is.
 
     Raises:
         SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,10 +88,15 @@ def verify(
     given = tuple(overrides)
     cfgs = _configs(submission, given)
     scores: dict[int, dict[str, Played]] = defaultdict(dict)
+    # Each group is what one simulator can play.
+    alike: dict[Any, list[int]] = defaultdict(list)
+    for number, entry in enumerate(submission.entries):
+        place = entry.configuration
+        if run_policies or not entry.policy:
+            alike[place.task, place.targets, place.terms, entry.policy].append(number)
     groups = [
         (numbers, _player(submission, [submission.entries[number] for number in numbers]))
-        for numbers in _groups(submission)
-        if run_policies or not submission.entries[numbers[0]].policy
+        for numbers in alike.values()
     ]
     # Going from one precision to the other starts Taichi anew.
     for precision in precisions:
@@ -112,15 +117,6 @@ def _player(
         return lambda cfgs, precision: play_policy(cfgs, policy, name, precision)
     plans = [entry.actions for entry in entries if entry.actions is not None]
     return lambda cfgs, precision: play_plans(cfgs, plans, precision)
-
-
-def _groups(submission: Submission) -> Iterator[list[int]]:
-    """Yield the numbers of entries that one simulator can play."""
-    groups: dict[Any, list[int]] = defaultdict(list)
-    for number, entry in enumerate(submission.entries):
-        place = entry.configuration
-        groups[place.task, place.targets, place.terms, entry.policy].append(number)
-    yield from groups.values()
 
 
 def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
