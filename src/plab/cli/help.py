@@ -70,11 +70,8 @@ _KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P
 
 
 def help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help``, two screens: usage, flags, the names of all choices, keys used often.
-
-    Args:
-        config_dir: Folder with files of the user's own, whose names are listed, too.
-    """
+    """Return the text of ``--help``, two screens: usage, flags, the names of all choices, those of the user's
+    own files in ``config_dir`` included, keys used often."""
     parts = [_USAGE, _FLAGS, "CHOICES"]
     for group in (*GROUPS, EXPERIMENT):
         sign = "+" if group == EXPERIMENT else ""
@@ -91,11 +88,7 @@ def help_text(config_dir: str | None = None) -> str:
 
 def full_help_text(config_dir: str | None = None) -> str:
     """Return the text of ``--help-all``: that of ``--help``, more examples, what each choice is, and every
-    key with its default and explanation.
-
-    Args:
-        config_dir: Folder with files of the user's own, whose names are listed, too.
-    """
+    key with its default and explanation."""
     folder = conf_folder()
     parts = [_USAGE, _MORE_EXAMPLES, _FLAGS]
     for group in GROUPS:

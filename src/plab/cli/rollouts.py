@@ -27,13 +27,8 @@ WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
 
 
 def make_parser(name: str, text: str, every: str) -> Parser:
-    """Return a parser with the arguments that choose a rollout.
-
-    Args:
-        name: As :class:`plab.cli.arguments.Parser` takes it.
-        text: The same.
-        every: What has a frame every K environment steps.
-    """
+    """Return a parser with the arguments that choose a rollout, of which ``every`` says what has a frame
+    every K environment steps."""
     parser = Parser(name, text)
     add = parser.add_argument
     add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run")

@@ -11,7 +11,7 @@ import io
 import lzma
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,14 @@ def pack(
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = readable_rows(source)
-    chosen = _members(filter(wanted or _finished, found))
+    chosen: dict[str, Row] = {}
+    for row in filter(wanted or _finished, found):
+        name = _member(row).as_posix()
+        if name in chosen:
+            raise ResultsError(
+                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
+            )
+        chosen[name] = row
     if not chosen:
         hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
         raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
@@ -97,9 +104,8 @@ def pack(
             member = zipfile.ZipInfo(name, _EPOCH)
             member.external_attr = 0o644 << 16
             members.writestr(member, encode(run, compress=False), zipfile.ZIP_STORED)
-    _make_folder(archive)
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    replace_file(archive, lzma.compress(content.getvalue(), preset=9), sync=True)
+    replace_file(archive, lzma.compress(content.getvalue(), preset=9), sync=True, folders=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
 
 
@@ -114,19 +120,6 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
 
     measured = run.iterations.select_dtypes("floating").apply(nearest)
     return replace(run, iterations=run.iterations.assign(**measured), best_loss=float(nearest(run.best_loss)))
-
-
-def _members(wanted: Iterable[Row]) -> dict[str, Row]:
-    """Return the runs to pack by their place in the archive."""
-    chosen: dict[str, Row] = {}
-    for row in wanted:
-        name = _member(row).as_posix()
-        if name in chosen:
-            raise ResultsError(
-                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
-            )
-        chosen[name] = row
-    return chosen
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
@@ -152,19 +145,9 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
             raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
         if path.exists():
             continue
-        run = read(row.path)
-        _make_folder(path)
-        replace_file(path, encode(run, compress=True), sync=False)
+        replace_file(path, encode(read(row.path), compress=True), sync=False, folders=True)
         written += 1
     return written, len(found) - written
-
-
-def _make_folder(path: Path) -> None:
-    """Make the folder that a file is to be written to."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _member(row: Row) -> Path:

@@ -74,14 +74,18 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
     replace_file(path, encode(result, compress=compress), sync=compress)
 
 
-def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
-    """Create or replace a file in one atomic step; ``sync`` waits until the disk has it.
+def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = False) -> None:
+    """Create or replace a file in one atomic step.
+
+    With ``sync`` wait until the disk has it, with ``folders`` make those that it is in.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
     """
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
+        if folders:
+            path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             file.write(content)
             if sync:

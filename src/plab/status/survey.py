@@ -168,7 +168,12 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
             runs[key].state = "running"
     means = _mean_seconds(runs.values())
     for run in runs.values():
-        _estimate(run, means.get((run.task, run.method)))
+        mean = means.get((run.task, run.method))
+        if run.state == "done":
+            run.left = 0.0
+        elif run.left is None and mean is not None:
+            # Its own speed has not said so.
+            run.left = mean * max(1.0 - (run.done / run.total if run.total else 0.0), 0.0)
     pairs = dict.fromkeys((run.task, run.method) for run in runs.values())
     groups = [_group(task, method, runs.values(), means) for task, method in pairs]
     return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable], protocol)
@@ -315,15 +320,6 @@ def _mean_seconds(runs: Iterable[Run]) -> dict[tuple[str, str], float]:
         if run.state == "done":
             times.setdefault((run.task, run.method), []).append(run.seconds)
     return {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
-
-
-def _estimate(run: Run, mean: float | None) -> None:
-    """Say how long a run that is not done will take, if its own speed has not said so."""
-    if run.state == "done":
-        run.left = 0.0
-    elif run.left is None and mean is not None:
-        share = run.done / run.total if run.total else 0.0
-        run.left = mean * max(1.0 - share, 0.0)
 
 
 def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:

@@ -59,11 +59,7 @@ def write(submission: Submission, path: Path) -> None:
     """
     if not path.name.endswith(SUFFIX):
         raise SubmissionError(f"a submission's name ends in {SUFFIX}: {path}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SubmissionError(f"cannot write {path}: {error.strerror or error}") from error
-    replace_file(path, encode(submission), sync=submission.card is not None)
+    replace_file(path, encode(submission), sync=submission.card is not None, folders=True)
 
 
 def encode(submission: Submission) -> bytes:
