@@ -48,11 +48,7 @@ def passed_on() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return what a text names.
-
-    Args:
-        text: Module and name in it, as ``module:NAME``.
-        kind: What it has to be an instance of; ``type`` for classes.
+    """Return what a text names, as ``module:NAME``: an instance of ``kind``, which is ``type`` for classes.
 
     Raises:
         plab.config.ConfigError: If the text is no such text, there is no such module or name, the module

@@ -22,13 +22,8 @@ class SimulatorCache:
         self._kept: dict[Any, Any] = {}
 
     def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
-        """Return something that holds a simulator: what is kept from the last run, if that is the same.
-
-        Args:
-            key: What it is made for.
-            build: Makes a new one.
-            check: Called with the old one; raises RuntimeError if its memory is gone.
-        """
+        """Return something that holds a simulator: what is kept from the last run, if its key is the same and
+        ``check`` raises no RuntimeError, as its memory is gone; else what ``build`` makes."""
         # Somebody else may have restarted Taichi with another precision or device.
         with suppress(RuntimeError):
             if key in self._kept:

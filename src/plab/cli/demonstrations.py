@@ -103,14 +103,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def replay(cfgs: Sequence[Config]) -> list[Replay]:
-    """Replay the demonstrations of configurations of one task, and an episode without any motion.
-
-    Args:
-        cfgs: Configurations that fit into one batch; those without a demonstration are replayed at rest.
-
-    Returns:
-        What each reached.
-    """
+    """Replay the demonstrations of configurations that fit into one batch, and an episode without any motion;
+    those without a demonstration are replayed at rest."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
@@ -125,9 +119,8 @@ def _require_own_resolution(cfg: Config) -> None:
     """Refuse to record what was found on another grid than the suite's."""
     own = load_config([f"task={cfg.task.name}", f"variant={cfg.variant}"])
     if build_scene(cfg) != build_scene(own):
-        raise ConfigError(
-            "demonstrations are recorded at the suite's own resolution: leave out what changes it"
-        )
+        why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
+        raise ConfigError(why)
 
 
 def _is_geometric(cfg: Config) -> bool:

@@ -13,7 +13,7 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from plab.cli.arguments import Parser, folder, sources_and_words
@@ -91,21 +91,17 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
     page.write(drawing=bool(wanted))
     if wanted:
         try:
-            _draw(wanted, lambda: page.write(drawing=True))
+            require_graphics()
+            # Imported here: all else needs neither PyVista nor Taichi.
+            from plab.render.replays import draw_runs
+
+            draw_runs(wanted, lambda: page.write(drawing=True))
         except RenderError as error:
             tell(f"without pictures: {error}")
         finally:
             remove_earlier(page.shown, out)
             page.write()
     return "index.html"
-
-
-def _draw(wanted: Mapping[Path, Mapping[str, tuple[Path, bool]]], drawn: Callable[[], None]) -> None:
-    require_graphics()
-    # Imported here: all else needs neither PyVista nor Taichi.
-    from plab.render.replays import draw_runs
-
-    draw_runs(wanted, drawn)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}

@@ -212,7 +212,11 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
         for name, mass in result.masses.items():
             if given and name == "target":
                 continue
-            _write_sparse(masses.create_group(name), mass, options)
+            flat, group = np.asarray(mass).ravel(), masses.create_group(name)
+            index = np.flatnonzero(flat).astype(np.int32)
+            group.attrs["shape"] = np.shape(mass)
+            group.create_dataset("index", data=index, **options)
+            group.create_dataset("value", data=flat[index], **options)
         if result.resume is not None:
             _write_tree(file.create_group("resume"), result.resume)
         file.flush()
@@ -233,12 +237,15 @@ def opened(path: Path) -> Iterator[h5py.File]:
     inside = split_archive(path)
     with explained(path):
         if inside is None:
-            regular_file(path)
+            found = regular_file(path)
             if path.name.endswith(OLD_ARCHIVE_SUFFIX):
                 raise ResultsError(
                     f"{path} was packed by an older plab: unpack it with a zip program, it holds result files"
                 )
-            _check_file(path)
+            # Of nothing no memory is mapped.
+            if found.st_size:
+                with path.open("rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                    check_heaps(content)
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
@@ -285,14 +292,6 @@ def explained(path: Path) -> Iterator[None]:
         raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
 
 
-def _check_file(path: Path) -> None:
-    with path.open("rb") as file:
-        # Of nothing no memory is mapped.
-        if os.fstat(file.fileno()).st_size:
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                check_heaps(content)
-
-
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     if file.id.get_create_plist().get_sizes() != (8, 8):
         raise ValueError("its addresses have another length")
@@ -310,14 +309,6 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
     return file
-
-
-def _write_sparse(group: h5py.Group, mass: np.ndarray, options: dict[str, Any]) -> None:
-    flat = np.asarray(mass).ravel()
-    index = np.flatnonzero(flat).astype(np.int32)
-    group.attrs["shape"] = np.shape(mass)
-    group.create_dataset("index", data=index, **options)
-    group.create_dataset("value", data=flat[index], **options)
 
 
 def _scalars(values: dict[str, Any]) -> dict[str, Any]:

@@ -67,12 +67,7 @@ def check_heaps(content: bytes | mmap.mmap) -> None:
 
 
 def attributes(file: h5py.File, group: str = "/", names: Container[str] | None = None) -> dict[str, Any]:
-    """Return the attributes of a group, scalars as plain Python ones.
-
-    Args:
-        file: An open file.
-        group: Name of the group; by default the file itself.
-        names: Which attributes to return if they are there; by default all.
+    """Return the attributes of a group, or those of them that are named, scalars as plain Python ones.
 
     Raises:
         KeyError: If there is no such group.

@@ -120,11 +120,9 @@ _RARE = (("suite", "release"), ("unseen", "release"))
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
-    """Make the leaderboard of a folder.
+    """Make the leaderboard of a folder of submissions, each with what ``plab.verify`` has kept beside it.
 
-    Args:
-        folder: Folder of submissions, each with what ``plab.verify`` has kept beside it.
-        overrides: Settings of every configuration that belongs here, if not plab's own.
+    Overrides are settings of every configuration that belongs here, if not plab's own.
 
     Raises:
         SubmissionError: If there is no such folder.

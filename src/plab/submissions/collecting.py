@@ -36,14 +36,8 @@ def submission_files(source: Path) -> list[Path]:
 
 
 def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
-    """Collect plans.
-
-    Args:
-        sources: Folders of recordings, or folders, files and archives of results.
-        chosen: Which runs of results to take.
-
-    Returns:
-        The entries, in the order of their configurations.
+    """Collect plans from folders of recordings, or from the chosen runs of folders, files and archives of
+    results, in the order of their configurations.
 
     Raises:
         SubmissionError: If there is nothing, or something twice.

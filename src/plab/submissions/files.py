@@ -133,13 +133,8 @@ def read_members(
 ) -> dict[str, bytes]:
     """Read all of a zip file into memory.
 
-    Of no member more is unpacked than the file says it holds; see :mod:`plab.reading`.
-
-    Args:
-        path: The file.
-        count: Number of members, at most.
-        each: Size of a member, at most [bytes].
-        total: Size of all of them, at most [bytes].
+    Of no member more is unpacked than the file says it holds; see :mod:`plab.reading`. There may be ``count``
+    members, of ``each`` bytes at most and ``total`` bytes together.
 
     Returns:
         Content of each member by name. A name is relative, with ``/`` between its parts.

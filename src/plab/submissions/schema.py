@@ -135,11 +135,8 @@ class Configuration:
         return "-".join(parts)
 
     def config(self, overrides: tuple[str, ...]) -> Config:
-        """Compose its configuration.
-
-        Args:
-            overrides: Of whoever composes it, such as ``sim.device=cuda``; with the authors' targets,
-                ``targets.source``.
+        """Compose its configuration, with overrides such as ``sim.device=cuda``; with the authors' targets,
+        ``targets.source``.
 
         Raises:
             plab.config.ConfigError: If an override does not fit.
@@ -270,11 +267,7 @@ class Submission:
 
 
 def parse_card(text: bytes, source: str) -> Card:
-    """Read a card.
-
-    Args:
-        text: Its YAML, UTF-8.
-        source: Name of the file, for messages.
+    """Read a card, YAML in UTF-8; messages name its ``source``.
 
     Raises:
         CardError: If it is no YAML or has mistakes.

@@ -72,13 +72,9 @@ def verify(
     run_policies: bool = False,
     precisions: Sequence[str] = PRECISIONS,
 ) -> Verification:
-    """Simulate all of a submission again.
+    """Simulate all of a submission again, with overrides such as ``sim.device=cuda``, in some precisions.
 
-    Args:
-        submission: What was read from a file.
-        overrides: Overrides of every configuration, such as ``sim.device=cuda``.
-        run_policies: Whether to execute the policies in it. They are other people's programs.
-        precisions: Precisions to simulate in.
+    The policies in it are other people's programs, and executed with ``run_policies`` only.
 
     Raises:
         SubmissionError: If it is of other physics, scenes or targets than these, or its plans or policies
