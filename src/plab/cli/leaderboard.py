@@ -8,7 +8,6 @@ Run plab.verify on the folder before: what it has kept is shown. The page is ind
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
 from collections.abc import Sequence
@@ -35,7 +34,13 @@ _PACKAGE = "plab.submissions"
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    options = _parse(arguments)
+    parser = Parser("plab.leaderboard", __doc__)
+    parser.add_argument("folder", type=folder, help="folder of submissions")
+    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
+    parser.add_argument("overrides", nargs="*", help=what)
+    what = "folder to write to (default: reports/leaderboard)"
+    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
+    options = parser.parse_intermixed_args(arguments)
     origin = {
         "command": shlex.join(["python", "-m", "plab.leaderboard", *arguments]),
         "plab": plab.__version__,
@@ -60,13 +65,3 @@ def main(argv: Sequence[str] | None = None) -> None:
     for line in made.left_out:
         tell(f"left out: {line}")
     print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")
-
-
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("plab.leaderboard", __doc__)
-    parser.add_argument("folder", type=folder, help="folder of submissions")
-    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
-    parser.add_argument("overrides", nargs="*", help=what)
-    what = "folder to write to (default: reports/leaderboard)"
-    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
-    return parser.parse_intermixed_args(argv)

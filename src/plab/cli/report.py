@@ -56,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         now = (runs.digest, quiet == 0)
         if now != before and not (options.follow and runs.table.empty and not quiet):
             made = _MAKERS[options.what](runs, options, out, command)
-            _tell(runs, made, out)
+            expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
+            print(f"{out}: {made} of {len(runs.table)} out of {expected} runs", *runs.left_out(), sep="\n")
             before = now
         if not options.follow or quiet == _QUIET:
             return
@@ -153,10 +154,3 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 def _bench(text: str) -> Path:
     """Read the name of a folder with files of benchmarks."""
     return measurements(text) if text in EXAMPLES else folder(text)
-
-
-def _tell(runs: Runs, what: str, out: Path) -> None:
-    expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
-    print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
-    for line in runs.left_out():
-        print(line)

@@ -40,8 +40,6 @@ __all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
 
-_CONFIG_ERRORS = (ConfigError, SceneError, TargetError)
-
 
 @command_line
 def main(argv: Sequence[str] | None = None) -> int:
@@ -124,7 +122,7 @@ def _run(composed: DictConfig, cache: SimulatorCache, config_dir: str | None) ->
         from plab.cli.next_steps import next_steps
         from plab.runners import run_config
         from plab.runners.jobs import USER_ERRORS, RunBusyError, RunError
-    except _CONFIG_ERRORS as error:
+    except (ConfigError, SceneError, TargetError) as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
     try:
         score = run_config(cfg, cache)

@@ -25,7 +25,6 @@ from plab.submissions.schema import (
     CARD_BYTES,
     SUFFIX,
     UNSEEN,
-    Card,
     CardError,
     Submission,
     SubmissionError,
@@ -42,7 +41,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _parse(argv)
     try:
-        card = _card(options.card)
+        with options.card.open("rb") as file:
+            card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
+    except OSError as error:
+        raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
     except CardError as error:
         # All that is wrong with it, a line each.
         return max(map(complain, error.faults))
@@ -61,15 +63,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     size = options.output.stat().st_size / 1e3
     print(f"{options.output}: {submission.track} for {len(places)} configuration(s), {size:.1f} kB")
     return 0
-
-
-def _card(path: Path) -> Card:
-    try:
-        with path.open("rb") as file:
-            text = file.read(CARD_BYTES + 1)
-    except OSError as error:
-        raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
-    return parse_card(text, str(path))
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

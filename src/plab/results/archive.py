@@ -7,7 +7,6 @@ same HDF5 files as those of a results folder.
 
 from __future__ import annotations
 
-import io
 import lzma
 import math
 import zipfile
@@ -18,14 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from plab.results.files import encode, read, replace_file
+from plab.results.files import encode, read, replace_file, zipped
 from plab.results.loading import Row, readable_rows, rows
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult, member_name
 
 __all__ = ["Packed", "pack", "unpack"]
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every member, the earliest that zip knows: the same runs give the same bytes."""
 
 
 @dataclass(frozen=True)
@@ -88,24 +84,23 @@ def pack(
     if not chosen:
         hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
         raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as members:
-        for name, row in sorted(chosen.items()):
-            run = read(row.path)
-            if digits is not None:
-                run = _rounded(run, digits)
-            run = replace(
-                run,
-                # A path of the computer that made it means nothing elsewhere.
-                config=run.config | {"results_dir": "results"},
-                masses=run.masses if keep_masses else {},
-                resume=run.resume if keep_resume else None,
-            )
-            member = zipfile.ZipInfo(name, _EPOCH)
-            member.external_attr = 0o644 << 16
-            members.writestr(member, encode(run, compress=False), zipfile.ZIP_STORED)
+
+    def packed(path: Path) -> bytes:
+        run = read(path)
+        if digits is not None:
+            run = _rounded(run, digits)
+        run = replace(
+            run,
+            # A path of the computer that made it means nothing elsewhere.
+            config=run.config | {"results_dir": "results"},
+            masses=run.masses if keep_masses else {},
+            resume=run.resume if keep_resume else None,
+        )
+        return encode(run, compress=False)
+
+    content = zipped(((name, packed(row.path)) for name, row in sorted(chosen.items())), zipfile.ZIP_STORED)
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    replace_file(archive, lzma.compress(content.getvalue(), preset=9), sync=True, folders=True)
+    replace_file(archive, lzma.compress(content, preset=9), sync=True, folders=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
 
 

@@ -38,13 +38,7 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong with a file.
-
-    Attributes:
-        path: The file, or the place in an archive.
-        reason: What is wrong, one line.
-        advice: What to do, one line.
-    """
+    """What is wrong with a file, or a run in an archive, and what to do, a line each."""
 
     path: Path
     reason: str

@@ -120,14 +120,8 @@ class Row:
 
 @dataclass(frozen=True)
 class _Stored:
-    """A run as it is kept: without its folder, and without the sections of its configuration.
-
-    Attributes:
-        member: Its name in an archive, empty for a file of its own.
-        values: As in :class:`Row`.
-        config: Its configuration, with None for sections.
-        sections: Number of each section.
-    """
+    """A run as it is kept: its name in an archive, empty for a file of its own, the values of :class:`Row`,
+    its configuration with None for sections, and the number of each section."""
 
     member: str
     values: dict[str, Any]
@@ -138,8 +132,7 @@ class _Stored:
 class Database:
     """The runs of one folder, archive or file: kept ones where files have not changed, and fresh ones.
 
-    Attributes:
-        missed: Whether a file was gone before it could be read.
+    It ``missed`` a file that was gone before it could be read.
     """
 
     def __init__(self, root: Path, files: Sequence[File]) -> None:
@@ -293,19 +286,17 @@ class Database:
         for name in ("sections", "section_keys"):
             connection.execute(f"DELETE FROM {name} WHERE section NOT IN (SELECT section FROM run_sections)")
 
-    def _columns(self, key: bytes, entry: _Stored) -> Iterator[Any]:
-        """Yield a run's row in the table of runs, but for its number and file."""
-        values, config = entry.values, self._config(entry)
+    def _columns(self, key: bytes, entry: _Stored) -> tuple[Any, ...]:
+        """Return a run's row in the table of runs, but for its number and file."""
+        config = self._config(entry)
         file = Path(os.fsdecode(key)) if key else Path(self._root.name)
-        more = {
+        values = entry.values | {
             "path": str(file / entry.member),
             "protocol": lookup(config, "protocol.name"),
             "targets": lookup(config, "targets.source"),
         }
-        yield bool(entry.member)
-        # Counted once all runs are there.
-        yield None
-        yield from (sql_value(more.get(name, values.get(name))) for name in (*COLUMNS, *_MORE))
+        # Whether it counts is known once all runs are there.
+        return bool(entry.member), None, *(sql_value(values.get(name)) for name in (*COLUMNS, *_MORE))
 
 
 def run_number(key: bytes, member: str, place: int = 0) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import itertools
 import json
 import math
@@ -49,6 +50,7 @@ __all__ = [
     "replace_file",
     "split_archive",
     "write",
+    "zipped",
 ]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -96,6 +98,18 @@ def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = Fals
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise ResultsError(f"cannot write {path}: {cause(error, len(content))}") from error
+
+
+def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
+    """Return a zip file of some members; the same ones give the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in members:
+            # The earliest time that zip knows.
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, data, method, 9)
+    return content.getvalue()
 
 
 def cause(error: OSError, size: int) -> str:

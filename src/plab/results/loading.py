@@ -58,14 +58,9 @@ _SUFFIXES = (SUFFIX, ARCHIVE_SUFFIX, OLD_ARCHIVE_SUFFIX)
 _LOOKS = 3
 """How often a folder is looked through at most while runs end in it."""
 
-_ORIGIN = {
-    "started": "start_time",
-    "device": "device",
-    "precision": "precision",
-    "batch": "batch",
-    "plab": "plab",
-    "git_commit": "git_commit",
-}
+_ALIKE = ("device", "precision", "batch", "plab", "git_commit")
+
+_ORIGIN = {"started": "start_time"} | {name: name for name in _ALIKE}
 """Column to attribute of the group ``provenance``."""
 
 _NAMES = frozenset(_ORIGIN.values())

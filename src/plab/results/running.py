@@ -10,8 +10,8 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,9 @@ class RunFile:
             return
         try:
             self._made = make_folder(self.path.parent)
-            _probe(self.path.parent)
+            # A file without a name, of which a process that is killed leaves nothing.
+            with tempfile.TemporaryFile(dir=self.path.parent) as probe:
+                probe.write(bytes(_PROBE_BYTES))
             self._lock_and_look(config["force"])
         except OSError as error:
             self._let_go()
@@ -180,15 +182,6 @@ class RunFile:
         """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
         if self._lock is not None:
             self._lock.release()
-
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        """Add the time spent inside the ``with`` block to the wall time of a phase."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.spend(name, time.perf_counter() - start)
 
     def spend(self, name: str, seconds: float) -> None:
         """Add to the wall time of a phase."""
@@ -296,10 +289,3 @@ def _refuse_newer(*paths: Path) -> None:
             # Missing or damaged: what is done about it depends on what it was.
             if isinstance(error, NewerSchemaError):
                 raise
-
-
-def _probe(folder: Path) -> None:
-    """Raise OSError if a folder cannot be written or has no room."""
-    # A file without a name, of which a process that is killed leaves nothing.
-    with tempfile.TemporaryFile(dir=folder) as probe:
-        probe.write(bytes(_PROBE_BYTES))

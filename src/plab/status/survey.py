@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -166,7 +166,11 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     for key in begun:
         if key in runs and runs[key].state not in ("done", "running"):
             runs[key].state = "running"
-    means = _mean_seconds(runs.values())
+    times: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for run in runs.values():
+        if run.state == "done":
+            times[run.task, run.method].append(run.seconds)
+    means = {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
     for run in runs.values():
         mean = means.get((run.task, run.method))
         if run.state == "done":
@@ -240,17 +244,13 @@ def _names(values: Mapping[str, Any]) -> Key:
     return task, variant, method, seed
 
 
-def _state(row: Row) -> str:
-    if row.values["status"] == "finished":
-        return "done"
-    if split_archive(row.path) is None and held(row.path):
-        return "running"
-    return "failed" if row.values["status"] == "failed" else "interrupted"
-
-
 def _take(run: Run, row: Row) -> None:
     """Describe a run by a row of the results, unless a better one of the same run has come before."""
-    state = _state(row)
+    state = "failed" if row.values["status"] == "failed" else "interrupted"
+    if row.values["status"] == "finished":
+        state = "done"
+    elif split_archive(row.path) is None and held(row.path):
+        state = "running"
     if STATES.index(state) >= STATES.index(run.state):
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
@@ -313,15 +313,6 @@ def _together(origin: dict[str, Any], written: float, spent: float) -> float:
     return max((written - started) / spent, 1.0)
 
 
-def _mean_seconds(runs: Iterable[Run]) -> dict[tuple[str, str], float]:
-    """Return the mean wall time [s] of the runs that are done, by task and method."""
-    times: dict[tuple[str, str], list[float]] = {}
-    for run in runs:
-        if run.state == "done":
-            times.setdefault((run.task, run.method), []).append(run.seconds)
-    return {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
-
-
 def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:
     own = [run for run in runs if (run.task, run.method) == (task, method)]
     counts = Counter(run.state for run in own)
@@ -339,9 +330,5 @@ def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, s
 
 def _sum(values: Iterable[float | None]) -> float | None:
     """Add numbers; None if one of them is not known."""
-    total = 0.0
-    for value in values:
-        if value is None:
-            return None
-        total += value
-    return total
+    known = list(values)
+    return None if None in known else float(sum(value for value in known if value is not None))

@@ -21,7 +21,7 @@ from plab.results.loading import readable_rows
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.files import read
 from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submission, SubmissionError
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, Verification, read_verification
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["Board", "Line", "Section", "board"]
@@ -43,9 +43,10 @@ _PAPER_STEPS = {True: 200 * _EPISODE, False: 10_000 * _EPISODE}
 
 @dataclass(frozen=True)
 class Point:
-    """A score that was reached after so many environment steps; ``exact`` is that in float64, or NaN."""
+    """A score that was reached after so many environment steps, in a task and a variant; ``exact`` is that in
+    float64, or NaN."""
 
-    configuration: Configuration
+    place: tuple[str, str]
     steps: int
     score: float
     exact: float = math.nan
@@ -141,15 +142,15 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     for place, line in _own():
         tables[place].append(line)
     places = [*_USUAL, *(place for place in _RARE if tables[place])]
-    sections = [_section(kind, terms, tables[kind, terms]) for kind, terms in places]
+    sections = []
+    for kind, terms in places:
+        title, targets = _SETS[kind]
+        if terms != "plab":
+            title += " on its terms" if kind == "authors" else " on the authors' terms"
+        protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
+        lines = _best_first(tables[kind, terms])
+        sections.append(Section(title, protocol, len(_expected(kind)), lines))
     return Board((*sections, _paper()), tuple(left_out))
-
-
-def _section(kind: str, terms: str, lines: Iterable[Line]) -> Section:
-    title, targets = _SETS[kind]
-    title += "" if terms == "plab" else " on its terms" if kind == "authors" else " on the authors' terms"
-    protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
-    return Section(title, protocol, len(_expected(kind)), _best_first(lines))
 
 
 def _best_first(lines: Iterable[Line]) -> tuple[Line, ...]:
@@ -190,9 +191,9 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
     """Return the best point of each configuration within a budget."""
     found: dict[tuple[str, str], Point] = {}
     for point in points:
-        place = point.configuration.task, point.configuration.variant
-        if point.steps <= limit and (place not in found or point.score > found[place].score):
-            found[place] = point
+        best = found.get(point.place)
+        if point.steps <= limit and (best is None or point.score > best.score):
+            found[point.place] = point
     return found
 
 
@@ -245,21 +246,13 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[s
             raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
         status = "verified" if verification.outcomes == {HOLDS} else "claimed"
     tables: dict[tuple[str, str], list[Point]] = defaultdict(list)
-    for place, point in _points(submission, verification):
-        tables[place].append(point)
-    for place, points in tables.items():
-        yield place, _line(submission.card, submission.track, status, place[0], points)
-
-
-def _points(
-    submission: Submission, verification: Verification | None
-) -> Iterator[tuple[tuple[str, str], Point]]:
     for number, entry in enumerate(submission.entries):
         scores = {} if verification is None else verification.verdicts[number].scores
-        place = entry.configuration
-        kind = "unseen" if place.unseen else place.targets
-        score = scores.get("float32", entry.score)
-        yield (kind, place.terms), Point(place, entry.steps, score, scores.get("float64", math.nan))
+        own, score = entry.configuration, scores.get("float32", entry.score)
+        point = Point((own.task, own.variant), entry.steps, score, scores.get("float64", math.nan))
+        tables["unseen" if own.unseen else own.targets, own.terms].append(point)
+    for place, points in tables.items():
+        yield place, _line(submission.card, submission.track, status, place[0], points)
 
 
 # -------------------------------------------------------------------------------------------- first entries
@@ -276,9 +269,7 @@ def _own() -> tuple[tuple[tuple[str, str], Line], ...]:
     }
     for name, place in archives.items():
         for card, runs in _runs(name):
-            points = [
-                Point(_place(row, *place), steps_to_best(row), row.values["score_best"]) for row in runs
-            ]
+            points = [Point(_place(row), steps_to_best(row), row.values["score_best"]) for row in runs]
             found.append((place, _line(card, "plans", "own runs", place[0], points)))
     return tuple(found)
 
@@ -303,8 +294,8 @@ def _of_today(config: Mapping[str, Any]) -> bool:
     return config["task"]["target"] == config_dict(today)["task"]["target"]
 
 
-def _place(row: Row, targets: str, terms: str) -> Configuration:
-    return Configuration(row.values["task"], row.values["variant"], targets, terms)
+def _place(row: Row) -> tuple[str, str]:
+    return row.values["task"], row.values["variant"]
 
 
 def _paper() -> Section:
@@ -314,20 +305,12 @@ def _paper() -> Section:
     for name, rows in table.groupby("method", sort=False):
         look = method(str(name))
         gradient = look.kind == GRADIENT
-        points = [
-            Point(
-                Configuration(row.task, row.variant, "authors", "release"),
-                _PAPER_STEPS[gradient],
-                row.iou_mean,
-            )
-            for row in rows.itertuples()
-        ]
+        steps = _PAPER_STEPS[gradient]
+        points = [Point((row.task, row.variant), steps, row.iou_mean) for row in rows.itertuples()]
         card = replace(PAPER, name=look.label, gradient=gradient)
         lines.append(_line(card, "plans" if gradient else "policies", "printed", "authors", points))
     for card, runs in _runs("release"):
-        points = [
-            Point(_place(row, "authors", "release"), _PAPER_STEPS[True], row.values["score"]) for row in runs
-        ]
+        points = [Point(_place(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
         lines.append(_line(card, "plans", "own runs", "authors", points))
     protocol = (
         f"{_ORIGIN['release']}; the authors' target files. The score is that of the last iteration as it was "

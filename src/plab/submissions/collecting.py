@@ -47,7 +47,12 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
     for source in sources:
         recordings = submission_files(source)
         groups = [(path, list(read(path).entries)) for path in recordings]
-        groups += [] if recordings else [(row.path, [_of_run(row)]) for row in _rows(source, chosen)]
+        if not recordings:
+            rows, unreadable = readable_rows(source)
+            if unreadable:
+                raise unreadable[0]
+            finished = (row for row in rows if row.values["status"] == "finished")
+            groups += [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
         for path, entries in groups:
             for place in {entry.configuration for entry in entries}:
                 if place in found:
@@ -58,14 +63,6 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
     if not found:
         raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
     return [entry for place in sorted(found) for entry in found[place][1]]
-
-
-def _rows(source: Path, chosen: Selection) -> list[Row]:
-    """Return the finished runs that are meant."""
-    rows, unreadable = readable_rows(source)
-    if unreadable:
-        raise unreadable[0]
-    return [row for row in rows if row.values["status"] == "finished" and chosen(row.values, row.config)]
 
 
 def _of_run(row: Row) -> Entry:

@@ -21,7 +21,7 @@ from numpy.lib import format as npy
 import plab
 from plab.config.suite import suite_tasks
 from plab.reading import UnreadableError, member_bytes, opened_zip
-from plab.results.files import replace_file
+from plab.results.files import replace_file, zipped
 from plab.submissions.schema import (
     SUFFIX,
     TARGETS,
@@ -45,9 +45,6 @@ _CARD, _MANIFEST = "card.yaml", "manifest.json"
 _ENTRY_KEYS = {"task", "variant", "targets", "terms", "scene", "target", "steps", "score", "file"}
 _LARGEST = (10_000, 100)
 """Steps and components of a plan, at most."""
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every member: the same submission gives the same bytes."""
 
 
 def write(submission: Submission, path: Path) -> None:
@@ -83,13 +80,7 @@ def encode(submission: Submission) -> bytes:
         )
     about = {"format": FORMAT, "plab": plab.__version__, "physics": PHYSICS_VERSION, "entries": listed}
     members[_MANIFEST] = json.dumps(about, indent=1).encode()
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content_bytes in (members | dict(submission.policies)).items():
-            info = zipfile.ZipInfo(name, _EPOCH)
-            info.external_attr = 0o644 << 16
-            archive.writestr(info, content_bytes, zipfile.ZIP_DEFLATED, 9)
-    return packed.getvalue()
+    return zipped((members | dict(submission.policies)).items(), zipfile.ZIP_DEFLATED)
 
 
 # ---------------------------------------------------------------------------------------------------- reading

@@ -20,12 +20,7 @@ _BATCH = 25
 
 @dataclass(frozen=True)
 class Played:
-    """What an episode came to.
-
-    Attributes:
-        score: Score of the last state; NaN if it broke off.
-        failure: When and why it broke off; empty if it did not.
-    """
+    """The score of an episode's last state, NaN if it broke off, and when and why it did."""
 
     score: float
     failure: str = ""
@@ -48,7 +43,11 @@ def play_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], precision: s
                     f"{where}: the plan has shape {list(own.shape)}, its task takes {shape}"
                 )
         whole = np.stack(actions)
-        played += _play(batch, lambda t, _, whole=whole: whole[:, t])
+
+        def act(t: int, _: np.ndarray, whole: np.ndarray = whole) -> np.ndarray:
+            return whole[:, t]
+
+        played += _play(batch, act)
     return played
 
 

@@ -67,14 +67,9 @@ class SubmissionError(ResultsError):
 
 
 class CardError(SubmissionError):
-    """A card with mistakes.
-
-    Attributes:
-        faults: A line for each.
-    """
+    """A card with mistakes; ``faults`` has a line for each."""
 
     def __init__(self, faults: list[str]) -> None:
-        """Take over the faults."""
         super().__init__("; ".join(faults))
         self.faults = faults
 
@@ -303,7 +298,8 @@ def _faults(read: dict[Any, Any]) -> Iterator[str]:
 def _fault(name: str, value: Any) -> str | None:
     """Return what is wrong with a value, None if nothing is."""
     if name == "authors":
-        good = isinstance(value, list) and 0 < len(value) <= _AUTHORS and all(map(_is_name, value))
+        good = isinstance(value, list) and 0 < len(value) <= _AUTHORS
+        good = good and all(_is_text(author, _LENGTH["name"]) and author.strip() for author in value)
         return None if good else f"must be a list of 1 to {_AUTHORS} names"
     if name == "budget":
         good = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**15
@@ -315,10 +311,6 @@ def _fault(name: str, value: Any) -> str | None:
     if name == "link" and not re.fullmatch(r"https?://[^\s\"'<>]+", value):
         return "must begin with https:// or http://"
     return None
-
-
-def _is_name(value: Any) -> bool:
-    return _is_text(value, _LENGTH["name"]) and bool(value.strip())
 
 
 def _is_text(value: Any, length: int) -> bool:

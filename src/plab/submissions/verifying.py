@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,29 +90,21 @@ def verify(
         place = entry.configuration
         if run_policies or not entry.policy:
             alike[place.task, place.targets, place.terms, entry.policy].append(number)
-    groups = [
-        (numbers, _player(submission, [submission.entries[number] for number in numbers]))
-        for numbers in alike.values()
-    ]
+    policies = {name: load(name, submission.policies[name]) for *_, name in alike if name}
     # Going from one precision to the other starts Taichi anew.
     for precision in precisions:
-        for numbers, play in groups:
-            chosen = [cfgs[submission.entries[number].configuration] for number in numbers]
-            for number, played in zip(numbers, play(chosen, precision), strict=True):
-                scores[number][precision] = played
+        for (*_, name), numbers in alike.items():
+            entries = [submission.entries[number] for number in numbers]
+            chosen = [cfgs[entry.configuration] for entry in entries]
+            if name:
+                played = play_policy(chosen, policies[name], name, precision)
+            else:
+                plans = [entry.actions for entry in entries if entry.actions is not None]
+                played = play_plans(chosen, plans, precision)
+            for number, one in zip(numbers, played, strict=True):
+                scores[number][precision] = one
     verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
     return Verification(submission.digest, verdicts, given)
-
-
-def _player(
-    submission: Submission, entries: Sequence[Entry]
-) -> Callable[[Sequence[Config], str], list[Played]]:
-    """Return what plays entries of one group."""
-    if name := entries[0].policy:
-        policy = load(name, submission.policies[name])
-        return lambda cfgs, precision: play_policy(cfgs, policy, name, precision)
-    plans = [entry.actions for entry in entries if entry.actions is not None]
-    return lambda cfgs, precision: play_plans(cfgs, plans, precision)
 
 
 def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
