@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -44,9 +45,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     print_table(list(table.columns), table.itertuples(index=False, name=None), digits=4)
     print(f"simulated targets are kept in {cache_dir() / 'targets'}")
     if args.csv is not None:
-        args.csv.parent.mkdir(parents=True, exist_ok=True)
-        plain = table.drop(columns="seconds")
-        plain.to_csv(args.csv, index=False, float_format="%.6g", lineterminator="\n")
+        _write(table, args.csv)
 
 
 def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:
@@ -103,6 +102,11 @@ def _moved(start: np.ndarray, mass: np.ndarray) -> float:
 
     change = mass / mass.sum() - start / start.sum()
     return 0.5 * float(np.abs(gaussian_filter(change, SMOOTHING * len(mass), mode="constant")).sum())
+
+
+def _write(table: pd.DataFrame, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table.drop(columns="seconds").to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
