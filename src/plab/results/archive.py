@@ -86,9 +86,7 @@ def pack(
         raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
 
     def packed(path: Path) -> bytes:
-        run = read(path)
-        if digits is not None:
-            run = _rounded(run, digits)
+        run = read(path) if digits is None else _rounded(read(path), digits)
         run = replace(
             run,
             # A path of the computer that made it means nothing elsewhere.
