@@ -225,8 +225,7 @@ def test_finished_run_is_recognised_unless_forced(tmp_path: Path, rng: np.random
 def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Generator) -> None:
     state = make_state(rng)
     run = RunFile(make_config(tmp_path))
-    with run.phase("optimise"):
-        time.sleep(0.01)
+    run.spend("optimise", 0.01)
     run.record(make_row(0), make_state(rng))
     run.record(make_row(1), state, best_loss=0.5, best_iteration=1)
     run.close("stopped", "interrupted")

@@ -27,10 +27,19 @@ from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table
 from plab.submissions.board import board
-from plab.submissions.card import Card, CardError, parse_card
-from plab.submissions.files import LIMITS, encode, read, write
-from plab.submissions.members import Limits, SubmissionError, read_members
-from plab.submissions.schema import UNSEEN, Configuration, Digests, Entry, Submission, configuration_of
+from plab.submissions.files import encode, read, read_members, write
+from plab.submissions.schema import (
+    UNSEEN,
+    Card,
+    CardError,
+    Configuration,
+    Digests,
+    Entry,
+    Submission,
+    SubmissionError,
+    configuration_of,
+    parse_card,
+)
 from plab.submissions.verifying import (
     HOLDS,
     LIES,
@@ -65,7 +74,7 @@ def path(tmp_path: Path) -> Path:
 
 def changed(path: Path, **members: bytes | None) -> Path:
     """Put other members into a file, by their names with ``_`` for every other sign; None takes one out."""
-    kept = read_members(path, LIMITS)
+    kept = read_members(path)
     names = {re.sub(r"\W", "_", name): name for name in kept}
     for key, content in members.items():
         if content is None:
@@ -79,7 +88,7 @@ def changed(path: Path, **members: bytes | None) -> Path:
 
 
 def with_manifest(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
-    about = json.loads(read_members(path, LIMITS)["manifest.json"])
+    about = json.loads(read_members(path)["manifest.json"])
     change(about)
     return changed(path, manifest_json=json.dumps(about).encode())
 
@@ -185,16 +194,14 @@ def test_more_than_is_allowed(path: Path) -> None:
 
     def refusal(**limits: int) -> str:
         with pytest.raises(SubmissionError) as caught:
-            read_members(
-                path, Limits(**({"members": 1, "member_bytes": 10**7, "total_bytes": 10**7} | limits))
-            )
+            read_members(path, **({"count": 1, "each": 10**7, "total": 10**7} | limits))
         return str(caught.value).removeprefix(f"{path}")
 
     assert len(bomb.getvalue()) < 10_000
-    assert refusal(member_bytes=10**6) == ": unpacked, zeros would take more than the 1 MB allowed"
-    assert refusal(total_bytes=2 * 10**6) == ": unpacked, it would take more than the 2 MB allowed"
-    assert refusal(members=0) == " holds 1 members, more than the 0 allowed"
-    assert refusal(total_bytes=1000) == " is larger than the 0.001 MB allowed"
+    assert refusal(each=10**6) == ": unpacked, zeros would take more than the 1 MB allowed"
+    assert refusal(total=2 * 10**6) == ": unpacked, it would take more than the 2 MB allowed"
+    assert refusal(count=0) == " holds 1 members, more than the 0 allowed"
+    assert refusal(total=1000) == " is larger than the 0.001 MB allowed"
 
 
 def test_a_size_that_is_a_lie_floods_nothing(path: Path) -> None:
@@ -207,7 +214,7 @@ def test_a_size_that_is_a_lie_floods_nothing(path: Path) -> None:
     content[place : place + 4] = struct.pack("<I", 10)
     path.write_bytes(content)
     with pytest.raises(SubmissionError) as caught:
-        read_members(path, Limits(10, 1000, 100_000))
+        read_members(path, count=10, each=1000, total=100_000)
     assert str(caught.value).startswith(f"{path} is cut off, damaged or no zip file (")
 
 

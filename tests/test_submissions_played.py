@@ -23,8 +23,7 @@ from plab.cli import leaderboard, submit, verify
 from plab.envs.vector import PlabVectorEnv
 from plab.submissions import record
 from plab.submissions.files import read, write
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import Submission
+from plab.submissions.schema import Submission, SubmissionError
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, read_verification
 from plab.submissions.verifying import verify as simulate_again
 

@@ -48,20 +48,13 @@ class Lock:
 
 
 def lock_path(path: str | Path) -> Path:
-    """Return the lock file of a run.
-
-    Args:
-        path: The run's final or partial result file.
-    """
+    """Return the lock file of a run, by its final or partial result file."""
     path = Path(path)
     return path.with_name(path.name.removesuffix(".h5").removesuffix(".partial") + ".lock")
 
 
 def acquire(path: str | Path) -> Lock | None:
-    """Take the lock of a run.
-
-    Args:
-        path: The run's final or partial result file; its folder exists.
+    """Take the lock of a run, by its final or partial result file, whose folder exists.
 
     Returns:
         The lock, or None if another process, or another lock object of this process, holds it.
@@ -97,11 +90,7 @@ def _lock(lock: FileLock) -> None:
 
 
 def held(path: str | Path) -> bool:
-    """Return whether somebody computes a run at this moment.
-
-    Args:
-        path: The run's final or partial result file.
-    """
+    """Return whether somebody computes a run at this moment, by its final or partial result file."""
     file = lock_path(path)
     if not file.exists():
         return False

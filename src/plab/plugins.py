@@ -25,11 +25,7 @@ Kind = TypeVar("Kind")
 
 
 def search_in(config_dir: str | Path) -> None:
-    """Let modules be found in a config folder and in the folder above it, too, for the rest of the process.
-
-    Args:
-        config_dir: Folder with YAML files of the user's own.
-    """
+    """Let modules be found in a config folder and in the one above it, too, for the rest of the process."""
     folder = Path(config_dir).resolve()
     # Last, so that nothing of Python's or plab's is hidden by a file of the user's.
     sys.path += [path for path in (str(folder), str(folder.parent)) if path not in sys.path]
@@ -52,11 +48,7 @@ def passed_on() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return what a text names.
-
-    Args:
-        text: Module and name in it, as ``module:NAME``.
-        kind: What it has to be an instance of; ``type`` for classes.
+    """Return what a text names, as ``module:NAME``: an instance of ``kind``, which is ``type`` for classes.
 
     Raises:
         plab.config.ConfigError: If the text is no such text, there is no such module or name, the module

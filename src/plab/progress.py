@@ -51,7 +51,7 @@ def forward_to(forward: Forward) -> None:
 def show_progress(
     title: str,
     start: int,
-    total: int,
+    total: int | None,
     *,
     enabled: bool = True,
     plain_every: int = PLAIN_EVERY,
@@ -62,7 +62,7 @@ def show_progress(
     Args:
         title: What is running.
         start: Steps done before.
-        total: Steps to do, the ones done before included.
+        total: Steps to do, the ones done before included; None: a terminal alone says that something is done.
         enabled: Whether to show anything.
         plain_every: Steps between two lines where there is no terminal.
         compiling: Says which kernel is being compiled, which is shown on a terminal; None: nothing does.
@@ -71,47 +71,27 @@ def show_progress(
         Function to call after every step.
     """
     console = Console()
-    if not enabled:
-        yield lambda done, text: None
-    elif (forward := _forward) is not None:
-        with _watched(compiling, lambda kernel: forward("compiling", kernel)):
+    watch = compiling or (lambda note: nullcontext())
+    if enabled and (forward := _forward) is not None:
+        with watch(lambda kernel: forward("compiling", kernel)):
             yield lambda done, text: forward("progress", title, start, total, plain_every, done, text)
-    elif not console.is_terminal:
+    elif enabled and console.is_terminal:
+        columns = (TextColumn("{task.description}"), _TextColumn()) if total is None else _columns()
+        with Progress(*columns, console=console, expand=total is not None, transient=total is None) as shown:
+            task = shown.add_task(title, total=total, completed=start, text="")
+            with watch(lambda kernel: _note(shown, task, kernel)):
+                yield lambda done, text: shown.update(task, completed=done, text=text)
+    elif enabled and total is not None:
         yield _plain(title, start, total, plain_every)
     else:
-        with Progress(*_columns(), console=console, expand=True) as progress:
-            task = progress.add_task(title, total=total, completed=start, text="")
-            with _watched(compiling, lambda kernel: _note(progress, task, kernel)):
-                yield lambda done, text: progress.update(task, completed=done, text=text)
+        yield lambda done, text: None
 
 
 @contextmanager
 def show_waiting(title: str, compiling: Watcher, *, enabled: bool = True) -> Iterator[None]:
-    """Show on a terminal that something is made ready while the ``with`` block lasts, and which kernel is
-    being compiled.
-
-    Args:
-        title: What is made ready.
-        compiling: Says which kernel it is.
-        enabled: Whether to show anything.
-    """
-    console = Console()
-    if enabled and (forward := _forward) is not None:
-        with _watched(compiling, lambda kernel: forward("compiling", kernel)):
-            yield
-    elif not enabled or not console.is_terminal:
+    """Show on a terminal that something is made ready in the ``with`` block, and what is compiled."""
+    with show_progress(title, 0, None, enabled=enabled, compiling=compiling):
         yield
-    else:
-        columns = TextColumn("{task.description}"), _TextColumn()
-        with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task(title, total=None, text="")
-            with _watched(compiling, lambda kernel: _note(progress, task, kernel)):
-                yield
-
-
-def _watched(compiling: Watcher | None, note: Callable[[str], None]) -> AbstractContextManager[None]:
-    """Have a function told which kernel is being compiled while the block lasts."""
-    return nullcontext() if compiling is None else compiling(note)
 
 
 def _note(progress: Progress, task: TaskID, kernel: str) -> None:
@@ -137,12 +117,8 @@ class _TextColumn(ProgressColumn):
 def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Callable[..., None]]:
     """Show how far several processes have come while the ``with`` block lasts, a bar each.
 
-    Args:
-        names: Names of the processes.
-        enabled: Whether to show anything.
-
     Yields:
-        Function of a name and what the process has forwarded.
+        Function of one of the ``names`` and what the process has forwarded.
     """
     console = Console()
     if not (enabled and console.is_terminal):
@@ -151,8 +127,8 @@ def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Call
         def say(name: str, kind: str, *content: Any) -> None:
             if enabled and kind == "progress":
                 title, start, total, every, done, text = content
-                key = name, title
-                lines.setdefault(key, _plain(f"{name} {title}", start, total, every))(done, text)
+                plain = _plain(f"{name} {title}", start, total, every)
+                lines.setdefault((name, title), plain)(done, text)
 
         yield say
         return
@@ -173,38 +149,31 @@ def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Call
 
 def _columns() -> tuple[ProgressColumn, ...]:
     """Return the parts of the bar; on a narrow terminal the bar itself gives way, then the text."""
-
-    def whole() -> Column:
-        return Column(no_wrap=True)
-
     return (
-        TextColumn("{task.description}", table_column=whole()),
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
         BarColumn(bar_width=None, table_column=Column(ratio=1)),
-        MofNCompleteColumn(table_column=whole()),
-        TimeRemainingColumn(table_column=whole()),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
         _TextColumn(),
     )
 
 
 def _plain(title: str, start: int, total: int, every: int) -> Report:
-    first: list[tuple[float, int]] = []
+    first: tuple[float, int] | None = None
     last = start
 
-    def left(done: int) -> str:
-        # The first step compiles the simulator: it says nothing about the pace.
-        now = time.monotonic()
-        if not first:
-            first.append((now, done))
-            return "compiled"
-        begin, before = first[0]
-        return f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
-
     def report(done: int, text: str) -> None:
-        nonlocal last
-        remaining = left(done)
+        nonlocal first, last
+        now = time.monotonic()
+        if first is None:
+            # The first step compiles the simulator: it says nothing about the pace.
+            first, left = (now, done), "compiled"
+        else:
+            begin, before = first
+            left = f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"
         # A step may be a batch of episodes, that passes a multiple without stopping at it.
         if last == start or done // every > last // every or done == total:
-            print(f"{title} {done}/{total}, {remaining}, {text}", flush=True)
+            print(f"{title} {done}/{total}, {left}, {text}", flush=True)
         last = done
 
     return report

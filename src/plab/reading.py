@@ -93,11 +93,9 @@ def regular_file(path: Path) -> os.stat_result:
 
 @contextmanager
 def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file for :func:`member_bytes`.
+    """Open a zip file for :func:`member_bytes`; if ``packed``, it is compressed as a whole, by xz.
 
-    Args:
-        path: The file.
-        packed: Whether it is compressed as a whole, by xz. What was unpacked last is kept in memory.
+    What was unpacked last is kept in memory.
 
     Raises:
         UnreadableError: If its members lead out of it, share a name or their bytes, are encrypted, or are too

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 __all__ = ["SimulatorCache"]
@@ -18,24 +19,16 @@ class SimulatorCache:
     """
 
     def __init__(self) -> None:
-        """Begin with nothing."""
         self._kept: dict[Any, Any] = {}
 
     def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
-        """Return something that holds a simulator: what is kept from the last run, if that is the same.
-
-        Args:
-            key: What it is made for.
-            build: Makes a new one.
-            check: Called with the old one; raises RuntimeError if its memory is gone.
-        """
-        try:
+        """Return something that holds a simulator: what is kept from the last run, if its key is the same and
+        ``check`` raises no RuntimeError, as its memory is gone; else what ``build`` makes."""
+        # Somebody else may have restarted Taichi with another precision or device.
+        with suppress(RuntimeError):
             if key in self._kept:
                 check(self._kept[key])
                 return self._kept[key]
-        except RuntimeError:
-            # Somebody else restarted Taichi with another precision or device.
-            pass
         # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels
         # again.
         self.clear()

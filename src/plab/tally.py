@@ -22,11 +22,7 @@ _UNFINISHED = {
 
 
 class Refusal(Exception):
-    """A run that cannot be done, for a reason that one line explains.
-
-    Attributes:
-        code: Exit code.
-    """
+    """A run that cannot be done, for a reason that one line explains, and the exit code."""
 
     def __init__(self, reason: str, code: int) -> None:
         # Both are arguments of Exception, so that it survives pickling.

@@ -30,12 +30,8 @@ class Parser(ArgumentParser):
     """The parser of a command line: a docstring is its help, a mistake an ArgumentError."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Make it without arguments.
-
-        Args:
-            name: Of the module that is run.
-            text: Docstring: a paragraph that says what it does, then whatever helps, such as examples.
-        """
+        """Make it without arguments, of a module's name and docstring: what it does, a blank line, whatever
+        helps, such as examples."""
         what, _, more = text.partition("\n\n")
         formed = RawDescriptionHelpFormatter
         super().__init__(f"python -m {name}", description=what, epilog=more, formatter_class=formed)
@@ -52,18 +48,16 @@ def name_flag(parser: ArgumentParser, message: str) -> str:
     return f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown.startswith("-") else message
 
 
-def positive(text: str) -> int:
+def positive(text: str, least: int = 1) -> int:
     """Read a whole number from 1 on."""
-    if not text.isdecimal() or int(text) < 1:
-        raise ArgumentTypeError(f"'{text}' is not a whole number from 1 on")
+    if not text.isdecimal() or int(text) < least:
+        raise ArgumentTypeError(f"'{text}' is not a whole number from {least} on")
     return int(text)
 
 
 def seed(text: str) -> int:
     """Read a whole number from 0 on."""
-    if not text.isdecimal():
-        raise ArgumentTypeError(f"'{text}' is not a whole number from 0 on")
-    return int(text)
+    return positive(text, 0)
 
 
 def rates(text: str) -> list[float]:

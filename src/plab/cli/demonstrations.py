@@ -62,14 +62,8 @@ _NOT_SEARCHED = (
 
 @dataclass(frozen=True)
 class Replay:
-    """A demonstration and what it reached.
-
-    Attributes:
-        cfg: The configuration.
-        actions: Actions, shape [T, A].
-        scores: What they reach in the hard contact model.
-        idle: What doing nothing reaches.
-    """
+    """A demonstration, actions of shape [T, A], what they reach in the hard contact model, and what doing
+    nothing reaches."""
 
     cfg: Config
     actions: np.ndarray
@@ -96,21 +90,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         if args.search and _is_geometric(cfgs[0]):
             _search(cfgs, args)
         replays = replay(cfgs)
-        if args.record:
-            _record(replays)
+        for item in replays if args.record else ():
+            names = action_names(build_scene(item.cfg))
+            save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
         rows += [_row(item) for item in replays]
     _show(rows, args.markdown)
 
 
 def replay(cfgs: Sequence[Config]) -> list[Replay]:
-    """Replay the demonstrations of configurations of one task, and an episode without any motion.
-
-    Args:
-        cfgs: Configurations that fit into one batch; those without a demonstration are replayed at rest.
-
-    Returns:
-        What each reached.
-    """
+    """Replay the demonstrations of configurations that fit into one batch, and an episode without any motion;
+    those without a demonstration are replayed at rest."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
@@ -125,9 +114,8 @@ def _require_own_resolution(cfg: Config) -> None:
     """Refuse to record what was found on another grid than the suite's."""
     own = load_config([f"task={cfg.task.name}", f"variant={cfg.variant}"])
     if build_scene(cfg) != build_scene(own):
-        raise ConfigError(
-            "demonstrations are recorded at the suite's own resolution: leave out what changes it"
-        )
+        why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
+        raise ConfigError(why)
 
 
 def _is_geometric(cfg: Config) -> bool:
@@ -157,12 +145,6 @@ def _search(cfgs: Sequence[Config], args: argparse.Namespace) -> None:
             save_actions(cfg.task.name, cfg.variant, found.actions, names, found.score)
 
 
-def _record(replays: Sequence[Replay]) -> None:
-    for item in replays:
-        names = action_names(build_scene(item.cfg))
-        save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
-
-
 def _row(item: Replay) -> dict[str, object]:
     moving = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0)
     return {
@@ -187,10 +169,8 @@ def _show(rows: Sequence[dict[str, object]], path: Path | None) -> None:
         for row in shown:
             line = by_task.setdefault(row["task"], {"task": row["task"], "target": row["target"]})
             line[str(row["variant"])] = row["score"]
-        columns = list(dict.fromkeys(name for line in by_task.values() for name in line))
-        # Of fewer variants, a cell stays empty.
-        lines = [dict.fromkeys(columns, "") | line for line in by_task.values()]
-        path.write_text(HEADING + markdown(columns, lines), encoding="utf-8")
+        table = markdown(("task", "target", *SUITE_VARIANTS), by_task.values())
+        path.write_text(HEADING + table, encoding="utf-8")
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

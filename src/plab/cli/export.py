@@ -53,8 +53,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
     add("--output", type=folder, metavar="FOLDER", help="by default named like the result or the task")
     arguments = parser.parse_args(argv)
-    usual = settle(arguments, f"-{arguments.format}")
-    output = arguments.output = arguments.output or usual
+    settle(arguments, f"-{arguments.format}")
+    output = arguments.output
     require_writable(output / "target")
     if output.is_dir() and any(output.iterdir()):
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
@@ -70,15 +70,14 @@ _KEY = re.compile(r"^(?P<indent> *)(?P<key>[\w\"]+):(?P<value>[^#]*?)(?:\s*# (?P
 
 
 def help_text(config_dir: str | None = None) -> str:
-    """Return the text of ``--help``, two screens: usage, flags, the names of all choices, keys used often.
-
-    Args:
-        config_dir: Folder with files of the user's own, whose names are listed, too.
-    """
+    """Return the text of ``--help``, two screens: usage, flags, the names of all choices, those of the user's
+    own files in ``config_dir`` included, keys used often."""
     parts = [_USAGE, _FLAGS, "CHOICES"]
     for group in (*GROUPS, EXPERIMENT):
         sign = "+" if group == EXPERIMENT else ""
-        parts += _wrapped(f"{sign}{group}=", choices(group, config_dir))
+        start = f"  {sign}{group}="
+        names = ", ".join(choices(group, config_dir))
+        parts += textwrap.wrap(names, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
     parts += ["", "KEYS used often, with their defaults"]
     folder = conf_folder()
     files = {"": "config.yaml", "method.": "method/adam.yaml", "sim.": "sim/fast.yaml"}
@@ -91,25 +90,19 @@ def help_text(config_dir: str | None = None) -> str:
 
 def full_help_text(config_dir: str | None = None) -> str:
     """Return the text of ``--help-all``: that of ``--help``, more examples, what each choice is, and every
-    key with its default and explanation.
-
-    Args:
-        config_dir: Folder with files of the user's own, whose names are listed, too.
-    """
+    key with its default and explanation."""
     folder = conf_folder()
     parts = [_USAGE, _MORE_EXAMPLES, _FLAGS]
-    for group in GROUPS:
+    for group in (*GROUPS, EXPERIMENT):
+        sign = "+" if group == EXPERIMENT else ""
+        names = choices(group, config_dir).items()
         parts.append(f"{group.upper()}S" if group != "sim" else "SIMULATOR PRESETS")
-        parts += [f"  {group}={name:<10} {_title(path)}" for name, path in choices(group, config_dir).items()]
+        parts += [f"  {sign}{group}={name:<10} {_title(path)}" for name, path in names]
         parts.append("")
-    parts.append("EXPERIMENTS")
-    names = choices(EXPERIMENT, config_dir).items()
-    parts += [f"  +{EXPERIMENT}={name:<10} {_title(path)}" for name, path in names]
-    parts += ["", "KEYS, with their defaults"]
+    parts.append("KEYS, with their defaults")
     parts += _lines(folder / "config.yaml", "")
-    parts += _lines(folder / "protocol" / "plab.yaml", "protocol.")
-    parts += _lines(folder / "sim" / "fast.yaml", "sim.")
-    parts += _lines(folder / "method" / "adam.yaml", "method.")
+    for group, name in (("protocol", "plab"), ("sim", "fast"), ("method", "adam")):
+        parts += _lines(folder / group / f"{name}.yaml", f"{group}.")
     # Each has keys of its own; those of adam are the default's, above.
     for method in (name for name, _ in schemas() if name in choices("method")):
         parts.append(f"  of method={method}; what has no value here takes the profile's:")
@@ -127,12 +120,6 @@ def _title(path: Path) -> str:
     lines = path.read_text(encoding="utf-8").splitlines()
     # The first line of an experiment says where its keys go.
     return next(line for line in lines if not line.startswith("# @package")).lstrip("# ")
-
-
-def _wrapped(start: str, names: Iterable[str]) -> list[str]:
-    """Return names with commas between them, on lines that fit."""
-    indent = "  " + " " * len(start)
-    return textwrap.wrap(", ".join(names), _WIDTH, initial_indent=f"  {start}", subsequent_indent=indent)
 
 
 def _lines(path: Path, prefix: str) -> list[str]:

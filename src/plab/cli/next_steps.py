@@ -21,13 +21,7 @@ _QUICK = re.compile(rf"sim\.({'|'.join(_SIZES)}|dt)|method\.(stages\.\w+\.)?(ite
 
 
 def next_steps(cfg: Config, words: Sequence[str], config_dir: str | None = None) -> tuple[str, str]:
-    """Return two lines that say what to do with the result of a run.
-
-    Args:
-        cfg: The run's configuration.
-        words: The overrides that it was composed of.
-        config_dir: Folder of YAML files of the user's own, if there is one.
-    """
+    """Return two lines that say what to do with the result of a run, composed of overrides, ``words``."""
     picture = f"python -m plab.render {shlex.quote(str(result_path(cfg)))}"
     page = f"python -m plab.report html --results {shlex.quote(cfg.results_dir)}"
     if (full := _full_words(cfg, words, config_dir)) is None:

@@ -105,10 +105,16 @@ def _draw_film_strip(arguments: argparse.Namespace) -> None:
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without drawing.
 
-    Adds ``draw``, what carries them out; ``all_tasks``, whether it shows all tasks; ``output`` where it was
-    not given; and what :func:`plab.cli.rollouts.settle` adds.
+    Adds ``draw``, what carries them out; ``all_tasks``, whether it shows all tasks; and what
+    :func:`plab.cli.rollouts.settle` adds.
     """
-    arguments = _parser().parse_args(argv)
+    parser = make_parser("plab.render", __doc__, "a film")
+    add = parser.add_argument
+    add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
+    add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
+    add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
+    add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
+    arguments = parser.parse_args(argv)
     for option, path, suffix, draw in (
         ("--contact-sheet", arguments.contact_sheet, ".png", _draw_contact_sheet),
         ("--film-strip", arguments.film_strip, ".jpg", _draw_film_strip),
@@ -118,8 +124,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
             arguments.output, arguments.draw, arguments.all_tasks = path, draw, True
             break
     else:
-        usual = settle(arguments, ".png")
-        arguments.output = arguments.output or usual
+        settle(arguments, ".png")
         arguments.draw, arguments.all_tasks = _draw_rollout, False
     require_writable(arguments.output)
     return arguments
@@ -138,16 +143,6 @@ def _check_sheet(arguments: argparse.Namespace, option: str, path: Path, suffix:
         raise RenderError(f"{option} FILE shows all {shown}: leave out '{unwanted[0]}'")
     if path.suffix.lower() != suffix:
         raise RenderError(f"cannot write {path}: a {option[2:].replace('-', ' ')} is a {suffix}")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = make_parser("plab.render", __doc__, "a film")
-    add = parser.add_argument
-    add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
-    add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
-    add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
-    add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
-    return parser
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -13,9 +13,8 @@ import argparse
 import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
@@ -31,9 +30,6 @@ from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import Page
 from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["main"]
 
@@ -60,7 +56,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         now = (runs.digest, quiet == 0)
         if now != before and not (options.follow and runs.table.empty and not quiet):
             made = _MAKERS[options.what](runs, options, out, command)
-            _tell(runs, made, out)
+            expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
+            print(f"{out}: {made} of {len(runs.table)} out of {expected} runs", *runs.left_out(), sep="\n")
             before = now
         if not options.follow or quiet == _QUIET:
             return
@@ -95,21 +92,17 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
     page.write(drawing=bool(wanted))
     if wanted:
         try:
-            _draw(wanted, lambda: page.write(drawing=True))
+            require_graphics()
+            # Imported here: all else needs neither PyVista nor Taichi.
+            from plab.render.replays import draw_runs
+
+            draw_runs(wanted, lambda: page.write(drawing=True))
         except RenderError as error:
             tell(f"without pictures: {error}")
         finally:
             remove_earlier(page.shown, out)
             page.write()
     return "index.html"
-
-
-def _draw(wanted: Mapping[Path, Mapping[str, tuple[Path, bool]]], drawn: Callable[[], None]) -> None:
-    require_graphics()
-    # Imported here: all else needs neither PyVista nor Taichi.
-    from plab.render.replays import draw_runs
-
-    draw_runs(wanted, drawn)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
@@ -161,10 +154,3 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
 def _bench(text: str) -> Path:
     """Read the name of a folder with files of benchmarks."""
     return measurements(text) if text in EXAMPLES else folder(text)
-
-
-def _tell(runs: Runs, what: str, out: Path) -> None:
-    expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
-    print(f"{out}: {what} of {len(runs.table)} out of {expected} runs")
-    for line in runs.left_out():
-        print(line)

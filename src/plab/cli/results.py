@@ -135,13 +135,8 @@ def _unpack_arguments(parser: Parser) -> None:
 def _scores(options: argparse.Namespace) -> int:
     sources, words = sources_and_words(options.arguments)
     chosen = _finished_unless_said(select(words, SELECTABLE))
-    table, unreadable = scores(
-        list(map(resolve, sources or ["results"])),
-        chosen,
-        options.keys,
-        options.sort,
-        descending=options.descending,
-    )
+    places = list(map(resolve, sources or ["results"]))
+    table, unreadable = scores(places, chosen, options.keys, options.sort, descending=options.descending)
     _tell_left_out(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
     return 0
@@ -167,18 +162,16 @@ def _check(options: argparse.Namespace) -> int:
             if problem is not None:
                 wrong += 1
                 print(f"{problem.path}: {problem.reason}: {problem.advice}", flush=True)
-    print(
-        f"{count} run(s) checked, {wrong} with something wrong"
-        if wrong
-        else f"{count} run(s) checked, all well"
-    )
+    print(f"{count} run(s) checked, {f'{wrong} with something wrong' if wrong else 'all well'}")
     return 1 if wrong else 0
 
 
 def _pack(options: argparse.Namespace) -> int:
     names, words = sources_and_words(options.arguments)
     sources, chosen = list(map(resolve, names or ["results"])), select(words, SELECTABLE)
-    _require_statuses(chosen.choices.get("status", ()))
+    for text in chosen.choices.get("status", ()):
+        if text not in (*STATUSES, "all"):
+            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
     if words:
         others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
         require_possible(Selection(others, chosen.keys), readable_rows(sources)[0])
@@ -196,12 +189,6 @@ def _pack(options: argparse.Namespace) -> int:
     before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
     print(f"{options.output}: {done.runs} run(s), {size}{before}")
     return 0
-
-
-def _require_statuses(texts: Sequence[str]) -> None:
-    for text in texts:
-        if text not in (*STATUSES, "all"):
-            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
 
 
 def _finished_unless_said(chosen: Selection) -> Selection:

@@ -27,13 +27,8 @@ WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
 
 
 def make_parser(name: str, text: str, every: str) -> Parser:
-    """Return a parser with the arguments that choose a rollout.
-
-    Args:
-        name: As :class:`plab.cli.arguments.Parser` takes it.
-        text: The same.
-        every: What has a frame every K environment steps.
-    """
+    """Return a parser with the arguments that choose a rollout, of which ``every`` says what has a frame
+    every K environment steps."""
     parser = Parser(name, text)
     add = parser.add_argument
     add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of python -m plab.run")
@@ -43,23 +38,22 @@ def make_parser(name: str, text: str, every: str) -> Parser:
     return parser
 
 
-def settle(arguments: argparse.Namespace, ending: str) -> Path:
+def settle(arguments: argparse.Namespace, ending: str) -> None:
     """Find out which rollout is meant, as far as can be done without simulating.
 
-    Adds ``result``, the result file or None, and ``config``, the configuration where there is none.
-
-    Args:
-        arguments: Those of the command line.
-        ending: What is written instead of ``.h5``.
-
-    Returns:
-        What is to be written where nothing else is said: named like the result, and beside it (but not inside
-        an archive), or like the task.
+    Adds ``result``, the result file or None, and ``config``, the configuration where there is none; and
+    ``output`` where it was not given: named like the result, with ``ending`` for ``.h5``, and beside it (but
+    not inside an archive), or like the task.
 
     Raises:
         RenderError: If nothing is chosen, or two things are.
         plab.config.ConfigError: If the configuration is wrong.
     """
+    usual = _usual_output(arguments, ending)
+    arguments.output = arguments.output or usual
+
+
+def _usual_output(arguments: argparse.Namespace, ending: str) -> Path:
     files, overrides = sources_and_words(arguments.what)
     if files and all(map(_holds_many, files)):
         arguments.result, name = _best(files, overrides)
@@ -97,8 +91,7 @@ def _best(sources: Sequence[str], words: Sequence[str]) -> tuple[Path, str]:
     names = ("task", "variant", "method", "seed")
     chosen = select(words, names)
     found, _ = readable_rows([resolve(source) for source in sources])
-    rows = [row for row in found if row.values["status"] == "finished"]
-    rows = [row for row in rows if chosen(row.values, row.config)]
+    rows = [r for r in found if r.values["status"] == "finished" and chosen(r.values, r.config)]
     one_protocol(row.config for row in rows)
     if not rows:
         raise RenderError(f"there is no finished run to show in {', '.join(sources)}: no run fits")

@@ -40,15 +40,10 @@ __all__ = ["main"]
 
 EXIT_BROKE_OFF = 1
 
-_CONFIG_ERRORS = (ConfigError, SceneError, TargetError)
-
 
 @command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
-
-    Args:
-        argv: Arguments after the program's name; those of the process by default.
 
     Returns:
         Exit code: 0 if every result is there, 1 if a run broke off, 2 for a mistake of the user's, 130 after
@@ -99,17 +94,15 @@ def _job(tally: Tally, config_dir: str | None) -> TaskFunction:
         tally.started = True
         try:
             return _run(composed, cache, config_dir)
-        except Refusal as refusal:
+        except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 # It has to get out of the job's process.
                 raise
             # Not raised: Hydra would add lines of its own.
-            tally.code = complain(str(refusal), refusal.code)
-            return math.nan
-        except Exception as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise
-            tally.error = error
+            if isinstance(error, Refusal):
+                tally.code = complain(str(error), error.code)
+            else:
+                tally.error = error
             return math.nan
 
     # For the launcher, which has the outcomes of a sweep.
@@ -129,7 +122,7 @@ def _run(composed: DictConfig, cache: SimulatorCache, config_dir: str | None) ->
         from plab.cli.next_steps import next_steps
         from plab.runners import run_config
         from plab.runners.jobs import USER_ERRORS, RunBusyError, RunError
-    except _CONFIG_ERRORS as error:
+    except (ConfigError, SceneError, TargetError) as error:
         raise Refusal(str(error), EXIT_USER_ERROR) from error
     try:
         score = run_config(cfg, cache)
@@ -144,9 +137,8 @@ def _run(composed: DictConfig, cache: SimulatorCache, config_dir: str | None) ->
 
 def _require_sweep(settings: Any) -> None:
     """Refuse settings of sweeps, of which a single run takes no notice."""
-    of_sweeps = [
-        word for word in settings.overrides.hydra if re.match(r"[+~]*hydra[./](launcher|sweep)", word)
-    ]
+    words = settings.overrides.hydra
+    of_sweeps = [word for word in words if re.match(r"[+~]*hydra[./](launcher|sweep)", word)]
     if settings.mode == RunMode.RUN and of_sweeps:
         raise ConfigError(
             f"'{shortened(of_sweeps[0])}' has no effect on a single run: add -m, or leave it out"
@@ -154,15 +146,8 @@ def _require_sweep(settings: Any) -> None:
 
 
 def _parse(argv: list[str]) -> tuple[list[str], Namespace]:
-    """Check the arguments and put them into the order that Hydra reads: overrides, then flags.
-
-    Returns:
-        The arguments in this order, and what they mean.
-
-    Raises:
-        ConfigError: If a flag does not exist, an override makes no sense or the folder of ``--config-dir``
-            does not do.
-    """
+    """Check the arguments; return them in the order that Hydra reads, overrides before flags, and their
+    meaning."""
     parser = get_args_parser()
     parser.add_argument("--help-all", action="store_true")
 

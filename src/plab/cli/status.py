@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
 
 from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line
@@ -19,17 +18,6 @@ from plab.examples import EXAMPLES, resolve
 from plab.status.survey import NAMES, STATES, Survey, survey
 
 __all__ = ["main"]
-
-
-def _json(found: Survey) -> dict[str, Any]:
-    return asdict(found) | {"workers": found.workers, "eta": found.eta}
-
-
-def _csv(found: Survey) -> None:
-    columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
-    groups = [asdict(group) for group in found.groups]
-    rows = ([(group | group["counts"])[name] for name in columns] for group in groups)
-    print_table(columns, rows, "csv")
 
 
 @command_line
@@ -53,9 +41,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         return survey(places, chosen, missing=options.missing)
 
     if options.json:
-        print(json.dumps(_json(look()), indent=1))
+        found = look()
+        print(json.dumps(asdict(found) | {"workers": found.workers, "eta": found.eta}, indent=1))
     elif options.csv:
-        _csv(look())
+        columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
+        groups = [asdict(group) | group.counts for group in look().groups]
+        print_table(columns, ([group[name] for name in columns] for group in groups), "csv")
     else:
         # Imported here: scripts need no tables.
         from plab.status.view import show, watch

@@ -19,11 +19,17 @@ from plab.cli.command import command_line, complain
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.examples import resolve
-from plab.submissions.card import CARD_BYTES, Card, CardError, parse_card
 from plab.submissions.collecting import from_policies, from_sources
 from plab.submissions.files import inconsistency, write
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import SUFFIX, UNSEEN, Submission
+from plab.submissions.schema import (
+    CARD_BYTES,
+    SUFFIX,
+    UNSEEN,
+    CardError,
+    Submission,
+    SubmissionError,
+    parse_card,
+)
 
 __all__ = ["main"]
 
@@ -35,14 +41,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _parse(argv)
     try:
-        card = _card(options.card)
+        with options.card.open("rb") as file:
+            card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
+    except OSError as error:
+        raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
     except CardError as error:
         # All that is wrong with it, a line each.
         return max(map(complain, error.faults))
-    return _run(options, card)
-
-
-def _run(options: argparse.Namespace, card: Card) -> int:
     folders, words = sources_and_words(options.arguments)
     sources = [resolve(folder) for folder in folders]
     if options.policy:
@@ -58,15 +63,6 @@ def _run(options: argparse.Namespace, card: Card) -> int:
     size = options.output.stat().st_size / 1e3
     print(f"{options.output}: {submission.track} for {len(places)} configuration(s), {size:.1f} kB")
     return 0
-
-
-def _card(path: Path) -> Card:
-    try:
-        with path.open("rb") as file:
-            text = file.read(CARD_BYTES + 1)
-    except OSError as error:
-        raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
-    return parse_card(text, str(path))
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

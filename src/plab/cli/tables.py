@@ -34,20 +34,29 @@ def report(
     Returns:
         The rows.
     """
-    wide = widths or {}
-    least = [max(len(name), wide.get(name, 8)) for name in columns]
+    least = [max(len(name), (widths or {}).get(name, 8)) for name in columns]
+
+    def write(values: Iterable[object], mode: str) -> None:
+        if path is not None:
+            with path.open(mode, newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerow(values)
+
+    def show(values: Iterable[object]) -> None:
+        progress("")
+        shown = (f"{value!s:>{width}s}" for value, width in zip(values, least, strict=True))
+        print("  ".join(shown), flush=True)
+
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _append(path, columns, "w")
+    write(columns, "w")
     table: list[Mapping[str, object]] = []
     for row in rows:
         if not table:
             # Not before, so that a mistake is answered by one line alone.
-            _print(columns, least)
+            show(columns)
         values = [row[name] for name in columns]
-        _print(values, least)
-        if path is not None:
-            _append(path, values, "a")
+        show(values)
+        write(values, "a")
         table.append(row)
     return table
 
@@ -98,13 +107,3 @@ def progress(text: str) -> None:
     """Say on standard error what is being measured, if somebody watches, in a line that the next replaces."""
     if sys.stderr.isatty():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
-
-
-def _print(values: Iterable[object], widths: Sequence[int]) -> None:
-    progress("")
-    print("  ".join(f"{value!s:>{width}s}" for value, width in zip(values, widths, strict=True)), flush=True)
-
-
-def _append(path: Path, values: Iterable[object], mode: str) -> None:
-    with path.open(mode, newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerow(values)

@@ -75,7 +75,11 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
     rows = [
         {"task": task, "variant": variant}
         | _moments(mass / scene.particle_mass)
-        | {"moved": _moved(first, mass), "distance": _distance(first, mass), "seconds": seconds}
+        | {
+            "moved": _moved(first, mass),
+            "distance": float((first / first.sum() * target_sdf(mass)).sum()),
+            "seconds": seconds,
+        }
         for variant, mass, first, scene in zip(SUITE_VARIANTS, masses, starts, scenes, strict=True)
     ]
     return pd.DataFrame(rows)
@@ -98,11 +102,6 @@ def _moved(start: np.ndarray, mass: np.ndarray) -> float:
 
     change = mass / mass.sum() - start / start.sum()
     return 0.5 * float(np.abs(gaussian_filter(change, SMOOTHING * len(mass), mode="constant")).sum())
-
-
-def _distance(start: np.ndarray, mass: np.ndarray) -> float:
-    """Mean distance of the start's mass from the target [domain units]; both [n, n, n]."""
-    return float((start / start.sum() * target_sdf(mass)).sum())
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:

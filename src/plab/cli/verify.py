@@ -22,8 +22,7 @@ from plab.config import PRECISIONS
 from plab.errors import PlabError, tell
 from plab.submissions.collecting import submission_files
 from plab.submissions.files import read
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import SUFFIX, Submission
+from plab.submissions.schema import SUFFIX, Submission, SubmissionError
 from plab.submissions.verifying import Verification, verify, write_verification
 
 __all__ = ["main"]

@@ -48,8 +48,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--output", type=folder, metavar="FILE", help="by default a .html named like the result or the task"
     )
     arguments = parser.parse_args(argv)
-    usual = settle(arguments, ".html")
-    arguments.output = arguments.output or usual
+    settle(arguments, ".html")
     if arguments.output.suffix.lower() != ".html":
         raise RenderError(f"cannot write {arguments.output}: its suffix must be .html")
     require_writable(arguments.output)

@@ -7,25 +7,21 @@ same HDF5 files as those of a results folder.
 
 from __future__ import annotations
 
-import io
 import lzma
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from plab.results.files import encode, read, replace_file
+from plab.results.files import encode, read, replace_file, zipped
 from plab.results.loading import Row, readable_rows, rows
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult, member_name
 
 __all__ = ["Packed", "pack", "unpack"]
-
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Time of every member, the earliest that zip knows: the same runs give the same bytes."""
 
 
 @dataclass(frozen=True)
@@ -77,29 +73,32 @@ def pack(
     if not archive.name.endswith(ARCHIVE_SUFFIX):
         raise ResultsError(f"an archive's name ends in {ARCHIVE_SUFFIX}: {archive}")
     found, unreadable = readable_rows(source)
-    chosen = _members(filter(wanted or _finished, found))
+    chosen: dict[str, Row] = {}
+    for row in filter(wanted or _finished, found):
+        name = _member(row).as_posix()
+        if name in chosen:
+            raise ResultsError(
+                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
+            )
+        chosen[name] = row
     if not chosen:
         hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
         raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as members:
-        for name, row in sorted(chosen.items()):
-            run = read(row.path)
-            if digits is not None:
-                run = _rounded(run, digits)
-            run = replace(
-                run,
-                # A path of the computer that made it means nothing elsewhere.
-                config=run.config | {"results_dir": "results"},
-                masses=run.masses if keep_masses else {},
-                resume=run.resume if keep_resume else None,
-            )
-            member = zipfile.ZipInfo(name, _EPOCH)
-            member.external_attr = 0o644 << 16
-            members.writestr(member, encode(run, compress=False), zipfile.ZIP_STORED)
-    _make_folder(archive)
+
+    def packed(path: Path) -> bytes:
+        run = read(path) if digits is None else _rounded(read(path), digits)
+        run = replace(
+            run,
+            # A path of the computer that made it means nothing elsewhere.
+            config=run.config | {"results_dir": "results"},
+            masses=run.masses if keep_masses else {},
+            resume=run.resume if keep_resume else None,
+        )
+        return encode(run, compress=False)
+
+    content = zipped(((name, packed(row.path)) for name, row in sorted(chosen.items())), zipfile.ZIP_STORED)
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    replace_file(archive, lzma.compress(content.getvalue(), preset=9), sync=True)
+    replace_file(archive, lzma.compress(content, preset=9), sync=True, folders=True)
     return Packed(len(chosen), archive.stat().st_size, size, unreadable)
 
 
@@ -114,19 +113,6 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
 
     measured = run.iterations.select_dtypes("floating").apply(nearest)
     return replace(run, iterations=run.iterations.assign(**measured), best_loss=float(nearest(run.best_loss)))
-
-
-def _members(wanted: Iterable[Row]) -> dict[str, Row]:
-    """Return the runs to pack by their place in the archive."""
-    chosen: dict[str, Row] = {}
-    for row in wanted:
-        name = _member(row).as_posix()
-        if name in chosen:
-            raise ResultsError(
-                f"{row.path} and {chosen[name].path} are runs of one configuration: remove one"
-            )
-        chosen[name] = row
-    return chosen
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
@@ -152,19 +138,9 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
             raise ResultsError(f"{row.path} would be unpacked to {path}, outside of {folder}")
         if path.exists():
             continue
-        run = read(row.path)
-        _make_folder(path)
-        replace_file(path, encode(run, compress=True), sync=False)
+        replace_file(path, encode(read(row.path), compress=True), sync=False, folders=True)
         written += 1
     return written, len(found) - written
-
-
-def _make_folder(path: Path) -> None:
-    """Make the folder that a file is to be written to."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultsError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _member(row: Row) -> Path:

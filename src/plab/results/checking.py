@@ -38,13 +38,7 @@ _TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong with a file.
-
-    Attributes:
-        path: The file, or the place in an archive.
-        reason: What is wrong, one line.
-        advice: What to do, one line.
-    """
+    """What is wrong with a file, or a run in an archive, and what to do, a line each."""
 
     path: Path
     reason: str
@@ -72,7 +66,9 @@ def check(source: str | Path) -> Iterator[tuple[Path, Problem | None]]:
 
 def problems(run: RunResult) -> list[str]:
     """Return what is wrong with the contents of a run that could be read, nothing if all is well."""
-    found = [*_status(run), *_iterations(run), *_best(run), *_times(run)]
+    found = [*_status(run), *_iterations(run), *_best(run)]
+    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
+        found.append("wall_time has seconds that are negative or not finite")
     if run.status == "finished":
         found += [*_evaluation(run), *_masses(run), *_complete(run)]
     return list(dict.fromkeys(found))
@@ -120,12 +116,10 @@ def _advice_unreadable(path: Path, reason: str) -> str:
         return _GET_RIGHTS
     if reason.startswith(("was written by a newer plab", "has schema version")):
         return "read it with the plab that wrote it"
-    if reason.startswith("cannot be read: it is"):
+    if "not a plab" in reason or reason.startswith("cannot be read: it is"):
         return "move it out of the results"
-    if "not a plab" in reason or not (path.is_file() and h5py.is_hdf5(path)):
-        begun = path.name.endswith(PARTIAL_SUFFIX)
-        cut = "delete it; the run starts afresh" if begun else "delete it and run it again"
-        return "move it out of the results" if "not a plab" in reason else cut
+    if path.name.endswith(PARTIAL_SUFFIX) and not (path.is_file() and h5py.is_hdf5(path)):
+        return "delete it; the run starts afresh"
     return "delete it and run it again"
 
 
@@ -142,11 +136,6 @@ def _status(run: RunResult) -> Iterator[str]:
         yield "config_hash is not that of config"
     if fault := resume_fault(run):
         yield fault
-
-
-def _times(run: RunResult) -> Iterator[str]:
-    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
-        yield "wall_time has seconds that are negative or not finite"
 
 
 def _iterations(run: RunResult) -> Iterator[str]:
@@ -231,15 +220,11 @@ def _masses(run: RunResult) -> Iterator[str]:
 
 
 def _possible(mass: np.ndarray, floor: str) -> bool:
-    """Return whether a tensor of finite numbers can be what some particles spread.
+    """Return whether a tensor of finite numbers, shape [n, n, n], can be what some particles spread.
 
     Masses are not negative, with one exception: with the release's floor, a particle within 0.13 cells of a
     lower face has a negative weight for the second node along that axis, and at least 9/2 times as much for
     the first one.
-
-    Args:
-        mass: The tensor, shape [n, n, n].
-        floor: Whose floor it was, ``plab`` or ``release``.
     """
     allowed = np.zeros(mass.shape, bool)
     if floor == "release":

@@ -61,34 +61,36 @@ def read_curves(source: str | Path | Sequence[str | Path], paths: Iterable[str |
             place = str(path / member) if member else str(path)
             if place in asked:
                 found[place] = _unpacked(*curves)
-    # What could not be read is read once more, to say why.
-    return [found[path] if path in found else _directly(path) for path in wanted]
+    for path in wanted:
+        if path not in found:
+            # What could not be read is read once more, to say why.
+            _, table = read_iterations(path)
+            found[path] = {str(name): table[name].to_numpy() for name in table}
+    return [found[path] for path in wanted]
 
 
 def add_iterations(connection: sqlite3.Connection, sources: Sequence[Path]) -> None:
-    """Add the table ``iterations`` to a connection of :func:`plab.results.connect`.
-
-    Args:
-        connection: The connection.
-        sources: Where it leads.
-    """
+    """Add the table ``iterations`` to a connection of :func:`plab.results.connect` to ``sources``."""
     counted = {run for (run,) in connection.execute("SELECT run FROM runs")}
     names: set[str] = set()
     connection.execute("CREATE TEMP TABLE iterations (run INTEGER)")
-    for run, packed in _numbered(sources):
+    stored = ((place, root, *each) for place, root in enumerate(sources) for each in _stored(root))
+    for place, root, path, member, packed in stored:
+        run = run_number(file_key(root, path), member, place)
         if run not in counted:
             continue
         curves = _unpacked(*packed)
         # SQLite does not tell a from A.
         curves = {name: curves[name] for name in {name.lower(): name for name in curves}.values()}
+        own = {name: quoted(name, '"') for name in curves}
         for name in (name for name in curves if name.lower() not in names):
             names.add(name.lower())
-            connection.execute(f"ALTER TABLE temp.iterations ADD COLUMN {_name(name)}")
-        into = ", ".join(["run", *map(_name, curves)])
-        places = ", ".join("?" * (len(curves) + 1))
+            connection.execute(f"ALTER TABLE temp.iterations ADD COLUMN {own[name]}")
+        into = ", ".join(["run", *own.values()])
+        marks = ", ".join("?" * (len(curves) + 1))
         rows = zip(*(values.tolist() for values in curves.values()), strict=True)
         connection.executemany(
-            f"INSERT INTO temp.iterations ({into}) VALUES ({places})", ((run, *row) for row in rows)
+            f"INSERT INTO temp.iterations ({into}) VALUES ({marks})", ((run, *row) for row in rows)
         )
     connection.execute("CREATE INDEX temp.iterations_by_run ON iterations (run)")
 
@@ -99,13 +101,6 @@ Packed = tuple[str, bytes]
 """Names and types of columns, JSON, and the columns one after the other, compressed."""
 
 _INSIDE = f"{ARCHIVE_SUFFIX}{os.sep}"
-
-
-def _numbered(sources: Sequence[Path]) -> Iterator[tuple[int, Packed]]:
-    """Yield number and iterations of all runs."""
-    for place, root in enumerate(sources):
-        for path, member, packed in _stored(root):
-            yield run_number(file_key(root, path), member, place), packed
 
 
 def _stored(root: Path, wanted: Container[str] | None = None) -> Iterator[tuple[Path, str, Packed]]:
@@ -164,12 +159,3 @@ def _unpacked(types: str, data: bytes) -> Curves:
 @functools.lru_cache
 def _kinds(types: str) -> list[tuple[str, np.dtype]]:
     return [(name, np.dtype(kind)) for name, kind in json.loads(types)]
-
-
-def _directly(path: str) -> Curves:
-    _, table = read_iterations(path)
-    return {str(name): table[name].to_numpy() for name in table}
-
-
-def _name(column: str) -> str:
-    return quoted(column, '"')

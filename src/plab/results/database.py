@@ -120,14 +120,8 @@ class Row:
 
 @dataclass(frozen=True)
 class _Stored:
-    """A run as it is kept: without its folder, and without the sections of its configuration.
-
-    Attributes:
-        member: Its name in an archive, empty for a file of its own.
-        values: As in :class:`Row`.
-        config: Its configuration, with None for sections.
-        sections: Number of each section.
-    """
+    """A run as it is kept: its name in an archive, empty for a file of its own, the values of :class:`Row`,
+    its configuration with None for sections, and the number of each section."""
 
     member: str
     values: dict[str, Any]
@@ -138,17 +132,11 @@ class _Stored:
 class Database:
     """The runs of one folder, archive or file: kept ones where files have not changed, and fresh ones.
 
-    Attributes:
-        missed: Whether a file was gone before it could be read.
+    It ``missed`` a file that was gone before it could be read.
     """
 
     def __init__(self, root: Path, files: Sequence[File]) -> None:
-        """Open the database of a folder.
-
-        Args:
-            root: Folder of results, archive or result file.
-            files: The files that count, as they are now.
-        """
+        """Open the database of a folder, archive or file; ``files`` are those that count, as they are now."""
         self._root, self.missed = root, False
         self._sections: dict[int, tuple[str, dict[str, Any]]] = {}
         self._numbers: dict[tuple[str, bytes], int] = {}
@@ -252,7 +240,8 @@ class Database:
             # What no plab writes may be no JSON: it is read again each time.
             with contextlib.suppress(TypeError, ValueError):
                 if entries or not self._wrong[key]:
-                    texts[key] = json.dumps([_listed(entry) for entry in entries])
+                    listed = [[e.member, e.values | {"path": ""}, e.config, e.sections] for e in entries]
+                    texts[key] = json.dumps(listed)
 
         def write(connection: sqlite3.Connection, outdated: Sequence[bytes]) -> None:
             keys = [(key,) for key in outdated]
@@ -276,8 +265,13 @@ class Database:
             used |= numbers
             tables["run_sections"] += [(run, number) for number in numbers]
             tables["all_runs"].append((run, key, *self._columns(key, entry)))
-            tables["all_evaluations"] += [(run, *each) for each in _evaluation(entry.values)]
-            tables["all_times"] += [(run, *each) for each in _times(entry.values)]
+            for name, value in entry.values.items():
+                if name.startswith(_PHASE):
+                    phase = text(name.removeprefix(_PHASE))
+                    tables["all_times"].append((run, phase, sql_value(value)))
+                elif value == value and name not in _NO_EVALUATION:
+                    scalar = "score" if name == "score_best" else text(name)
+                    tables["all_evaluations"].append((run, scalar, sql_value(value)))
         for name, rows in tables.items():
             if rows:
                 places = ", ".join("?" * len(rows[0]))
@@ -292,19 +286,17 @@ class Database:
         for name in ("sections", "section_keys"):
             connection.execute(f"DELETE FROM {name} WHERE section NOT IN (SELECT section FROM run_sections)")
 
-    def _columns(self, key: bytes, entry: _Stored) -> Iterator[Any]:
-        """Yield a run's row in the table of runs, but for its number and file."""
-        values, config = entry.values, self._config(entry)
+    def _columns(self, key: bytes, entry: _Stored) -> tuple[Any, ...]:
+        """Return a run's row in the table of runs, but for its number and file."""
+        config = self._config(entry)
         file = Path(os.fsdecode(key)) if key else Path(self._root.name)
-        more = {
+        values = entry.values | {
             "path": str(file / entry.member),
             "protocol": lookup(config, "protocol.name"),
             "targets": lookup(config, "targets.source"),
         }
-        yield bool(entry.member)
-        # Counted once all runs are there.
-        yield None
-        yield from (sql_value(more.get(name, values.get(name))) for name in (*COLUMNS, *_MORE))
+        # Whether it counts is known once all runs are there.
+        return bool(entry.member), None, *(sql_value(values.get(name)) for name in (*COLUMNS, *_MORE))
 
 
 def run_number(key: bytes, member: str, place: int = 0) -> int:
@@ -321,9 +313,7 @@ def run_number(key: bytes, member: str, place: int = 0) -> int:
 def tables_of(sources: Sequence[str], connections: Sequence[sqlite3.Connection]) -> sqlite3.Connection:
     """Return the tables of some sources, with the column ``folder`` in that of runs: their source.
 
-    Args:
-        sources: What the sources are called.
-        connections: :meth:`Database.connection` of each; all but the one returned are closed.
+    Of the :meth:`Database.connection` of each all but the one returned are closed.
     """
     names = [quoted(source, "'") for source in sources]
     if len(connections) == 1:
@@ -382,24 +372,6 @@ def quoted(value: str, mark: str) -> str:
 def _number(name: bytes) -> int:
     """Return a number of 63 bits that is as good as a name."""
     return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") >> 1
-
-
-def _listed(entry: _Stored) -> list[Any]:
-    return [entry.member, entry.values | {"path": ""}, entry.config, entry.sections]
-
-
-def _evaluation(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the scalars of the final evaluation, nothing before it."""
-    for name, value in values.items():
-        if value != value or name in _NO_EVALUATION or name.startswith(_PHASE):
-            continue
-        yield "score" if name == "score_best" else text(name), sql_value(value)
-
-
-def _times(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if name.startswith(_PHASE):
-            yield text(name.removeprefix(_PHASE)), sql_value(value)
 
 
 def _leaves(node: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import itertools
 import json
 import math
@@ -49,6 +50,7 @@ __all__ = [
     "replace_file",
     "split_archive",
     "write",
+    "zipped",
 ]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -74,19 +76,18 @@ def write(result: RunResult, path: Path, *, compress: bool = False) -> None:
     replace_file(path, encode(result, compress=compress), sync=compress)
 
 
-def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
-    """Put a file in place in one atomic step.
+def replace_file(path: Path, content: bytes, *, sync: bool, folders: bool = False) -> None:
+    """Create or replace a file in one atomic step.
 
-    Args:
-        path: File to create or replace.
-        content: What it is to hold.
-        sync: Wait until the disk has it.
+    With ``sync`` wait until the disk has it, with ``folders`` make those that it is in.
 
     Raises:
         ResultsError: If the file cannot be written; ``path`` is then as it was.
     """
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
+        if folders:
+            path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             file.write(content)
             if sync:
@@ -99,13 +100,20 @@ def replace_file(path: Path, content: bytes, *, sync: bool) -> None:
         raise ResultsError(f"cannot write {path}: {cause(error, len(content))}") from error
 
 
-def cause(error: OSError, size: int) -> str:
-    """Return why something could not be written, and, where a disk is full, what room it needs.
+def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
+    """Return a zip file of some members; the same ones give the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in members:
+            # The earliest time that zip knows.
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, data, method, 9)
+    return content.getvalue()
 
-    Args:
-        error: What the system answered.
-        size: What was to be written [bytes].
-    """
+
+def cause(error: OSError, size: int) -> str:
+    """Return why ``size`` bytes could not be written, and, where a disk is full, what room they need."""
     why = error.strerror or str(error)
     if error.errno not in _FULL:
         return why
@@ -218,7 +226,11 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
         for name, mass in result.masses.items():
             if given and name == "target":
                 continue
-            _write_sparse(masses.create_group(name), mass, options)
+            flat, group = np.asarray(mass).ravel(), masses.create_group(name)
+            index = np.flatnonzero(flat).astype(np.int32)
+            group.attrs["shape"] = np.shape(mass)
+            group.create_dataset("index", data=index, **options)
+            group.create_dataset("value", data=flat[index], **options)
         if result.resume is not None:
             _write_tree(file.create_group("resume"), result.resume)
         file.flush()
@@ -239,12 +251,15 @@ def opened(path: Path) -> Iterator[h5py.File]:
     inside = split_archive(path)
     with explained(path):
         if inside is None:
-            regular_file(path)
+            found = regular_file(path)
             if path.name.endswith(OLD_ARCHIVE_SUFFIX):
                 raise ResultsError(
                     f"{path} was packed by an older plab: unpack it with a zip program, it holds result files"
                 )
-            _check_file(path)
+            # Of nothing no memory is mapped.
+            if found.st_size:
+                with path.open("rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                    check_heaps(content)
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
@@ -291,14 +306,6 @@ def explained(path: Path) -> Iterator[None]:
         raise ResultsError(f"{path} is truncated or damaged ({one_line(error)})") from error
 
 
-def _check_file(path: Path) -> None:
-    with path.open("rb") as file:
-        # Of nothing no memory is mapped.
-        if os.fstat(file.fileno()).st_size:
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                check_heaps(content)
-
-
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     if file.id.get_create_plist().get_sizes() != (8, 8):
         raise ValueError("its addresses have another length")
@@ -316,14 +323,6 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     if version != SCHEMA_VERSION:
         raise ResultsError(f"{path} has schema version {version}, this plab reads {SCHEMA_VERSION}")
     return file
-
-
-def _write_sparse(group: h5py.Group, mass: np.ndarray, options: dict[str, Any]) -> None:
-    flat = np.asarray(mass).ravel()
-    index = np.flatnonzero(flat).astype(np.int32)
-    group.attrs["shape"] = np.shape(mass)
-    group.create_dataset("index", data=index, **options)
-    group.create_dataset("value", data=flat[index], **options)
 
 
 def _scalars(values: dict[str, Any]) -> dict[str, Any]:

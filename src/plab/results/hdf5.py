@@ -48,25 +48,26 @@ Kind = TypeVar("Kind")
 def check_heaps(content: bytes | mmap.mmap) -> None:
     """See that the heaps of a file come to an end: HDF5 reads one whose objects take no room for ever.
 
-    Args:
-        content: The file.
-
     Raises:
         ValueError: If a heap is damaged.
     """
-    at = content.find(_HEAP)
-    while at >= 0:
-        _check_heap(content, at)
-        at = content.find(_HEAP, at + 1)
+    start = content.find(_HEAP)
+    while start >= 0:
+        place = start + _HEAP_HEADER.size
+        size = _HEAP_HEADER.unpack_from(content, start)[1] if place <= len(content) else 0
+        # What is no heap, but begins as one, HDF5 refuses itself.
+        end = start + size if _LEAST_HEAP <= size <= len(content) - start else 0
+        while end - place >= _OBJECT.size:
+            number, room = _OBJECT.unpack_from(content, place)
+            taken = _OBJECT.size + -(-room // 8) * 8 if number else room
+            if not _OBJECT.size <= taken <= end - place:
+                raise ValueError("a heap of texts is damaged")
+            place += taken
+        start = content.find(_HEAP, start + 1)
 
 
 def attributes(file: h5py.File, group: str = "/", names: Container[str] | None = None) -> dict[str, Any]:
-    """Return the attributes of a group, scalars as plain Python ones.
-
-    Args:
-        file: An open file.
-        group: Name of the group; by default the file itself.
-        names: Which attributes to return if they are there; by default all.
+    """Return the attributes of a group, or those of them that are named, scalars as plain Python ones.
 
     Raises:
         KeyError: If there is no such group.
@@ -159,23 +160,6 @@ def tree(file: h5py.File, group: str) -> dict[str, Any]:
     return _tree(_group(file.id, group), 0)
 
 
-def _check_heap(content: bytes | mmap.mmap, start: int) -> None:
-    place = start + _HEAP_HEADER.size
-    if place > len(content):
-        return
-    _, size = _HEAP_HEADER.unpack_from(content, start)
-    # What is no heap, but begins as one, HDF5 refuses itself.
-    if size < _LEAST_HEAP or size > len(content) - start:
-        return
-    end = start + size
-    while end - place >= _OBJECT.size:
-        number, room = _OBJECT.unpack_from(content, place)
-        taken = _OBJECT.size + -(-room // 8) * 8 if number else room
-        if not _OBJECT.size <= taken <= end - place:
-            raise ValueError("a heap of texts is damaged")
-        place += taken
-
-
 def _tree(place: h5g.GroupID, depth: int) -> dict[str, Any]:
     if depth > _DEPTH:
         raise ValueError(f"it has groups in groups, {depth} deep")
@@ -187,18 +171,21 @@ def _tree(place: h5g.GroupID, depth: int) -> dict[str, Any]:
             found[name] = _tree(member, depth + 1)
         else:
             dataset = _dataset(place, name)
-            text = h5py.check_string_dtype(dataset.dtype) is not None
-            found[name] = _string(dataset, name) if text else _numbers(dataset, name)
+            if h5py.check_string_dtype(dataset.dtype) is None:
+                found[name] = _numbers(dataset, name)
+            elif dataset.shape == ():
+                found[name] = h5py.Dataset(dataset).asstr()[()]
+            else:
+                raise ValueError(f"{name} is a list of texts")
     return found
 
 
 def _names(place: h5g.GroupID) -> list[str]:
     """Return what the attribute ``columns`` says."""
     names = _value(place, b"columns")
-    if not isinstance(names, np.ndarray) or names.ndim != 1:
-        raise ValueError("columns is no list of names")
+    listed = isinstance(names, np.ndarray) and names.ndim == 1
     # Of no columns HDF5 keeps no type of names.
-    if not all(isinstance(name, str) for name in names):
+    if not listed or not all(isinstance(name, str) for name in names):
         raise ValueError("columns is no list of names")
     return list(names)
 
@@ -251,12 +238,6 @@ def _numbers(dataset: h5d.DatasetID, name: str) -> np.ndarray:
     values = np.empty(dataset.shape, kind)
     dataset.read(h5s.ALL, h5s.ALL, values)
     return values
-
-
-def _string(dataset: h5d.DatasetID, name: str) -> str:
-    if dataset.shape != ():
-        raise ValueError(f"{name} is a list of texts")
-    return h5py.Dataset(dataset).asstr()[()]
 
 
 def _value(place: h5g.GroupID, name: bytes) -> Any:

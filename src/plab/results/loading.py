@@ -58,14 +58,9 @@ _SUFFIXES = (SUFFIX, ARCHIVE_SUFFIX, OLD_ARCHIVE_SUFFIX)
 _LOOKS = 3
 """How often a folder is looked through at most while runs end in it."""
 
-_ORIGIN = {
-    "started": "start_time",
-    "device": "device",
-    "precision": "precision",
-    "batch": "batch",
-    "plab": "plab",
-    "git_commit": "git_commit",
-}
+_ALIKE = ("device", "precision", "batch", "plab", "git_commit")
+
+_ORIGIN = {"started": "start_time"} | {name: name for name in _ALIKE}
 """Column to attribute of the group ``provenance``."""
 
 _NAMES = frozenset(_ORIGIN.values())
@@ -118,15 +113,9 @@ def rows(
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    found: list[Row] = []
-    unreadable: list[ResultsError] = []
-    for root in places(source):
-        for entry in _all_rows(root, database):
-            if isinstance(entry, ResultsError):
-                unreadable.append(entry)
-            else:
-                found.append(entry)
-    return _without_repetitions(found), unreadable
+    entries = [entry for root in places(source) for entry in _all_rows(root, database)]
+    found = [entry for entry in entries if isinstance(entry, Row)]
+    return _without_repetitions(found), [entry for entry in entries if isinstance(entry, ResultsError)]
 
 
 def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
@@ -217,17 +206,22 @@ def read_rows(path: Path) -> Iterator[Row | ResultsError]:
 
 
 def read_each(path: Path, extract: Callable[[h5py.File, Path], T]) -> Iterator[T | ResultsError]:
-    """Yield something of a result file or of each run of an archive, and what is wrong where there is none.
+    """Yield what ``extract`` takes from a result file or from each run of an archive, or what is wrong.
 
-    Args:
-        path: The file.
-        extract: Takes it from an open file; is also given the path, of a run in an archive its place there.
+    It is given the open file and the path, of a run in an archive its place there.
     """
     try:
         if path.name.endswith(ARCHIVE_SUFFIX):
             with opened_archive(path) as archive:
                 for name in members(archive):
-                    yield _of_member(archive, path, name, extract)
+                    place = path / name
+                    try:
+                        with explained(place):
+                            image = member_bytes(archive, name)
+                        with opened_image(image, place) as file:
+                            yield extract(file, place)
+                    except ResultsError as error:
+                        yield error
         else:
             with opened(path) as file:
                 yield extract(file, path)
@@ -278,18 +272,6 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
         loose = [row for row in best if split_archive(row.path) is None]
         kept += loose or best[:1]
     return kept
-
-
-def _of_member(
-    archive: zipfile.ZipFile, path: Path, name: str, extract: Callable[[h5py.File, Path], T]
-) -> T | ResultsError:
-    try:
-        with explained(path / name):
-            image = member_bytes(archive, name)
-        with opened_image(image, path / name) as file:
-            return extract(file, path / name)
-    except ResultsError as error:
-        return error
 
 
 def _row(file: h5py.File, path: Path) -> Row:

@@ -47,11 +47,7 @@ def connect(
 def query(
     source: str | Path | Sequence[str | Path], sql: str
 ) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    """Answer an SQL query.
-
-    Args:
-        source: As for :func:`connect`.
-        sql: The query.
+    """Answer an SQL query to the tables of :func:`connect`.
 
     Returns:
         Names of the columns, the rows, and what could not be read, hence is not in them.

@@ -10,8 +10,8 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,10 +64,8 @@ class RunFile:
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
         # Rows not yet in the table, the last one first: ``(row, (row before, ...))``. One object with
         # the result: an interrupt may arrive between any two assignments.
-        self._state: tuple[RunResult, tuple[Any, ...]] = (
-            RunResult(config, config_hash(config), provenance=provenance(config)),
-            (),
-        )
+        known = RunResult(config, config_hash(config), provenance=provenance(config))
+        self._state: tuple[RunResult, tuple[Any, ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._lock: Lock | None = None
         # What is there before the run begins: folders made for it, files, iterations.
@@ -81,7 +79,9 @@ class RunFile:
             return
         try:
             self._made = make_folder(self.path.parent)
-            _probe(self.path.parent)
+            # A file without a name, of which a process that is killed leaves nothing.
+            with tempfile.TemporaryFile(dir=self.path.parent) as probe:
+                probe.write(bytes(_PROBE_BYTES))
             self._lock_and_look(config["force"])
         except OSError as error:
             self._let_go()
@@ -183,15 +183,6 @@ class RunFile:
         if self._lock is not None:
             self._lock.release()
 
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        """Add the time spent inside the ``with`` block to the wall time of a phase."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.spend(name, time.perf_counter() - start)
-
     def spend(self, name: str, seconds: float) -> None:
         """Add to the wall time of a phase."""
         times = self._state[0].wall_time
@@ -227,12 +218,8 @@ class RunFile:
         self._written = time.monotonic()
 
     def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
-        """Write the final file and remove the partial one.
-
-        Args:
-            evaluation: Scalars of the final evaluation.
-            masses: Mass tensors to add, each of shape [n, n, n].
-        """
+        """Write the final file, with the scalars of the evaluation and more mass tensors, each of shape
+        [n, n, n], and remove the partial one."""
         result = dataclasses.replace(
             self.result,
             status="finished",
@@ -272,18 +259,14 @@ class RunFile:
             except ResultsError as error:
                 _move_aside(path, error)
                 continue
-            if earlier.resume is not None:
-                self._resume(earlier)
-
-    def _resume(self, earlier: RunResult) -> None:
-        changes = version_changes(earlier.provenance, self.result.provenance)
-        if changes:
-            _log.warning("resuming %s, begun with other versions: %s", self.partial_path, ", ".join(changes))
-        first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
-        self._state = (
-            dataclasses.replace(earlier, status="running", message="", provenance=first, path=None),
-            (),
-        )
+            if earlier.resume is None:
+                continue
+            if changes := version_changes(earlier.provenance, self.result.provenance):
+                listed = ", ".join(changes)
+                _log.warning("resuming %s, begun with other versions: %s", self.partial_path, listed)
+            first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
+            known = dataclasses.replace(earlier, status="running", message="", provenance=first, path=None)
+            self._state = known, ()
 
 
 def _move_aside(path: Path, reason: ResultsError) -> None:
@@ -302,15 +285,7 @@ def _refuse_newer(*paths: Path) -> None:
         try:
             with opened(path):
                 pass
-        except NewerSchemaError:
-            raise
-        except ResultsError:
+        except ResultsError as error:
             # Missing or damaged: what is done about it depends on what it was.
-            pass
-
-
-def _probe(folder: Path) -> None:
-    """Raise OSError if a folder cannot be written or has no room."""
-    # A file without a name, of which a process that is killed leaves nothing.
-    with tempfile.TemporaryFile(dir=folder) as probe:
-        probe.write(bytes(_PROBE_BYTES))
+            if isinstance(error, NewerSchemaError):
+                raise

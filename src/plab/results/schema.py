@@ -341,11 +341,8 @@ def final_path(partial: Path) -> Path:
 
 
 def parse_member(path: Path) -> dict[str, str] | None:
-    """Return task, variant, method and seed that a path made by :func:`member_name` tells, None for others.
-
-    Args:
-        path: Path of a result file, or of a file beside it with the same stem.
-    """
+    """Return task, variant, method and seed that a path made by :func:`member_name` tells, with any suffix;
+    None for others."""
     found = re.fullmatch(
         r"(?P<task>.+)-v(?P<variant>[^/]+)/(?P<method>[^/]+)/seed(?P<seed>\d+)-[0-9a-f]{8}\..+",
         "/".join(path.parts[-3:]),

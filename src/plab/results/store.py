@@ -120,22 +120,29 @@ class Store:
         if self.connection is not None and not (self.changed or self._outdated):
             return
         kept = {key: identity for key, identity in self._settled.items() if read.get(key)}
-
-        def complete(connection: sqlite3.Connection) -> None:
-            connection.execute("BEGIN")
-            connection.executemany("DELETE FROM files WHERE path = ?", [(key,) for key in self._outdated])
-            connection.executemany("INSERT INTO files VALUES (?, ?)", [(key, kept.get(key)) for key in read])
-            write(connection, self._outdated)
-            connection.execute("COMMIT")
-
         base, self.connection = self.connection, None
+
+        def fill(working: sqlite3.Connection) -> None:
+            if base is not None:
+                base.backup(working)
+            for setting in ("journal_mode = OFF", "synchronous = OFF", f"cache_size = -{_CACHE_KIB}"):
+                working.execute(f"PRAGMA {setting}")
+            if base is None:
+                working.executescript(self._layout)
+                working.execute(f"PRAGMA application_id = {_APPLICATION}")
+            working.execute("BEGIN")
+            working.executemany("DELETE FROM files WHERE path = ?", [(key,) for key in self._outdated])
+            working.executemany("INSERT INTO files VALUES (?, ?)", [(key, kept.get(key)) for key in read])
+            write(working, self._outdated)
+            working.execute("COMMIT")
+
         try:
             if kept or self._worth_keeping:
-                self.connection = self._kept(base, complete)
+                self.connection = self._kept(fill)
             if self.connection is None and lasting:
                 # SQLite's own temporary file, which goes with the connection.
                 self.connection = sqlite3.connect("", isolation_level=None)
-                self._filled(self.connection, base, complete)
+                fill(self.connection)
         finally:
             if base is not None:
                 base.close()
@@ -156,9 +163,7 @@ class Store:
                     return _immutable(place)
         return None
 
-    def _kept(
-        self, base: sqlite3.Connection | None, complete: Callable[[sqlite3.Connection], None]
-    ) -> sqlite3.Connection | None:
+    def _kept(self, fill: Callable[[sqlite3.Connection], None]) -> sqlite3.Connection | None:
         """Put up-to-date tables in the first place that can be written; None where there is none."""
         for place in self._places:
             temporary = place.with_name(f"{place.name}.{uuid.uuid4().hex}.tmp")
@@ -170,7 +175,7 @@ class Store:
                     f"{temporary.absolute().as_uri()}?nolock=1", uri=True, isolation_level=None
                 )
                 with contextlib.closing(working):
-                    self._filled(working, base, complete)
+                    fill(working)
                 with temporary.open("r+b") as file:
                     checksum = self._checksum(file)
                     file.seek(_CHECKSUM_AT)
@@ -183,22 +188,6 @@ class Store:
             _clear_up(place)
             return connection
         return None
-
-    def _filled(
-        self,
-        working: sqlite3.Connection,
-        base: sqlite3.Connection | None,
-        complete: Callable[[sqlite3.Connection], None],
-    ) -> None:
-        """Fill an empty database: what there is, brought up to date."""
-        if base is not None:
-            base.backup(working)
-        for setting in ("journal_mode = OFF", "synchronous = OFF", f"cache_size = -{_CACHE_KIB}"):
-            working.execute(f"PRAGMA {setting}")
-        if base is None:
-            working.executescript(self._layout)
-            working.execute(f"PRAGMA application_id = {_APPLICATION}")
-        complete(working)
 
     def _checksum(self, file: BinaryIO) -> int:
         """Return the CRC-32 of a file, its own place left out; another layout has another one."""

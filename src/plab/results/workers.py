@@ -35,9 +35,7 @@ _LOST = (OSError, EOFError, pickle.PickleError, AttributeError, ImportError)
 def each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
     """Yield what a function returns for each item, in order, by several processes where there are many.
 
-    Args:
-        function: Of a module, by whose name other processes find it.
-        items: What to call it with.
+    They find the function by its name in its module.
     """
     workers = [_start() for _ in range(min(_processors() - 1, len(items) // _WORTH))]
     if not workers:

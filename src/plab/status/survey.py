@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -158,7 +158,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     runs = {key: Run(*key) for key in keys}
     others = 0
     for row in fitting:
-        run = runs.get(_key(row))
+        run = runs.get(_names(row.values))
         # Of several settings of the same run the best one counts.
         others += run is None or run.state != "missing"
         if run is not None:
@@ -166,12 +166,20 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     for key in begun:
         if key in runs and runs[key].state not in ("done", "running"):
             runs[key].state = "running"
-    means = _mean_seconds(runs.values())
+    times: dict[tuple[str, str], list[float]] = defaultdict(list)
     for run in runs.values():
-        _estimate(run, means.get((run.task, run.method)))
-    groups = [
-        _group(task, method, runs.values(), means) for task, method in dict.fromkeys(_pairs(runs.values()))
-    ]
+        if run.state == "done":
+            times[run.task, run.method].append(run.seconds)
+    means = {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
+    for run in runs.values():
+        mean = means.get((run.task, run.method))
+        if run.state == "done":
+            run.left = 0.0
+        elif run.left is None and mean is not None:
+            # Its own speed has not said so.
+            run.left = mean * max(1.0 - (run.done / run.total if run.total else 0.0), 0.0)
+    pairs = dict.fromkeys((run.task, run.method) for run in runs.values())
+    groups = [_group(task, method, runs.values(), means) for task, method in pairs]
     return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable], protocol)
 
 
@@ -179,10 +187,14 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
 
 def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> Iterable[Key]:
-    present = list(dict.fromkeys(_key(row) for row in found))
+    present = list(dict.fromkeys(_names(row.values) for row in found))
     if not chosen.keys:
         # Of a run without a file only its name is known.
-        present += [key for key in dict.fromkeys(begun) if key not in present and chosen(_values(key), {})]
+        present += [
+            key
+            for key in dict.fromkeys(begun)
+            if key not in present and chosen(dict(zip(NAMES, key, strict=True)), {})
+        ]
     if missing or (not present and chosen.choices):
         return _suite(present, chosen)
     # What the words name takes the place of what a run has.
@@ -202,7 +214,7 @@ def _suite(present: Sequence[Key], chosen: Selection) -> Iterable[Key]:
     open_choices = {
         "task": suite_tasks(),
         "variant": list(SUITE_VARIANTS),
-        "method": _in_order(methods, PAPER_METHODS) or list(PAPER_METHODS),
+        "method": sorted(methods, key=lambda name: _place(name, PAPER_METHODS)) or list(PAPER_METHODS),
         "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
     }
     asked = [chosen.choices.get(name, open_choices[name]) for name in NAMES]
@@ -213,11 +225,6 @@ def _suite(present: Sequence[Key], chosen: Selection) -> Iterable[Key]:
 def _require_few(count: int) -> None:
     if count > MOST_RUNS:
         raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
-
-
-def _in_order(names: Iterable[str], known: Sequence[str]) -> list[str]:
-    """Return names in the order of those that are known, the others after them."""
-    return sorted(names, key=lambda name: _place(name, known))
 
 
 def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
@@ -232,30 +239,18 @@ def _rank(key: Key) -> tuple[Any, ...]:
     return *(_place(name, list(known)) for name, known in orders), number, seed
 
 
-def _values(key: Key) -> dict[str, str]:
-    return dict(zip(NAMES, key, strict=True))
-
-
-def _key(row: Row) -> Key:
-    return _names(row.values)
-
-
 def _names(values: Mapping[str, Any]) -> Key:
     task, variant, method, seed = (str(values[name]) for name in NAMES)
     return task, variant, method, seed
 
 
-def _state(row: Row) -> str:
-    if row.values["status"] == "finished":
-        return "done"
-    if split_archive(row.path) is None and held(row.path):
-        return "running"
-    return "failed" if row.values["status"] == "failed" else "interrupted"
-
-
 def _take(run: Run, row: Row) -> None:
     """Describe a run by a row of the results, unless a better one of the same run has come before."""
-    state = _state(row)
+    state = "failed" if row.values["status"] == "failed" else "interrupted"
+    if row.values["status"] == "finished":
+        state = "done"
+    elif split_archive(row.path) is None and held(row.path):
+        state = "running"
     if STATES.index(state) >= STATES.index(run.state):
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
@@ -318,28 +313,6 @@ def _together(origin: dict[str, Any], written: float, spent: float) -> float:
     return max((written - started) / spent, 1.0)
 
 
-def _mean_seconds(runs: Iterable[Run]) -> dict[tuple[str, str], float]:
-    """Return the mean wall time [s] of the runs that are done, by task and method."""
-    times: dict[tuple[str, str], list[float]] = {}
-    for run in runs:
-        if run.state == "done":
-            times.setdefault((run.task, run.method), []).append(run.seconds)
-    return {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
-
-
-def _estimate(run: Run, mean: float | None) -> None:
-    """Say how long a run that is not done will take, if its own speed has not said so."""
-    if run.state == "done":
-        run.left = 0.0
-    elif run.left is None and mean is not None:
-        share = run.done / run.total if run.total else 0.0
-        run.left = mean * max(1.0 - share, 0.0)
-
-
-def _pairs(runs: Iterable[Run]) -> Iterable[tuple[str, str]]:
-    return ((run.task, run.method) for run in runs)
-
-
 def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:
     own = [run for run in runs if (run.task, run.method) == (task, method)]
     counts = Counter(run.state for run in own)
@@ -357,9 +330,5 @@ def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, s
 
 def _sum(values: Iterable[float | None]) -> float | None:
     """Add numbers; None if one of them is not known."""
-    total = 0.0
-    for value in values:
-        if value is None:
-            return None
-        total += value
-    return total
+    known = list(values)
+    return None if None in known else float(sum(value for value in known if value is not None))

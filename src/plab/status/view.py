@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from plab.errors import ArgumentError
-from plab.status.survey import STATES, Run, Survey
+from plab.status.survey import STATES, Survey
 
 __all__ = ["duration", "show", "watch"]
 
@@ -90,11 +90,7 @@ def _sums(found: Survey) -> list[str]:
 
 
 def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.sleep) -> None:
-    """Show all runs on a terminal until each is done or has failed.
-
-    Args:
-        look: Finds out what has become of them.
-        pause: Waits for some time [s].
+    """Show all runs on a terminal until each is done or has failed; ``pause`` waits for some time [s].
 
     Raises:
         plab.errors.ArgumentError: If there is no terminal.
@@ -120,18 +116,14 @@ def _screen(found: Survey, room: int) -> Group:
     if len(runs) > room:
         runs = sorted(runs, key=lambda run: _ORDER.index(run.state))[: max(room, 1)]
     for run in runs:
-        table.add_row(*_cells(run))
+        state = Text(run.state, _COLOURS[run.state])
+        if run.message:
+            state.append(f": {run.message}", "default")
+        done = f"{run.done}/{run.total}" if run.total else ""
+        rate = "" if run.rate is None else f"{run.rate:.3g}/s"
+        name = Text(f"{run.task}-v{run.variant} {run.method} seed {run.seed}")
+        left = None if run.left is None else run.left * run.together
+        # Where runs share a process, each has to wait for the others.
+        table.add_row(name, state, done, rate, duration(left) if run.state == "running" else "")
     rest = len(found.runs) - len(runs)
     return Group(table, *([f"... and {rest} more"] if rest else []), *_sums(found))
-
-
-def _cells(run: Run) -> tuple[Text, ...]:
-    state = Text(run.state, _COLOURS[run.state])
-    if run.message:
-        state.append(f": {run.message}", "default")
-    done = f"{run.done}/{run.total}" if run.total else ""
-    rate = "" if run.rate is None else f"{run.rate:.3g}/s"
-    # Where runs share a process, each has to wait for the others.
-    left = duration(None if run.left is None else run.left * run.together) if run.state == "running" else ""
-    name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
-    return Text(name), state, Text(done), Text(rate), Text(left)

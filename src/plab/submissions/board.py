@@ -18,12 +18,10 @@ from plab.report.methods import GRADIENT, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.results import ResultsError, Row, config_dict
 from plab.results.loading import readable_rows
-from plab.submissions.card import Card
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.files import read
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import UNSEEN, Configuration, Digests, Submission
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, Verification, read_verification
+from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submission, SubmissionError
+from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["Board", "Line", "Section", "board"]
@@ -45,9 +43,10 @@ _PAPER_STEPS = {True: 200 * _EPISODE, False: 10_000 * _EPISODE}
 
 @dataclass(frozen=True)
 class Point:
-    """A score that was reached after so many environment steps; ``exact`` is that in float64, or NaN."""
+    """A score that was reached after so many environment steps, in a task and a variant; ``exact`` is that in
+    float64, or NaN."""
 
-    configuration: Configuration
+    place: tuple[str, str]
     steps: int
     score: float
     exact: float = math.nan
@@ -122,11 +121,9 @@ _RARE = (("suite", "release"), ("unseen", "release"))
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
-    """Make the leaderboard of a folder.
+    """Make the leaderboard of a folder of submissions, each with what ``plab.verify`` has kept beside it.
 
-    Args:
-        folder: Folder of submissions, each with what ``plab.verify`` has kept beside it.
-        overrides: Settings of every configuration that belongs here, if not plab's own.
+    Overrides are settings of every configuration that belongs here, if not plab's own.
 
     Raises:
         SubmissionError: If there is no such folder.
@@ -136,25 +133,24 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
         raise SubmissionError(f"there is no folder {folder}")
     tables: dict[tuple[str, str], list[Line]] = defaultdict(list)
     left_out: list[str] = []
-    known = _Known(tuple(overrides))
     for path in submission_files(folder):
         try:
-            for place, line in _handed_in(path, known):
+            for place, line in _handed_in(path, tuple(overrides)):
                 tables[place].append(line)
         except ResultsError as error:
             left_out.append(str(error))
     for place, line in _own():
         tables[place].append(line)
     places = [*_USUAL, *(place for place in _RARE if tables[place])]
-    sections = [_section(kind, terms, tables[kind, terms]) for kind, terms in places]
+    sections = []
+    for kind, terms in places:
+        title, targets = _SETS[kind]
+        if terms != "plab":
+            title += " on its terms" if kind == "authors" else " on the authors' terms"
+        protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
+        lines = _best_first(tables[kind, terms])
+        sections.append(Section(title, protocol, len(_expected(kind)), lines))
     return Board((*sections, _paper()), tuple(left_out))
-
-
-def _section(kind: str, terms: str, lines: Iterable[Line]) -> Section:
-    title, targets = _SETS[kind]
-    title += "" if terms == "plab" else " on its terms" if kind == "authors" else " on the authors' terms"
-    protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
-    return Section(title, protocol, len(_expected(kind)), _best_first(lines))
 
 
 def _best_first(lines: Iterable[Line]) -> tuple[Line, ...]:
@@ -195,9 +191,9 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
     """Return the best point of each configuration within a budget."""
     found: dict[tuple[str, str], Point] = {}
     for point in points:
-        place = point.configuration.task, point.configuration.variant
-        if point.steps <= limit and (place not in found or point.score > found[place].score):
-            found[place] = point
+        best = found.get(point.place)
+        if point.steps <= limit and (best is None or point.score > best.score):
+            found[point.place] = point
     return found
 
 
@@ -209,30 +205,25 @@ def _composed(place: Configuration, overrides: tuple[str, ...]) -> Config:
     return place.config(overrides)
 
 
-class _Known:
-    """Digests of the configurations that belong to a board, composed once."""
-
-    def __init__(self, overrides: tuple[str, ...]) -> None:
-        self._overrides = overrides
-        self._digests: dict[Configuration, Digests] = {}
-
-    def fit(self, submission: Submission) -> str | None:
-        """Return the name of a configuration that is another one here, None if there is none."""
-        for entry in submission.entries:
-            place = entry.configuration
-            # The scene is the same, and the authors' files need not be here.
-            own = replace(place, targets="suite")
-            if own not in self._digests:
-                self._digests[own] = Digests.of(_composed(own, self._overrides))
-            known = self._digests[own]
-            if entry.digests.scene != known.scene:
-                return f"the scene of {place.name}"
-            if place.targets == "suite" and entry.digests.target != known.target:
-                return f"the target of {place.name}"
-        return None
+@functools.cache
+def _digests(place: Configuration, overrides: tuple[str, ...]) -> Digests:
+    return Digests.of(_composed(place, overrides))
 
 
-def _handed_in(path: Path, known: _Known) -> Iterator[tuple[tuple[str, str], Line]]:
+def _stranger(submission: Submission, overrides: tuple[str, ...]) -> str | None:
+    """Return the name of a configuration that is another one here, None if there is none."""
+    for entry in submission.entries:
+        place = entry.configuration
+        # The scene is the same, and the authors' files need not be here.
+        known = _digests(replace(place, targets="suite"), overrides)
+        if entry.digests.scene != known.scene:
+            return f"the scene of {place.name}"
+        if place.targets == "suite" and entry.digests.target != known.target:
+            return f"the target of {place.name}"
+    return None
+
+
+def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[str, str], Line]]:
     """Yield the lines of a submission, with the tables that they belong to.
 
     Raises:
@@ -245,7 +236,7 @@ def _handed_in(path: Path, known: _Known) -> Iterator[tuple[tuple[str, str], Lin
         raise SubmissionError(
             f"{path} is of physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
         )
-    if other := known.fit(submission):
+    if other := _stranger(submission, overrides):
         raise SubmissionError(f"{path}: {other} is another one than on this leaderboard")
     verification = read_verification(submission)
     status = "claimed"
@@ -255,21 +246,13 @@ def _handed_in(path: Path, known: _Known) -> Iterator[tuple[tuple[str, str], Lin
             raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
         status = "verified" if verification.outcomes == {HOLDS} else "claimed"
     tables: dict[tuple[str, str], list[Point]] = defaultdict(list)
-    for place, point in _points(submission, verification):
-        tables[place].append(point)
-    for place, points in tables.items():
-        yield place, _line(submission.card, submission.track, status, place[0], points)
-
-
-def _points(
-    submission: Submission, verification: Verification | None
-) -> Iterator[tuple[tuple[str, str], Point]]:
     for number, entry in enumerate(submission.entries):
         scores = {} if verification is None else verification.verdicts[number].scores
-        place = entry.configuration
-        kind = "unseen" if place.unseen else place.targets
-        score = scores.get("float32", entry.score)
-        yield (kind, place.terms), Point(place, entry.steps, score, scores.get("float64", math.nan))
+        own, score = entry.configuration, scores.get("float32", entry.score)
+        point = Point((own.task, own.variant), entry.steps, score, scores.get("float64", math.nan))
+        tables["unseen" if own.unseen else own.targets, own.terms].append(point)
+    for place, points in tables.items():
+        yield place, _line(submission.card, submission.track, status, place[0], points)
 
 
 # -------------------------------------------------------------------------------------------- first entries
@@ -286,9 +269,7 @@ def _own() -> tuple[tuple[tuple[str, str], Line], ...]:
     }
     for name, place in archives.items():
         for card, runs in _runs(name):
-            points = [
-                Point(_place(row, *place), steps_to_best(row), row.values["score_best"]) for row in runs
-            ]
+            points = [Point(_place(row), steps_to_best(row), row.values["score_best"]) for row in runs]
             found.append((place, _line(card, "plans", "own runs", place[0], points)))
     return tuple(found)
 
@@ -313,8 +294,8 @@ def _of_today(config: Mapping[str, Any]) -> bool:
     return config["task"]["target"] == config_dict(today)["task"]["target"]
 
 
-def _place(row: Row, targets: str, terms: str) -> Configuration:
-    return Configuration(row.values["task"], row.values["variant"], targets, terms)
+def _place(row: Row) -> tuple[str, str]:
+    return row.values["task"], row.values["variant"]
 
 
 def _paper() -> Section:
@@ -324,20 +305,12 @@ def _paper() -> Section:
     for name, rows in table.groupby("method", sort=False):
         look = method(str(name))
         gradient = look.kind == GRADIENT
-        points = [
-            Point(
-                Configuration(row.task, row.variant, "authors", "release"),
-                _PAPER_STEPS[gradient],
-                row.iou_mean,
-            )
-            for row in rows.itertuples()
-        ]
+        steps = _PAPER_STEPS[gradient]
+        points = [Point((row.task, row.variant), steps, row.iou_mean) for row in rows.itertuples()]
         card = replace(PAPER, name=look.label, gradient=gradient)
         lines.append(_line(card, "plans" if gradient else "policies", "printed", "authors", points))
     for card, runs in _runs("release"):
-        points = [
-            Point(_place(row, "authors", "release"), _PAPER_STEPS[True], row.values["score"]) for row in runs
-        ]
+        points = [Point(_place(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
         lines.append(_line(card, "plans", "own runs", "authors", points))
     protocol = (
         f"{_ORIGIN['release']}; the authors' target files. The score is that of the last iteration as it was "

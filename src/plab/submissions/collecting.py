@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from plab.config import Config, load_config
+from plab.config import load_config
 from plab.config.selection import Selection
 from plab.render import RenderError, recording
 from plab.report.series import load_rows
 from plab.results import Row
 from plab.results.loading import readable_rows
 from plab.submissions.files import read
-from plab.submissions.members import SubmissionError
 from plab.submissions.playing import play_policy
 from plab.submissions.policies import load
-from plab.submissions.schema import SUFFIX, UNSEEN, Configuration, Digests, Entry, configuration_of
+from plab.submissions.schema import (
+    SUFFIX,
+    Configuration,
+    Digests,
+    Entry,
+    SubmissionError,
+    configuration_of,
+    variant_words,
+)
 
 __all__ = ["from_policies", "from_sources", "steps_to_best", "submission_files"]
 
@@ -29,14 +36,8 @@ def submission_files(source: Path) -> list[Path]:
 
 
 def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
-    """Collect plans.
-
-    Args:
-        sources: Folders of recordings, or folders, files and archives of results.
-        chosen: Which runs of results to take.
-
-    Returns:
-        The entries, in the order of their configurations.
+    """Collect plans from folders of recordings, or from the chosen runs of folders, files and archives of
+    results, in the order of their configurations.
 
     Raises:
         SubmissionError: If there is nothing, or something twice.
@@ -46,7 +47,12 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
     for source in sources:
         recordings = submission_files(source)
         groups = [(path, list(read(path).entries)) for path in recordings]
-        groups += [] if recordings else [(row.path, [_of_run(row)]) for row in _rows(source, chosen)]
+        if not recordings:
+            rows, unreadable = readable_rows(source)
+            if unreadable:
+                raise unreadable[0]
+            finished = (row for row in rows if row.values["status"] == "finished")
+            groups += [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
         for path, entries in groups:
             for place in {entry.configuration for entry in entries}:
                 if place in found:
@@ -57,14 +63,6 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
     if not found:
         raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
     return [entry for place in sorted(found) for entry in found[place][1]]
-
-
-def _rows(source: Path, chosen: Selection) -> list[Row]:
-    """Return the finished runs that are meant."""
-    rows, unreadable = readable_rows(source)
-    if unreadable:
-        raise unreadable[0]
-    return [row for row in rows if row.values["status"] == "finished" and chosen(row.values, row.config)]
 
 
 def _of_run(row: Row) -> Entry:
@@ -109,7 +107,7 @@ def from_policies(
             files[name] = path.read_bytes()
         except OSError as error:
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
-        cfgs = list(_configs(task, variants, overrides))
+        cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
         played = play_policy(cfgs, load(name, files[name]), str(path), "float32")
         for cfg, one in zip(cfgs, played, strict=True):
             place = configuration_of(cfg)
@@ -117,10 +115,3 @@ def from_policies(
                 raise SubmissionError(f"{place.name}: the simulation broke off, {one.failure}")
             entries.append(Entry(place, Digests.of(cfg), steps, one.score, policy=name))
     return entries, files
-
-
-def _configs(task: str, variants: Sequence[str], overrides: Sequence[str]) -> Iterator[Config]:
-    for variant in variants:
-        seed = variant.removeprefix("random")
-        chosen = ["variant=random", f"seed_scene={seed}"] if variant in UNSEEN else [f"variant={variant}"]
-        yield load_config([f"task={task}", *chosen, *overrides])

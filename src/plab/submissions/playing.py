@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
-from plab.submissions.members import SubmissionError
 from plab.submissions.policies import Policy
+from plab.submissions.schema import SubmissionError
 
 __all__ = ["Played", "play_plans", "play_policy"]
 
@@ -21,32 +20,21 @@ _BATCH = 25
 
 @dataclass(frozen=True)
 class Played:
-    """What an episode came to.
-
-    Attributes:
-        score: Score of the last state; NaN if it broke off.
-        failure: When and why it broke off; empty if it did not.
-    """
+    """The score of an episode's last state, NaN if it broke off, and when and why it did."""
 
     score: float
     failure: str = ""
 
 
 def play_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], precision: str) -> list[Played]:
-    """Play a plan in each configuration.
-
-    Args:
-        cfgs: Configurations of one task that fit into one simulator.
-        plans: Actions of each, shape [T, A].
-        precision: ``float32`` or ``float64``.
+    """Play a plan, shape [T, A], in each of several configurations of one task.
 
     Raises:
         SubmissionError: If a plan has not as many steps or components as its task.
     """
     played: list[Played] = []
-    for start in range(0, len(cfgs), _BATCH):
-        actions = plans[start : start + _BATCH]
-        batch = _batch(cfgs[start : start + _BATCH], precision)
+    for start, batch in _batches(cfgs, precision):
+        actions = plans[start : start + len(batch.configs)]
         shape = [batch.horizon, *(batch.action_space.shape or ())]
         for cfg, own in zip(batch.configs, actions, strict=True):
             if list(own.shape) != shape:
@@ -54,31 +42,24 @@ def play_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], precision: s
                 raise SubmissionError(
                     f"{where}: the plan has shape {list(own.shape)}, its task takes {shape}"
                 )
-        played += _play(batch, partial(_next_action, np.stack(actions)))
+        whole = np.stack(actions)
+
+        def act(t: int, _: np.ndarray, whole: np.ndarray = whole) -> np.ndarray:
+            return whole[:, t]
+
+        played += _play(batch, act)
     return played
 
 
-def _next_action(plans: np.ndarray, t: int, _: np.ndarray) -> np.ndarray:
-    """Return the actions of a step, whatever is observed."""
-    return plans[:, t]
-
-
 def play_policy(cfgs: Sequence[Config], policy: Policy, name: str, precision: str) -> list[Played]:
-    """Let a policy act in each configuration.
-
-    Args:
-        cfgs: Configurations of one task that fit into one simulator.
-        policy: The policy.
-        name: Its file, for messages.
-        precision: ``float32`` or ``float64``, of the simulator; observations are float32.
+    """Let a policy act in each of several configurations of one task; its observations are float32.
 
     Raises:
         SubmissionError: If it cannot be run, its actions do not fit, or it answers the same question twice
-            with different actions.
+            with different actions; the message calls it ``name``.
     """
     played: list[Played] = []
-    for start in range(0, len(cfgs), _BATCH):
-        batch = _batch(cfgs[start : start + _BATCH], precision)
+    for _, batch in _batches(cfgs, precision):
         components = (batch.action_space.shape or (0,))[0]
 
         def act(t: int, observations: np.ndarray, components: int = components) -> np.ndarray:
@@ -95,8 +76,10 @@ def play_policy(cfgs: Sequence[Config], policy: Policy, name: str, precision: st
     return played
 
 
-def _batch(cfgs: Sequence[Config], precision: str) -> EpisodeBatch:
-    return EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in cfgs])
+def _batches(cfgs: Sequence[Config], precision: str) -> Iterator[tuple[int, EpisodeBatch]]:
+    for start in range(0, len(cfgs), _BATCH):
+        some = cfgs[start : start + _BATCH]
+        yield start, EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
 
 
 def _play(batch: EpisodeBatch, choose: Callable[[int, np.ndarray], np.ndarray]) -> list[Played]:

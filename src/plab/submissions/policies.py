@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from plab.submissions.members import SubmissionError
+from plab.submissions.schema import SubmissionError
 
 __all__ = ["Policy", "load"]
 
@@ -18,17 +18,29 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 def load(name: str, content: bytes) -> Policy:
-    """Make a policy callable.
+    """Make a policy callable; the ending of its file's name says of which kind it is.
 
-    Args:
-        name: Name of its file; the ending says of which kind it is.
-        content: The file.
+    What it answers with is finite actions of the right number, or a SubmissionError of one line.
 
     Raises:
         SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.
     """
     kinds = {".pt": _torchscript, ".onnx": _onnx}
-    return _checked(name, next(make for end, make in kinds.items() if name.endswith(end))(name, content))
+    policy = next(make for end, make in kinds.items() if name.endswith(end))(name, content)
+
+    def answer(observations: np.ndarray) -> np.ndarray:
+        try:
+            actions = np.asarray(policy(observations), np.float64)
+        # Whatever its author's code or the runtime raises.
+        except Exception as error:
+            raise SubmissionError(f"{name} cannot be run ({_first(error)})") from None
+        if actions.ndim != 2 or len(actions) != len(observations):
+            raise SubmissionError(f"{name} gives actions of shape {list(actions.shape)}, not [batch, action]")
+        if not np.isfinite(actions).all():
+            raise SubmissionError(f"{name} gives actions that are not finite")
+        return np.clip(actions, -1.0, 1.0)
+
+    return answer
 
 
 def _torchscript(name: str, content: bytes) -> Policy:
@@ -58,24 +70,6 @@ def _onnx(name: str, content: bytes) -> Policy:
     except Exception as error:
         raise SubmissionError(f"{name} is no ONNX model of one input ({_first(error)})") from None
     return lambda observations: session.run(None, {given.name: observations})[0]
-
-
-def _checked(name: str, policy: Policy) -> Policy:
-    """Return a policy that answers with finite actions of the right number, or with one line."""
-
-    def answer(observations: np.ndarray) -> np.ndarray:
-        try:
-            actions = np.asarray(policy(observations), np.float64)
-        # Whatever its author's code or the runtime raises.
-        except Exception as error:
-            raise SubmissionError(f"{name} cannot be run ({_first(error)})") from None
-        if actions.ndim != 2 or len(actions) != len(observations):
-            raise SubmissionError(f"{name} gives actions of shape {list(actions.shape)}, not [batch, action]")
-        if not np.isfinite(actions).all():
-            raise SubmissionError(f"{name} gives actions that are not finite")
-        return np.clip(actions, -1.0, 1.0)
-
-    return answer
 
 
 def _first(error: Exception) -> str:

@@ -22,8 +22,7 @@ from plab.envs.vector import PlabVectorEnv
 from plab.report.budgets import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.files import encode, write
-from plab.submissions.members import SubmissionError
-from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, configuration_of
+from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, SubmissionError, configuration_of
 
 __all__ = ["Recorder", "VectorRecorder", "record"]
 
@@ -52,12 +51,9 @@ class _Ledger:
         self._configuration, self._digests = configuration_of(cfg), Digests.of(cfg)
         self._best: dict[float, Entry] = {}
         self._path = path
-        self._claim()
-
-    def _claim(self) -> None:
-        """Create the file, without entries: two processes cannot both."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
+            # Without entries: two processes cannot both create it.
             with self._path.open("xb") as file:
                 file.write(encode(Submission(None, ())))
         except FileExistsError:
@@ -68,12 +64,7 @@ class _Ledger:
             raise ResultsError(f"cannot write {self._path}: {error.strerror or error}") from error
 
     def episode(self, actions: np.ndarray, score: float) -> None:
-        """Take a whole episode into account.
-
-        Args:
-            actions: Its actions, shape [T, A].
-            score: What it reached.
-        """
+        """Take a whole episode into account: its actions, shape [T, A], and the score that they reached."""
         better = [
             limit
             for limit in (*BUDGETS, math.inf)

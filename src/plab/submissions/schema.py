@@ -4,29 +4,39 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
 from plab.config import Config, build_scene, load_config, variant_task
 from plab.config.suite import SUITE_VARIANTS
-from plab.submissions.card import Card
-from plab.submissions.members import SubmissionError
+from plab.errors import pick
+from plab.results import ResultsError
 from plab.targets import load_release_target
 
 __all__ = [
+    "CARD_BYTES",
     "SUFFIX",
     "TARGETS",
     "TERMS",
     "UNSEEN",
     "VARIANTS",
+    "Card",
+    "CardError",
     "Configuration",
+    "Digests",
     "Entry",
     "Submission",
+    "SubmissionError",
     "configuration_of",
+    "parse_card",
+    "variant_words",
 ]
 
 SUFFIX = ".plabsub.zip"
@@ -42,6 +52,52 @@ UNSEEN = tuple(f"random{seed}" for seed in range(9000, 9010))
 """Variants of every task that nothing is to be trained on: ``variant=random`` with these ``seed_scene``."""
 
 VARIANTS = (*SUITE_VARIANTS, *UNSEEN)
+
+CARD_BYTES = 64_000
+"""Size of a card, at most."""
+
+_LENGTH = {"name": 60, "link": 300, "hardware": 200, "description": 500}
+"""Characters of the texts, at most."""
+
+_AUTHORS = 50
+
+
+class SubmissionError(ResultsError):
+    """A submission that cannot be read, written or judged; the message is one line."""
+
+
+class CardError(SubmissionError):
+    """A card with mistakes; ``faults`` has a line for each."""
+
+    def __init__(self, faults: list[str]) -> None:
+        super().__init__("; ".join(faults))
+        self.faults = faults
+
+
+@dataclass(frozen=True)
+class Card:
+    """What a submission says about its method.
+
+    Attributes:
+        name: Name of the method.
+        authors: Who submits it.
+        link: Paper, code or page, http or https.
+        budget: Environment steps simulated for all that is submitted, those of tuning included.
+        hardware: What it was computed on.
+        gradient: Whether the simulator's gradient was used.
+        description: The method in a sentence or two; may be left out.
+    """
+
+    name: str
+    authors: tuple[str, ...]
+    link: str
+    budget: int
+    hardware: str
+    gradient: bool
+    description: str = ""
+
+
+_KEYS = [one.name for one in fields(Card)]
 
 
 @dataclass(frozen=True, order=True)
@@ -74,11 +130,8 @@ class Configuration:
         return "-".join(parts)
 
     def config(self, overrides: tuple[str, ...]) -> Config:
-        """Compose its configuration.
-
-        Args:
-            overrides: Of whoever composes it, such as ``sim.device=cuda``; with the authors' targets,
-                ``targets.source``.
+        """Compose its configuration, with overrides such as ``sim.device=cuda``; with the authors' targets,
+        ``targets.source``.
 
         Raises:
             plab.config.ConfigError: If an override does not fit.
@@ -92,9 +145,14 @@ class Configuration:
                     f"{self.name} needs the authors' target files: add targets.source=<their folder>"
                 )
             mine = overrides
-        seed = self.variant.removeprefix("random")
-        chosen = ["variant=random", f"seed_scene={seed}"] if self.unseen else [f"variant={self.variant}"]
-        return load_config([f"task={self.task}", *chosen, f"protocol={self.terms}", *mine])
+        return load_config([*variant_words(self.task, self.variant), f"protocol={self.terms}", *mine])
+
+
+def variant_words(task: str, variant: str) -> list[str]:
+    """Return the overrides that choose one of :data:`VARIANTS` of a task."""
+    if variant in UNSEEN:
+        return [f"task={task}", "variant=random", f"seed_scene={variant.removeprefix('random')}"]
+    return [f"task={task}", f"variant={variant}"]
 
 
 def configuration_of(cfg: Config) -> Configuration:
@@ -198,3 +256,62 @@ class Submission:
     def track(self) -> str:
         """``policies`` if it holds some, else ``plans``."""
         return "policies" if self.policies else "plans"
+
+
+# ------------------------------------------------------------------------------------------------- cards
+
+
+def parse_card(text: bytes, source: str) -> Card:
+    """Read a card, YAML in UTF-8; messages name its ``source``.
+
+    Raises:
+        CardError: If it is no YAML or has mistakes.
+    """
+    if len(text) > CARD_BYTES:
+        raise CardError([f"{source} is larger than the {CARD_BYTES // 1000} kB allowed"])
+    try:
+        read = yaml.safe_load(text.decode("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        place = getattr(error, "problem_mark", None)
+        where = "" if place is None else f", line {place.line + 1}"
+        raise CardError([f"{source} is no YAML{where}"]) from None
+    if not isinstance(read, dict):
+        raise CardError([f"{source} must have the keys {', '.join(_KEYS)}"])
+    if faults := [f"{source}: {fault}" for fault in _faults(read)]:
+        raise CardError(faults)
+    return Card(**(read | {"authors": tuple(read["authors"])}))
+
+
+def _faults(read: dict[Any, Any]) -> Iterator[str]:
+    """Yield a line for each mistake."""
+    for key in read:
+        if key not in _KEYS:
+            yield f"unknown key '{str(key)[:60]}'; {pick(str(key), _KEYS)}"
+    for name in _KEYS:
+        if name not in read:
+            if name != "description":
+                yield f"{name} is missing"
+        elif fault := _fault(name, read[name]):
+            yield f"{name} {fault}"
+
+
+def _fault(name: str, value: Any) -> str | None:
+    """Return what is wrong with a value, None if nothing is."""
+    if name == "authors":
+        good = isinstance(value, list) and 0 < len(value) <= _AUTHORS
+        good = good and all(_is_text(author, _LENGTH["name"]) and author.strip() for author in value)
+        return None if good else f"must be a list of 1 to {_AUTHORS} names"
+    if name == "budget":
+        good = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**15
+        return None if good else "must be a whole number of environment steps"
+    if name == "gradient":
+        return None if isinstance(value, bool) else "must be true or false"
+    if not _is_text(value, _LENGTH[name]) or (name != "description" and not value.strip()):
+        return f"must be a line of at most {_LENGTH[name]} characters"
+    if name == "link" and not re.fullmatch(r"https?://[^\s\"'<>]+", value):
+        return "must begin with https:// or http://"
+    return None
+
+
+def _is_text(value: Any, length: int) -> bool:
+    return isinstance(value, str) and len(value) <= length and value.isprintable()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,9 @@ import plab
 from plab.config import PRECISIONS, Config
 from plab.provenance import now
 from plab.results.files import replace_file
-from plab.submissions.members import SubmissionError
 from plab.submissions.playing import Played, play_plans, play_policy
 from plab.submissions.policies import load
-from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission
+from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission, SubmissionError
 from plab.targets.store import PHYSICS_VERSION
 
 __all__ = ["TOLERANCE", "Verdict", "Verification", "read_verification", "verify", "write_verification"]
@@ -73,13 +72,9 @@ def verify(
     run_policies: bool = False,
     precisions: Sequence[str] = PRECISIONS,
 ) -> Verification:
-    """Simulate all of a submission again.
+    """Simulate all of a submission again, with overrides such as ``sim.device=cuda``, in some precisions.
 
-    Args:
-        submission: What was read from a file.
-        overrides: Overrides of every configuration, such as ``sim.device=cuda``.
-        run_policies: Whether to execute the policies in it. They are other people's programs.
-        precisions: Precisions to simulate in.
+    The policies in it are other people's programs, and executed with ``run_policies`` only.
 
     Raises:
         SubmissionError: If it is of other physics, scenes or targets than these, or its plans or policies
@@ -89,39 +84,27 @@ def verify(
     given = tuple(overrides)
     cfgs = _configs(submission, given)
     scores: dict[int, dict[str, Played]] = defaultdict(dict)
-    groups = [
-        (numbers, _player(submission, [submission.entries[number] for number in numbers]))
-        for numbers in _groups(submission)
-        if run_policies or not submission.entries[numbers[0]].policy
-    ]
-    # Going from one precision to the other starts Taichi anew.
-    for precision in precisions:
-        for numbers, play in groups:
-            chosen = [cfgs[submission.entries[number].configuration] for number in numbers]
-            for number, played in zip(numbers, play(chosen, precision), strict=True):
-                scores[number][precision] = played
-    verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
-    return Verification(submission.digest, verdicts, given)
-
-
-def _player(
-    submission: Submission, entries: Sequence[Entry]
-) -> Callable[[Sequence[Config], str], list[Played]]:
-    """Return what plays entries of one group."""
-    if name := entries[0].policy:
-        policy = load(name, submission.policies[name])
-        return lambda cfgs, precision: play_policy(cfgs, policy, name, precision)
-    plans = [entry.actions for entry in entries if entry.actions is not None]
-    return lambda cfgs, precision: play_plans(cfgs, plans, precision)
-
-
-def _groups(submission: Submission) -> Iterator[list[int]]:
-    """Yield the numbers of entries that one simulator can play."""
-    groups: dict[Any, list[int]] = defaultdict(list)
+    # Each group is what one simulator can play.
+    alike: dict[Any, list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
         place = entry.configuration
-        groups[place.task, place.targets, place.terms, entry.policy].append(number)
-    yield from groups.values()
+        if run_policies or not entry.policy:
+            alike[place.task, place.targets, place.terms, entry.policy].append(number)
+    policies = {name: load(name, submission.policies[name]) for *_, name in alike if name}
+    # Going from one precision to the other starts Taichi anew.
+    for precision in precisions:
+        for (*_, name), numbers in alike.items():
+            entries = [submission.entries[number] for number in numbers]
+            chosen = [cfgs[entry.configuration] for entry in entries]
+            if name:
+                played = play_policy(chosen, policies[name], name, precision)
+            else:
+                plans = [entry.actions for entry in entries if entry.actions is not None]
+                played = play_plans(chosen, plans, precision)
+            for number, one in zip(numbers, played, strict=True):
+                scores[number][precision] = one
+    verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
+    return Verification(submission.digest, verdicts, given)
 
 
 def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configuration, Config]:
