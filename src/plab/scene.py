@@ -440,38 +440,22 @@ def sample_particles(scene: Scene) -> np.ndarray:
     Returns:
         Positions [domain units], shape [particle, 3], float64, body after body.
     """
-    if scene.start == "release":
-        return _legacy_particles(scene)
-    rng = np.random.default_rng(scene.particle_seed)
+    # The release's are the very same numbers with seed 0, to the last bit, which no other generator has.
+    release = scene.start == "release"
+    rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)
     parts = []
     for body in scene.bodies:
         if isinstance(body, MeshBody):
-            parts.append(np.asarray(body.center) + body.size[0] * body.mesh.fill(body.particles, rng.random))
+            offset = body.size[0] * body.mesh.fill(body.particles, rng.random)
         elif body.shape == "box":
-            unit = rng.random((body.particles, 3)) - 0.5
-            parts.append(np.asarray(body.center) + unit * np.asarray(body.size))
+            offset = (rng.random((body.particles, 3)) - 0.5) * np.asarray(body.size)
         else:
             direction = rng.normal(size=(body.particles, 3))
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            radius = body.size[0] * np.cbrt(rng.random((body.particles, 1)))
-            parts.append(np.asarray(body.center) + radius * direction)
-    return np.concatenate(parts)
-
-
-def _legacy_particles(scene: Scene) -> np.ndarray:
-    """Draw the particles' initial positions as the release does: with seed 0, the very same numbers, which no
-    other generator has."""
-    rng = np.random.RandomState(scene.particle_seed)
-    parts = []
-    for body in scene.bodies:
-        center = np.asarray(body.center)
-        if isinstance(body, MeshBody):
-            parts.append(center + body.size[0] * body.mesh.fill(body.particles, rng.random_sample))
-        elif body.shape == "box":
-            unit = rng.random_sample((body.particles, 3)) * 2 - 1
-            parts.append(center + unit * np.asarray(body.size) / 2)
-        else:
-            p = rng.normal(size=(body.particles, 3))
-            u = rng.random_sample((body.particles, 1))
-            parts.append(center + body.size[0] * u ** (1 / 3) * p / np.linalg.norm(p, axis=1, keepdims=True))
+            length = np.linalg.norm(direction, axis=1, keepdims=True)
+            share = rng.random((body.particles, 1))
+            if release:
+                offset = body.size[0] * share ** (1 / 3) * direction / length
+            else:
+                offset = body.size[0] * np.cbrt(share) * (direction / length)
+        parts.append(np.asarray(body.center) + offset)
     return np.concatenate(parts)

@@ -118,7 +118,7 @@ def read_tensor(file: str, sha256: str | None = None) -> np.ndarray:
     """
     path = _of_kind(_find(file, sha256 is not None), (".npy",), "a mass tensor")
     _checked(path, sha256)
-    mass = _decoded(_array, path, *_state(path))
+    mass = _decoded(read_array, path, *_state(path))
     if mass.ndim != 3 or mass.dtype.kind not in "bfiu":
         raise ShapeError(f"{path} holds {mass.dtype} of shape {list(mass.shape)}, not masses [n, n, n]")
     mass = mass.astype(np.float64)
@@ -234,10 +234,6 @@ def _quietly() -> Iterator[None]:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _array(path: Path) -> np.ndarray:
-    return read_array(path)
 
 
 def _loaded(path: Path, **options: Any) -> Any:

@@ -98,9 +98,7 @@ def _replace(name: str, rows: pd.DataFrame, keys: list[str]) -> None:
     path = FOLDER / name
     if path.is_file():
         old = pd.read_csv(path, dtype={"variant": str})
-        same = (
-            old.merge(rows[keys].drop_duplicates(), on=keys, how="left", indicator=True)["_merge"] == "both"
-        )
-        rows = pd.concat([old[~same.to_numpy()], rows])
+        same = old.set_index(keys).index.isin(rows.set_index(keys).index)
+        rows = pd.concat([old[~same], rows])
     order = [*keys, "step"] if "step" in rows else keys
     rows.sort_values(order, kind="stable").to_csv(path, index=False, lineterminator="\n")

@@ -36,12 +36,8 @@ class Overlap(NodeTerm):
         return self.target[self.sim.entry(e, node)] * mass
 
     def iou(self, overlap: Any, peak: Any) -> Any:
-        """Return soft IoUs with the targets, as :func:`plab.objective.soft_iou` defines them.
-
-        Args:
-            overlap: This term's measure, shape [..., batch]; an array or a CUDA tensor.
-            peak: Largest mass of a node, likewise.
-        """
+        """Return soft IoUs with the targets, as :func:`plab.objective.soft_iou` defines them, from this
+        term's measure and the largest mass of a node, shape [..., batch]; arrays or CUDA tensors."""
         target_sum, target_peak = self._scale.like(overlap)
         with np.errstate(invalid="ignore", divide="ignore"):
             both = overlap / (peak * target_peak)

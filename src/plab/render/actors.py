@@ -96,12 +96,8 @@ class Rigid:
         self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
 
     def reveal(self, x: np.ndarray, camera: Camera) -> None:
-        """Let it be seen through where it hides plasticine that it is at work on.
-
-        Args:
-            x: Particle positions [domain units], shape [particle, 3].
-            camera: Where the picture is taken from.
-        """
+        """Let it be seen through where it hides plasticine that it is at work on: particles at positions
+        [domain units], shape [particle, 3]."""
         low, high = _HIDES
         share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
         for actor in self.actors:
@@ -122,15 +118,8 @@ class Target:
     def __init__(
         self, plotter: pv.Plotter, inside: vtkRenderer, scene: Scene, mass: np.ndarray, camera: Camera
     ) -> None:
-        """Add the target to a window.
-
-        Args:
-            plotter: The window.
-            inside: Its layer for what is seen inside plasticine.
-            scene: The scene.
-            mass: Mass tensor, shape [n, n, n].
-            camera: Where pictures are taken from.
-        """
+        """Add the target with a mass tensor, shape [n, n, n], to a window; ``inside`` is its layer for what
+        is seen inside plasticine."""
         self.mesh = target_mesh(scene, mass)
         self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
         self.solid = Clay(plotter, self.mesh.copy(), TARGET_COLOR)
@@ -163,14 +152,8 @@ class Floor:
     """Paper with lines, ten to the domain unit, on which shadows fall."""
 
     def __init__(self, plotter: pv.Plotter, paper: str, ink: str, pixel: float) -> None:
-        """Add it to a window.
-
-        Args:
-            plotter: The window.
-            paper: Colour in the light.
-            ink: Colour of the lines, and of complete darkness.
-            pixel: Size of a pixel [domain units], to which the lines are fitted.
-        """
+        """Add it to a window; its lines, of the colour of complete darkness too, are fitted to the size of a
+        pixel [domain units]."""
         self._paper, self._ink = _rgb(paper), _rgb(ink)
         low, high = FLOOR_LOW, FLOOR_LOW + FLOOR_EDGE
         corners = np.array([[low, 0, low], [low, 0, high], [high, 0, high], [high, 0, low]])
@@ -200,12 +183,7 @@ class Floor:
 
 
 def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.PolyData:
-    """Return the surface of a field, smoothed, with normals.
-
-    Args:
-        field: The field.
-        smoothing: Iterations and pass band of Taubin's filter.
-    """
+    """Return the surface of a field with normals, smoothed by iterations and pass band of Taubin's filter."""
     image = pv.ImageData(dimensions=field.values.shape, spacing=(field.spacing,) * 3, origin=field.origin)
     image["density"] = field.values.ravel(order="F")
     mesh = image.contour(

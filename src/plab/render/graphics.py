@@ -36,14 +36,9 @@ def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) ->
         packages: Names for readers by those that are imported.
         extra: The extra that installs them.
     """
-    if missing := _missing_package(who_needs, packages, extra):
-        raise RenderError(missing)
-
-
-def _missing_package(who_needs: str, packages: Mapping[str, str], extra: str) -> str | None:
-    lacking = (name for package, name in packages.items() if find_spec(package) is None)
-    message = f"{who_needs} {{}}, which is not installed: pip install 'plab[{extra}]'"
-    return next((message.format(name) for name in lacking), None)
+    for package, name in packages.items():
+        if find_spec(package) is None:
+            raise RenderError(f"{who_needs} {name}, which is not installed: pip install 'plab[{extra}]'")
 
 
 @functools.cache
@@ -53,8 +48,10 @@ def missing_graphics() -> str | None:
     On Linux, VTK is told to draw through EGL, which needs no screen, unless the environment variable
     ``VTK_DEFAULT_OPENGL_WINDOW`` says otherwise.
     """
-    if missing := _missing_package("pictures need", {"pyvista": "PyVista", "PIL": "Pillow"}, "render"):
-        return missing
+    try:
+        require_packages("pictures need", {"pyvista": "PyVista", "PIL": "Pillow"}, "render")
+    except RenderError as error:
+        return str(error)
     if sys.platform.startswith("linux") and _WINDOW not in os.environ:
         if not _egl_works():
             # VTK would end the process with a segmentation fault.

@@ -29,7 +29,6 @@ __all__ = [
     "demonstration",
     "record",
     "record_all",
-    "record_unscored",
     "record_with_motion",
     "result",
     "say",
@@ -155,14 +154,10 @@ def record(cfg: Config, actions: np.ndarray) -> Recording:
     return record_all([cfg], actions[None])[0]
 
 
-def record_all(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
-    """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene."""
-    return _recordings(cfgs, Problem(cfgs), actions)
-
-
-def record_unscored(cfgs: Sequence[Config], actions: np.ndarray) -> list[Recording]:
-    """Run actions as :func:`record_all` does, without working out their scores."""
-    return _recordings(cfgs, Problem(cfgs), actions, scored=False)
+def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = True) -> list[Recording]:
+    """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene; their
+    scores are worked out if ``scored``."""
+    return _recordings(cfgs, Problem(cfgs), actions, scored=scored)
 
 
 def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
@@ -219,7 +214,7 @@ def _recordings(
     for state in _states(problem.simulator, actions):
         states.append(state)
         if scored:
-            scores.append(_scores(problem, problem.simulator.mass_tensor()))
+            scores.append(_scores(problem))
     return [
         Recording(
             task=cfg.task.name,
@@ -239,11 +234,9 @@ def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str,
     return {name: np.stack([getattr(state, name)[number] for state in states]) for name in names}
 
 
-def _scores(problem: Problem, mass: np.ndarray) -> list[float]:
-    """Return the scores of states by their mass tensors, shape [batch, n, n, n].
-
-    As :meth:`plab.problem.Problem.scores`, but what does not change is not computed again.
-    """
+def _scores(problem: Problem) -> list[float]:
+    """As :meth:`plab.problem.Problem.scores`, but what does not change is not computed again."""
+    mass = problem.simulator.mass_tensor()
     return [
         scores_from_iou(first.iou_initial, soft_iou(now, target), first.iou_target_self).score
         for first, now, target in zip(problem.initial_scores, mass, problem.target_mass, strict=True)

@@ -107,9 +107,7 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.Recording]:
     for cases in alike.values():
         names = [name for name, _, _ in cases]
         actions = np.stack([actions for _, _, actions in cases])
-        made |= dict(
-            zip(names, recording.record_unscored([cfg for _, cfg, _ in cases], actions), strict=True)
-        )
+        made |= zip(names, recording.record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
     return made
 
 

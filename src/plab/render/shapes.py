@@ -104,8 +104,7 @@ def _circle(major: float, minor: float) -> np.ndarray:
 def _revolve(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Revolve a profile (distance from the y axis, y), upwards, shape [point, 2], about the y axis.
 
-    Returns:
-        Vertices [point * _SIDES, 3] and faces [face, 4]. Faces at the axis have a side of length 0.
+    Returns vertices [point * _SIDES, 3] and faces [face, 4]; those at the axis have a side of length 0.
     """
     angle = 2 * math.pi * np.arange(_SIDES) / _SIDES
     radius, height = profile[:, :1], np.broadcast_to(profile[:, 1:], (len(profile), _SIDES))

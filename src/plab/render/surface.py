@@ -63,12 +63,8 @@ class BodySurface:
     """The surface of one body as its particles move."""
 
     def __init__(self, body: Body, rest: np.ndarray) -> None:
-        """Weigh the particles.
-
-        Args:
-            body: The body.
-            rest: Positions of its particles at t = 0 [domain units], shape [particle, 3].
-        """
+        """Weigh the body's particles, whose positions at t = 0 are given [domain units], shape [particle,
+        3]."""
         self._spacing = (body.volume / body.particles) ** (1 / 3)
         self._weights = np.full(len(rest), CELL**-3)
         grid = _Grid(rest, self._spacing)
@@ -82,11 +78,8 @@ class BodySurface:
         self._level = float(np.partition(fine, -nodes, axis=None)[-nodes])
 
     def field(self, x: np.ndarray) -> Field:
-        """Return the field whose level set is the surface.
-
-        Args:
-            x: Positions of the body's particles [domain units], shape [particle, 3].
-        """
+        """Return the field whose level set is the surface of particles at positions [domain units], shape
+        [particle, 3]."""
         grid = _Grid(x, self._spacing)
         return Field(grid.density(x, self._weights), grid.origin, grid.spacing, self._level)
 

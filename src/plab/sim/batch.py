@@ -43,8 +43,7 @@ def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
     manipulator, 8]."""
     turn = list if scenes[0].numbers == "release" else _unit
     return np.array(
-        [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes],
-        dtype=np.float64,
+        [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes], dtype=np.float64
     ).reshape(len(scenes), len(scenes[0].manipulators), 8)
 
 
@@ -72,11 +71,7 @@ def with_material(
     Raises:
         SceneError: If bodies of one material are given one each.
     """
-    given = {
-        "youngs_modulus": youngs_modulus,
-        "poisson_ratio": poisson_ratio,
-        "yield_stress": yield_stress,
-    }
+    given = {"youngs_modulus": youngs_modulus, "poisson_ratio": poisson_ratio, "yield_stress": yield_stress}
     counts = len(scenes), len(scenes[0].bodies)
     values = {}
     for name, value in given.items():

@@ -42,19 +42,8 @@ class ClosedLoop:
         discount: float,
         like: torch.Tensor | None,
     ) -> None:
-        """Start before the first step.
-
-        Args:
-            particles: The current state and the kernels.
-            poses: History of the manipulators' poses.
-            steps: Environment steps T.
-            choose: This and what follows: see :meth:`plab.sim.Simulator.closed_loop`.
-            react: Likewise.
-            observe: Observes a time slot of an array.
-            stride: Distance of the observed particles' numbers.
-            discount: Of the step losses.
-            like: What arrays are to be like.
-        """
+        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array, the rest is as
+        in :meth:`plab.sim.Simulator.closed_loop`."""
         self._particles, self._engine = particles, particles.engine
         self._poses, self._steps, self._stride = poses, steps, stride
         self._choose, self._react, self._observe = choose, react, observe

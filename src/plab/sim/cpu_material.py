@@ -50,17 +50,8 @@ class MaterialTiles(ParticlePhases):
 
     @ti.func
     def material_tile(self, state: ti.template(), source, target, entry9, e, at, update: ti.template()):
-        """Return mapping and A = stress_scale tau + mass C for a tile.
-
-        Args:
-            state: Particle state.
-            source: Entry of the tile before the substep.
-            target: Entry of the tile after it.
-            entry9: Entry of the tile in ``affine``.
-            e: Environment.
-            at: First entry of the thread's share of ``strains``.
-            update: Whether the new F is stored.
-        """
+        """Return mapping and A = stress_scale tau + mass C for a tile, in the thread's share of ``strains``
+        from entry ``at``; the new F is stored if ``update``."""
         p = self.parameters_of_tile(e, entry9)
         c = [state[source + AT_C + i] for i in range(9)]
         f = [state[source + AT_F + i] for i in range(9)]

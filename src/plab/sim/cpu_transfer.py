@@ -3,7 +3,9 @@ nodes of one particle after the other.
 
 LLVM vectorises what ends in stores to a field, and what begins with loads from one. So each part of the work
 leaves its results in ``stencils`` (lane vectors, one particle per lane) or in ``scratch`` (4-vectors of one
-particle), and the next part takes them from there.
+particle), and the next part takes them from there. ``at``, ``bases_at`` and ``scratch_at`` are the first
+entries of a thread's shares of ``stencils``, ``bases`` and ``scratch``; ``source``, ``target`` and ``entry9``
+those of a tile in states and in ``affine``.
 """
 
 import taichi as ti
@@ -70,15 +72,8 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def stencil_tile(self, state: ti.template(), source, at, bases_at, slopes: ti.template()):
-        """Weights, offsets and base nodes of a tile's particles.
-
-        Args:
-            state: Particle state.
-            source: Entry of the tile.
-            at: First entry of the thread's share of ``stencils``.
-            bases_at: First entry of the thread's share of ``bases``.
-            slopes: Whether the weights' slopes are needed.
-        """
+        """Weights, offsets and base nodes of a tile's particles, and the weights' slopes if asked for, into
+        the thread's shares of ``stencils`` and ``bases``."""
         node = ti.Vector.zero(ti.i32, self.lanes)
         block = ti.Vector.zero(ti.i32, self.lanes)
         crossing = ti.Vector.zero(ti.i32, self.lanes)
@@ -154,16 +149,8 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def scatter_momentum(self, entry9, lane, base_node, grid_node, at, scratch_at):
-        """Add a particle's momentum and mass to its nodes.
-
-        Args:
-            entry9: Entry of the tile in ``affine``.
-            lane: Particle of the tile.
-            base_node: Its base node, from ``bases``.
-            grid_node: Index of the base node in ``momentum``.
-            at: First entry of the thread's share of ``stencils``.
-            scratch_at: First entry of the thread's share of ``scratch``.
-        """
+        """Add a particle's momentum and mass to its nodes; ``base_node`` is from ``bases``, ``grid_node`` its
+        index in ``momentum``."""
         a = self.load(self.affine, self.own(entry9, base_node), lane, 9)
         value = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
         own_scratch = self.own(scratch_at, base_node)
@@ -171,17 +158,8 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def scatter_adjoint(self, bar: ti.template(), target, lane, base_node, grid_node, at, scratch_at):
-        """Add what a particle contributes to the adjoint of the grid's velocities.
-
-        Args:
-            bar: Adjoint of the particle state after the substep.
-            target: Entry of the tile in it.
-            lane: Particle of the tile.
-            base_node: Its base node, from ``bases``.
-            grid_node: Index of the base node in ``velocity_bar``.
-            at: First entry of the thread's share of ``stencils``.
-            scratch_at: First entry of the thread's share of ``scratch``.
-        """
+        """Add what a particle contributes to the adjoint of the grid's velocities, from that of the state
+        after the substep."""
         c_bar = self.load(bar, target + AT_C, lane, 9)
         value = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
         own_scratch = self.own(scratch_at, base_node)
@@ -200,19 +178,7 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, scratch_at):
-        """Grid to particle: v, C and x after the substep.
-
-        Args:
-            state: Particle state.
-            source: Entry of the tile before the substep.
-            target: Entry of the tile after it.
-            lane: Particle of the tile.
-            node: Index of the base node in ``velocity``.
-            e: Environment.
-            time: Substep, noted where the speed is not sane.
-            at: First entry of the thread's share of ``stencils``.
-            scratch_at: First entry of the thread's share of ``scratch``.
-        """
+        """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         # A variable: what is passed on as an expression is compiled again wherever it is used.
         w = self.weights(at + WEIGHTS, lane)
         gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.scratch, scratch_at)
@@ -280,13 +246,8 @@ class TransferTiles(ParticlePhases):
 
     @ti.func
     def mark(self, grid_index, key, stamp):
-        """Note that a chunk's particle touches the blocks around its base node.
-
-        Args:
-            grid_index: Chunk among those of all environments.
-            key: Eight times the base node's block, and which axes the stencil crosses into the next (3 bits).
-            stamp: The substep's stamp.
-        """
+        """Note that a chunk's particle touches the blocks around its base node; ``key`` is eight times that
+        node's block, plus which axes the stencil crosses into the next (3 bits)."""
         block = key >> 3
         entry = grid_index * self.blocks + block
         if self.mark_stamp[entry] != stamp:

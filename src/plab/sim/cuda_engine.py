@@ -18,6 +18,7 @@ from plab.sim.cuda_phases import DISTANCE_GROUPS
 from plab.sim.cuda_threads import RESIDENT_BLOCK, ThreadPhases
 from plab.sim.cuda_warp import NODE_BITS, WARP, WARP_BLOCK
 from plab.sim.storage import STATE
+from plab.sim.tensors import Array
 
 __all__ = ["CudaEngine"]
 
@@ -131,14 +132,7 @@ class CudaEngine(ThreadPhases):
     # -- kernels ------------------------------------------------------------------------------------
 
     @ti.kernel
-    def advance_kernel(
-        self,
-        poses: ti.types.ndarray(ndim=1),
-        actions: ti.types.ndarray(ndim=1),
-        t: ti.i32,
-        before: ti.i32,
-        after: ti.i32,
-    ):
+    def advance_kernel(self, poses: Array, actions: Array, t: ti.i32, before: ti.i32, after: ti.i32):
         """Poses and frames of all substeps of environment step t."""
         self.block_count[0] = 0
         for q in range(self.pose_threads):
@@ -155,13 +149,7 @@ class CudaEngine(ThreadPhases):
 
     @ti.kernel
     def substep_kernel(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        before: ti.i32,
-        after: ti.i32,
-        s: ti.i32,
-        time: ti.i32,
-        stamp: ti.i32,
+        self, state: Array, before: ti.i32, after: ti.i32, s: ti.i32, time: ti.i32, stamp: ti.i32
     ):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
         ti.loop_config(block_dim=WARP_BLOCK)
@@ -177,9 +165,9 @@ class CudaEngine(ThreadPhases):
     @ti.kernel
     def resident_step_kernel(
         self,
-        state: ti.types.ndarray(ndim=1),
-        poses: ti.types.ndarray(ndim=1),
-        actions: ti.types.ndarray(ndim=1),
+        state: Array,
+        poses: Array,
+        actions: Array,
         slot: ti.i32,
         stride: ti.i32,
         t: ti.i32,
@@ -219,14 +207,7 @@ class CudaEngine(ThreadPhases):
                 self.wait_for_warp()
 
     @ti.kernel
-    def losses_kernel(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        slot: ti.i32,
-        terms: ti.types.ndarray(ndim=1),
-        at: ti.i32,
-        stamp: ti.i32,
-    ):
+    def losses_kernel(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
         """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
         self.block_count[0] = 0
         for e in range(self.batch):
@@ -256,9 +237,7 @@ class CudaEngine(ThreadPhases):
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
 
     @ti.kernel
-    def loss_gradient_kernel(
-        self, state: ti.types.ndarray(ndim=1), slot: ti.i32, bar: ti.types.ndarray(ndim=1)
-    ):
+    def loss_gradient_kernel(self, state: Array, slot: ti.i32, bar: Array):
         """Add the gradient of the losses just computed to the adjoints of particles and poses."""
         self.block_count[0] = 0
         for q in range(self.particle_threads):
@@ -276,13 +255,7 @@ class CudaEngine(ThreadPhases):
 
     @ti.kernel
     def substep_adjoint_kernel(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        bar: ti.types.ndarray(ndim=1),
-        before: ti.i32,
-        after: ti.i32,
-        s: ti.i32,
-        stamp: ti.i32,
+        self, state: Array, bar: Array, before: ti.i32, after: ti.i32, s: ti.i32, stamp: ti.i32
     ):
         """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
         ti.loop_config(block_dim=WARP_BLOCK)
@@ -296,13 +269,7 @@ class CudaEngine(ThreadPhases):
             self.gather_thread_adjoint(state, bar, before, after, q)
 
     @ti.kernel
-    def resident_adjoint_kernel(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        bar: ti.types.ndarray(ndim=1),
-        slot: ti.i32,
-        stamp: ti.i32,
-    ):
+    def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
         """Adjoints of all substeps of an environment step in one launch, as :meth:`resident_step_kernel` runs
         them."""
         self.arrivals[0] = 0
@@ -325,9 +292,7 @@ class CudaEngine(ThreadPhases):
                 self.wait_for_warp()
 
     @ti.kernel
-    def retreat_kernel(
-        self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1), t: ti.i32
-    ):
+    def retreat_kernel(self, actions: Array, actions_bar: Array, t: ti.i32):
         """Adjoint of all manipulators' motion in environment step t, from its frames' adjoints."""
         for q in range(self.pose_threads * self.substeps):
             s = q // self.pose_threads
@@ -341,13 +306,7 @@ class CudaEngine(ThreadPhases):
                     self.retreat_through(q % self.batch, m, actions, actions_bar, t)
 
     @ti.kernel
-    def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):
-        """Place all manipulators at slot ``slot`` of the pose history."""
-        for e in range(self.batch):
-            self.place_manipulators(e, poses, slot)
-
-    @ti.kernel
-    def export_mass(self, out: ti.types.ndarray(ndim=1)):
+    def export_mass(self, out: Array):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
@@ -357,13 +316,7 @@ class CudaEngine(ThreadPhases):
                     out[self.entry(e, i - 1)] = self.node4(self.velocity, e * self.nodes + self.linear(i))[0]
 
     @ti.kernel
-    def copy_slot(
-        self,
-        source: ti.types.ndarray(ndim=1),
-        source_slot: ti.i32,
-        target: ti.types.ndarray(ndim=1),
-        target_slot: ti.i32,
-    ):
+    def copy_slot(self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32):
         """Copy the particle state of all environments between time slots."""
         size = self.batch * self.tiles * STATE
         for i in range(size * self.lanes):

@@ -9,6 +9,7 @@ import taichi as ti
 
 from plab.sim.cuda_warp import ALL_LANES, RUN_BITS, WARP, WARP_BLOCK, WarpPhases
 from plab.sim.storage import STATE
+from plab.sim.tensors import Array
 
 __all__ = ["OrderPhases"]
 
@@ -27,12 +28,6 @@ class OrderPhases(WarpPhases):
         self.cell_count = ti.field(ti.i32, shape=self.batch * self.nodes)
         self.rank = ti.field(ti.i32, shape=self.batch * self.tiles * self.lanes)
         self.placed = ti.field(ti.i32, shape=self.batch)
-
-    @ti.func
-    def particle_of(self, q):
-        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
-        e = q // (self.tiles * self.lanes)
-        return e, q - e * (self.tiles * self.lanes)
 
     @ti.func
     def mark_shared(self, e, base, stamp):
@@ -75,13 +70,13 @@ class OrderPhases(WarpPhases):
     @ti.kernel
     def sort(
         self,
-        state: ti.types.ndarray(ndim=1),
+        state: Array,
         slot: ti.i32,
-        target: ti.types.ndarray(ndim=1),
+        target: Array,
         target_slot: ti.i32,
-        numbers: ti.types.ndarray(ndim=1),
-        after: ti.types.ndarray(ndim=1),
-        moves: ti.types.ndarray(ndim=1),
+        numbers: Array,
+        after: Array,
+        moves: Array,
         t: ti.i32,
         stamp: ti.i32,
     ):
@@ -142,26 +137,14 @@ class OrderPhases(WarpPhases):
 
     @ti.kernel
     def move(
-        self,
-        source: ti.types.ndarray(ndim=1),
-        source_slot: ti.i32,
-        target: ti.types.ndarray(ndim=1),
-        target_slot: ti.i32,
-        moves: ti.types.ndarray(ndim=1),
-        t: ti.i32,
+        self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32, moves: Array, t: ti.i32
     ):
         """Put the states of a time slot into the order of step t, in another slot or array."""
         for q in range(self.particle_threads):
             self.move_particle(source, source_slot, target, target_slot, moves, t, q)
 
     @ti.kernel
-    def move_back(
-        self,
-        source: ti.types.ndarray(ndim=1),
-        target: ti.types.ndarray(ndim=1),
-        moves: ti.types.ndarray(ndim=1),
-        t: ti.i32,
-    ):
+    def move_back(self, source: Array, target: Array, moves: Array, t: ti.i32):
         """Put adjoints from the order of step t into the one before it, in another array."""
         for q in range(self.particle_threads):
             e, place = self.particle_of(q)

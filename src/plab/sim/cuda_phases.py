@@ -67,16 +67,8 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def moments(self, grid: ti.template(), node, w: ti.template()):
-        """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil, in registers.
-
-        Args:
-            grid: Gathered grid.
-            node: Index of the base node.
-            w: Spline weights.
-
-        Returns:
-            Sum of w g, and of w g times the node's offset (0, 1, 2) along x, y and z.
-        """
+        """Sum of w g over a particle's stencil in a gathered grid, and of w g times the node's offset (0, 1,
+        2) along x, y and z, in registers."""
         m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         mx = m0
         my = m0
@@ -107,20 +99,11 @@ class CudaPhases(OrderPhases, PosePhases):
         q: ti.template(),
         h: ti.template(),
     ):
-        """What a particle's adjoint needs of the grid, in registers.
+        """What a particle's adjoint needs of the grid, in registers: moments of momentum_bar as in
+        :meth:`moments`, and the sum over nodes of grad_f w (momentum_bar . q + velocity . h), a 3-vector.
 
-        Args:
-            velocity: Gathered grid of velocities, 4-vectors whose last entry is ignored.
-            momentum_bar: Gathered grid of adjoints of the grid's momentum and mass, 4-vectors.
-            node: Index of the base node.
-            w: Spline weights.
-            dw: Their derivatives.
-            q: The scattered affine field: value at the base node and increments along x, y, z, mass last.
-            h: The affine field of the velocity's adjoint, likewise, with 0 at the end.
-
-        Returns:
-            Moments of momentum_bar as in :meth:`moments`, and the sum over nodes of grad_f w (momentum_bar
-            . q + velocity . h), a 3-vector.
+        ``q`` and ``h`` are the affine fields that are scattered, of the momentum with the mass at the end,
+        and of the velocity's adjoint with 0 there: value at the base node and increments along x, y, z.
         """
         m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
         mx = m0
@@ -170,11 +153,8 @@ class CudaPhases(OrderPhases, PosePhases):
     def gather_particle_adjoint(
         self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e
     ):
-        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``.
-
-        Returns:
-            Adjoint of A, row by row.
-        """
+        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``. Returns its
+        adjoint, row by row."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
         a = self.load(self.affine, entry9, lane, 9)

@@ -29,9 +29,8 @@ class ThreadPhases(CudaPhases):
         """The particle that thread q takes of its warp's tile, in the order of their base nodes; all lanes of
         a warp take part.
 
-        Returns:
-            Environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and the
-            base node's grid index, which is negative, and another for each, where the particle is padding.
+        Returns environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and
+        the base node's grid index, which is negative, and another for each, where the particle is padding.
         """
         e, place = self.particle_of(q)
         tile = place // self.lanes

@@ -133,16 +133,8 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r):
-        """Read and clear 32 nodes, one for each lane of a warp.
-
-        Args:
-            grid: Field of 4-vectors.
-            shared: Shared memory, ``WARP_BLOCK * NODE_STRIDE`` numbers.
-            w: Number of the thread.
-            e: Environment.
-            block: Block of the grid.
-            r: The lane's node in the block; those of a warp follow each other from a multiple of 32.
-        """
+        """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
+        of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for turn in ti.static(range(4)):
@@ -159,8 +151,7 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def put_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, value):
-        """Write a 4-vector for each lane of a warp to a gathered grid; arguments as for
-        :meth:`take_nodes`."""
+        """Write a 4-vector for each lane of a warp to a gathered grid, as :meth:`take_nodes` reads."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for c in ti.static(range(4)):
@@ -236,17 +227,11 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def run_of(self, key, taking_part, lane):
-        """The runs of lanes with the same key in a warp.
+        """The runs of neighbouring lanes with the same key in a warp; all lanes of a run take part or none.
 
-        Args:
-            key: Equal for the lanes of a run, which are neighbours.
-            taking_part: Whether the lane's run counts; the same for all lanes of a run.
-            lane: Number of the lane in its warp.
-
-        Returns:
-            Lanes from this one on that hold the same key; whether this is the first lane of a run that
-            counts; how many of these come before it; how many there are; and the number of doublings that
-            the longest run needs.
+        Returns the lanes from this one on that hold the same key; whether this is the first lane of a run
+        that takes part; how many of these come before it; how many there are; and the number of doublings
+        that the longest run needs.
         """
         run = 1
         for k in ti.static(range(RUN_BITS)):
@@ -284,20 +269,13 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         total,
         doublings,
     ):
-        """Scatter an affine field as :meth:`scatter` does; every lane of the warp must take part.
+        """Scatter an affine field as :meth:`scatter` does, or its first ``width`` components; every lane of
+        the warp must take part.
 
-        The first lane of each run sums the run's shares in registers. Then the lanes add the sums of all runs
-        to the grid together, neighbours to neighbouring numbers: the device takes up to 8 of them at once.
-
-        Args:
-            grid: Field of 4-vectors.
-            width: How many of their components there is something to add to.
-            sums: Shared memory of the block, ``WARP_BLOCK * PLANE_STRIDE`` numbers.
-            heads: Base node of each run of the block in shared memory, filled by :meth:`share_heads`.
-            q: Number of the thread.
-            w: Spline weights.
-            field: Value at the base node and increments along x, y, z, 4-vectors.
-            run: This and what follows: see :meth:`run_of`.
+        The first lane of each run, see :meth:`run_of`, sums the run's shares in registers. Then the lanes add
+        the sums of all runs to the grid together, neighbours to neighbouring numbers: the device takes up to
+        8 of them at once. ``sums`` is shared memory of the block for ``WARP_BLOCK * PLANE_STRIDE`` numbers,
+        ``heads`` for the base node of each run, filled by :meth:`share_heads`.
         """
         lane = q % WARP
         corner = q % WARP_BLOCK - lane

@@ -11,6 +11,7 @@ import taichi as ti
 from plab.sim.cpu_phases import BLOCK_NODES, CpuPhases
 from plab.sim.storage import STATE
 from plab.sim.teams import TeamChoice
+from plab.sim.tensors import Array
 
 __all__ = ["CpuEngine"]
 
@@ -114,9 +115,9 @@ class CpuEngine(CpuPhases):
     def step_kernel(
         self,
         size: ti.i32,
-        state: ti.types.ndarray(ndim=1),
-        poses: ti.types.ndarray(ndim=1),
-        actions: ti.types.ndarray(ndim=1),
+        state: Array,
+        poses: Array,
+        actions: Array,
         slot: ti.i32,
         stride: ti.i32,
         t: ti.i32,
@@ -153,13 +154,7 @@ class CpuEngine(CpuPhases):
 
     @ti.kernel
     def losses_kernel(
-        self,
-        size: ti.i32,
-        state: ti.types.ndarray(ndim=1),
-        slot: ti.i32,
-        terms: ti.types.ndarray(ndim=1),
-        at: ti.i32,
-        stamp: ti.i32,
+        self, size: ti.i32, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32
     ):
         """Measures of all environments, written to ``terms`` from entry ``at``."""
         teams = ti.min(self.batch, self.threads // size)
@@ -178,12 +173,12 @@ class CpuEngine(CpuPhases):
     def step_adjoint_kernel(
         self,
         size: ti.i32,
-        state: ti.types.ndarray(ndim=1),
-        bar: ti.types.ndarray(ndim=1),
-        poses: ti.types.ndarray(ndim=1),
-        actions: ti.types.ndarray(ndim=1),
-        actions_bar: ti.types.ndarray(ndim=1),
-        terms: ti.types.ndarray(ndim=1),
+        state: Array,
+        bar: Array,
+        poses: Array,
+        actions: Array,
+        actions_bar: Array,
+        terms: Array,
         at: ti.i32,
         slot: ti.i32,
         t: ti.i32,
@@ -234,22 +229,14 @@ class CpuEngine(CpuPhases):
                             self.barrier(team, size)
 
     @ti.kernel
-    def loss_gradient_kernel(
-        self, state: ti.types.ndarray(ndim=1), slot: ti.i32, bar: ti.types.ndarray(ndim=1)
-    ):
+    def loss_gradient_kernel(self, state: Array, slot: ti.i32, bar: Array):
         """Add the gradient of the losses just computed to the adjoints of particles and poses."""
         self.arrivals[0] = 0
         for e in range(self.batch):
             self.loss_gradient_of_team(state, slot, bar, e, 0, 0, 1, 1)
 
     @ti.kernel
-    def place(self, poses: ti.types.ndarray(ndim=1), slot: ti.i32):
-        """Place all manipulators at slot ``slot`` of the pose history."""
-        for e in range(self.batch):
-            self.place_manipulators(e, poses, slot)
-
-    @ti.kernel
-    def export_mass(self, out: ti.types.ndarray(ndim=1)):
+    def export_mass(self, out: Array):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for e in range(self.batch):
             for entry in range(e * self.blocks, e * self.blocks + self.block_count[e]):
@@ -259,13 +246,7 @@ class CpuEngine(CpuPhases):
                         out[self.entry(e, i - 1)] = self.velocity[e * self.nodes + self.linear(i)][0]
 
     @ti.kernel
-    def copy_slot(
-        self,
-        source: ti.types.ndarray(ndim=1),
-        source_slot: ti.i32,
-        target: ti.types.ndarray(ndim=1),
-        target_slot: ti.i32,
-    ):
+    def copy_slot(self, source: Array, source_slot: ti.i32, target: Array, target_slot: ti.i32):
         """Copy the particle state of all environments between time slots."""
         size = self.batch * self.tiles * STATE
         for i in range(size):

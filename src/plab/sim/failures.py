@@ -17,13 +17,8 @@ __all__ = ["broken_gradients", "broken_states", "broken_terms", "require_none"]
 
 
 def broken_states(faults: np.ndarray | torch.Tensor, substeps: int) -> dict[int, str]:
-    """Environments whose state is broken, and since when.
-
-    Args:
-        faults: Number of the substep in which it broke, from 1 on, or 0, shape [batch]; a CUDA tensor is
-            fetched only if there is one.
-        substeps: Substeps of an environment step.
-    """
+    """Environments whose state is broken, and since when, by the numbers, shape [batch], of the substeps in
+    which they broke, from 1 on, or 0; a CUDA tensor is fetched only if there is one."""
     if not faults.any():
         return {}
     if on_device(faults):

@@ -7,16 +7,8 @@ __all__ = ["slid", "slid_adjoint"]
 
 @ti.func
 def slid(t, rn, friction):
-    """Tangential velocity after full contact.
-
-    Args:
-        t: Tangential velocity before, 3-vector, or 2-vector in the surface's own axes.
-        rn: Normal velocity, negative: towards the surface.
-        friction: Coulomb friction coefficient.
-
-    Returns:
-        t, shortened by friction times the normal velocity that is lost.
-    """
+    """Tangential velocity t, a 3-vector or 2-vector in the surface's own axes, after full contact: shortened
+    by friction times the normal velocity rn that is lost, which is negative, towards the surface."""
     length = t.norm()
     factor = 0.0 * friction
     if length + rn * friction > 0.0 and length > 0.0:

@@ -12,6 +12,9 @@ rounding: :mod:`plab.sim.series` has the coefficients of the polynomials in ``Z 
 ``d = atanh(Z)``, and in d. Where ``|Z|`` or J leave the range in which the series are exact to rounding,
 :mod:`plab.sim.spectral` takes over with an SVD.
 
+Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
+parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.series.Series`.
+
 The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed, and
 so that each part is small enough for LLVM to vectorise. Components are scalars or lanes, see
 :mod:`plab.sim.linalg`.
@@ -65,31 +68,13 @@ NORM_SHIFT = 1e-8
 def trial_gradient(c: ti.template(), f: ti.template(), dt):
     """(I + dt C) F."""
     cf = mul(c, f)
-    return (
-        f[0] + dt * cf[0],
-        f[1] + dt * cf[1],
-        f[2] + dt * cf[2],
-        f[3] + dt * cf[3],
-        f[4] + dt * cf[4],
-        f[5] + dt * cf[5],
-        f[6] + dt * cf[6],
-        f[7] + dt * cf[7],
-        f[8] + dt * cf[8],
-    )
+    return [f[i] + dt * cf[i] for i in range(9)]
 
 
 @ti.func
 def hencky_strain(g: ti.template(), j, series: ti.template()):
-    """Deviatoric Hencky strain of G, and what its adjoint needs.
-
-    Args:
-        g: Trial deformation gradient G, 9 components.
-        j: det G.
-        series: :class:`plab.sim.series.Series`.
-
-    Returns:
-        c2 = J^(-2/3), W = (b + I)^-1 (6), Z (6), |Z|^2, the coefficients a1, a2 of Z and Z^2 in d, and d (6).
-    """
+    """Deviatoric Hencky strain d of G, and what its adjoint needs: c2, W = (b + I)^-1 (6), Z (6), |Z|^2, the
+    coefficients a1, a2 of Z and Z^2 in d, and d itself."""
     c = inverse_cbrt(j, series.cbrt_steps)
     c2 = c * c
     b = outer_sym(g)
@@ -127,7 +112,7 @@ def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
 
 @ti.func
 def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()):
-    """Kirchhoff stress (6 components) after return mapping; arguments as for :func:`stress_adjoint`."""
+    """Kirchhoff stress (6 components) after return mapping."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     qk = k * k * q
     dk = k * k * k * det_d
@@ -162,14 +147,7 @@ def yield_factor(d: ti.template(), yield_strain):
 @ti.func
 def scaled_sum(a, x: ti.template(), b, y: ti.template()):
     """a X + b Y of symmetric matrices."""
-    return (
-        a * x[0] + b * y[0],
-        a * x[1] + b * y[1],
-        a * x[2] + b * y[2],
-        a * x[3] + b * y[3],
-        a * x[4] + b * y[4],
-        a * x[5] + b * y[5],
-    )
+    return [a * x[i] + b * y[i] for i in range(6)]
 
 
 @ti.func
@@ -187,21 +165,8 @@ def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_
 def stress_adjoint(
     d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yield_strain, series: ti.template()
 ):
-    """Adjoint of the stress: the first part of the adjoint of return mapping.
-
-    Args:
-        d: Deviatoric Hencky strain, 6 components.
-        j: J.
-        c2: J^(-2/3).
-        tau_bar: Symmetric part of the adjoint of tau, 6 components.
-        mu: Shear modulus.
-        lam: Lame's lambda.
-        yield_strain: Yield stress / (2 mu).
-        series: :class:`plab.sim.series.Series`.
-
-    Returns:
-        Adjoints of d (6) at fixed k, of k, of c2 and of J.
-    """
+    """First part of the adjoint of return mapping: adjoints of d (6) at fixed k, of k, of c2 and of J from
+    ``tau_bar``, the symmetric part of that of tau (6)."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     d2 = square_sym(d)
     qk = k * k * q
@@ -241,20 +206,8 @@ def stress_adjoint(
 def parameter_adjoint(
     d: ti.template(), j, c2, tau_bar: ti.template(), k_bar, yield_strain, series: ti.template()
 ):
-    """Adjoints of mu, lambda and yield strain under return mapping and stress.
-
-    Args:
-        d: Deviatoric Hencky strain, 6 components.
-        j: J.
-        c2: J^(-2/3).
-        tau_bar: Symmetric part of the adjoint of tau, 6 components.
-        k_bar: Adjoint of the factor k of return mapping, from stress and flow together.
-        yield_strain: Yield stress / (2 mu).
-        series: :class:`plab.sim.series.Series`.
-
-    Returns:
-        Adjoints of mu, lambda and yield strain.
-    """
+    """Adjoints of mu, lambda and yield strain from ``tau_bar`` as in :func:`stress_adjoint`, and from that of
+    k by stress and flow together."""
     # The stress is linear in mu and lambda.
     mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
     _q, _det, norm, k = yield_factor(d, yield_strain)
@@ -266,20 +219,9 @@ def parameter_adjoint(
 def flow_adjoint(
     d: ti.template(), g: ti.template(), f_new_bar: ti.template(), yield_strain, series: ti.template()
 ):
-    """Adjoint of plastic flow F' = exp((k - 1) d) G: the second part of the adjoint of return mapping.
-
-    Where nothing yields, the flow is the identity and this part is not needed.
-
-    Args:
-        d: Deviatoric Hencky strain, 6 components.
-        g: Trial deformation gradient G, 9 components.
-        f_new_bar: Adjoint of the new F, 9 components.
-        yield_strain: Yield stress / (2 mu).
-        series: :class:`plab.sim.series.Series`.
-
-    Returns:
-        Adjoints of d (6) at fixed k, of k, and of G (9) at fixed d.
-    """
+    """Second part of the adjoint of return mapping, of plastic flow F' = exp((k - 1) d) G: adjoints of d (6)
+    at fixed k, of k, and of G (9) at fixed d. Where nothing yields, the flow is the identity and this part is
+    not needed."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     s = k - 1.0
     qs = s * s * q
@@ -309,21 +251,8 @@ def log_adjoint(
     yield_strain,
     series: ti.template(),
 ):
-    """Adjoint of Z under d = log(b) / 2: the third part of the adjoint of return mapping.
-
-    Args:
-        z: Z, 6 components.
-        a1: Coefficient of Z in d.
-        a2: Coefficient of Z^2 in d.
-        d: Deviatoric Hencky strain, 6 components.
-        d_bar: Adjoint of d at fixed k.
-        k_bar: Adjoint of k.
-        yield_strain: Yield stress / (2 mu).
-        series: :class:`plab.sim.series.Series`.
-
-    Returns:
-        Adjoint of Z, 6 components.
-    """
+    """Third part of the adjoint of return mapping: adjoint of Z (6) under d = log(b) / 2, whose coefficients
+    of Z and Z^2 are a1 and a2, from those of d at fixed k and of k."""
     _q, _det, norm, k = yield_factor(d, yield_strain)
     # k = yield_strain / norm where it yields, else constant.
     q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
@@ -363,24 +292,8 @@ def strain_adjoint(
     g_bar: ti.template(),
     dt,
 ):
-    """Adjoint of the strain measure Z(G): the last part of the adjoint of return mapping.
-
-    Args:
-        c: APIC matrix C, 9 components.
-        f: Deformation gradient F, 9 components.
-        g: Trial deformation gradient G, 9 components.
-        j: J.
-        c2: J^(-2/3).
-        w: (b + I)^-1, 6 components.
-        z_bar: Adjoint of Z, 6 components.
-        c2_bar: Adjoint of c2 from the stress.
-        j_bar: Adjoint of J from the stress.
-        g_bar: Adjoint of G from the flow, 9 components.
-        dt: Time step [s].
-
-    Returns:
-        Adjoints of C and F, 9 components each.
-    """
+    """Last part of the adjoint of return mapping: adjoints of C and F (9 each) from those of Z, of c2 and J
+    by the stress, and of G by the flow; ``w`` is (b + I)^-1."""
     p = sandwich_sym(w, z_bar)
     scale = 4.0 * c2
     b_bar = (scale * p[0], scale * p[1], scale * p[2], scale * p[3], scale * p[4], scale * p[5])

@@ -69,12 +69,11 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
 
 def array_bytes(data: ti.Field | ti.Ndarray) -> int:
     """Bytes of a field's or an array's entries."""
-    scalars = data.element_shape if isinstance(data, ti.Ndarray) else _entry_shape(data)
-    return math.prod(data.shape) * math.prod(scalars) * BYTES[data.dtype]
-
-
-def _entry_shape(field: ti.Field) -> tuple[int, ...]:
-    return (field.n, field.m) if isinstance(field, ti.MatrixField) else ()
+    if isinstance(data, ti.Ndarray):
+        scalars = math.prod(data.element_shape)
+    else:
+        scalars = data.n * data.m if isinstance(data, ti.MatrixField) else 1
+    return math.prod(data.shape) * scalars * BYTES[data.dtype]
 
 
 def held_bytes(*holders: object) -> int:

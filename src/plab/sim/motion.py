@@ -138,19 +138,8 @@ def displacement(motion: ti.template(), pose, u):
 
 @ti.func
 def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
-    """Pose after one substep.
-
-    Args:
-        motion: Motion rule, see :class:`plab.scene.ManipulatorShape`.
-        pose: Pose before, 8-vector.
-        u: This substep's share of the clipped and scaled action, 7-vector.
-        low: Lower bound of the position, 3-vector.
-        high: Upper bound of the position, 3-vector.
-        minimal_gap: Smallest gap.
-
-    Returns:
-        Pose after, 8-vector.
-    """
+    """Pose (8) after one substep, by this substep's share u (7) of the clipped and scaled action; ``motion``
+    is a rule of :class:`plab.scene.ManipulatorShape`."""
     out = pose
     if ti.static(motion != "static"):
         move = displacement(motion, pose, u)

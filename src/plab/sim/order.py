@@ -8,16 +8,12 @@ particles on CUDA the order is made anew before every environment step.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast
+from typing import Any
 
 import numpy as np
 import taichi as ti
 
 from plab.sim.tensors import copy_numbers
-
-if TYPE_CHECKING:
-    from plab.sim.cuda_engine import CudaEngine
-    from plab.sim.engine import CpuEngine
 
 __all__ = ["ParticleOrder", "curve_order", "hilbert_index"]
 
@@ -84,27 +80,17 @@ class ParticleOrder:
             particles are padding, shape [batch * place].
     """
 
-    def __init__(self, engine: CpuEngine | CudaEngine) -> None:
-        """Allocate; :meth:`start_from` comes next.
-
-        Args:
-            engine: The kernels that find and follow another order, where ``engine.sorts``.
-        """
+    def __init__(self, engine: Any) -> None:
+        """Allocate; :meth:`start_from` comes next. ``engine`` is the CPU's or CUDA's kernels."""
         self._engine = engine
-        self.numbers = self._array(1)
+        self.numbers = self.allocate(1)
         if engine.sorts:
-            # The CPU's engine never does.
-            self._sorting = cast("CudaEngine", engine)
-            self._sorting.allocate_order()
-            self._spare = self._array(1)
+            engine.allocate_order()
+            self._spare = self.allocate(1)
             self._moves = self.allocate(1)
 
     def start_from(self, positions: Sequence[np.ndarray]) -> None:
-        """Start with the curve's order.
-
-        Args:
-            positions: Initial positions of each environment [domain units], each [particle, 3].
-        """
+        """Start with the curve's order of each environment's positions [domain units], [particle, 3]."""
         engine = self._engine
         self.initial = np.stack([curve_order(x, engine.n) for x in positions])
         batch, particles = self.initial.shape
@@ -119,12 +105,9 @@ class ParticleOrder:
         """Places in all environments, padding included."""
         return self._engine.batch * self._engine.tiles * self._engine.lanes
 
-    def _array(self, steps: int) -> ti.Ndarray:
-        return ti.ndarray(ti.i32, shape=steps * self.places)
-
     def allocate(self, steps: int) -> ti.Ndarray:
         """Allocate the moves of several environment steps, for :meth:`sort`."""
-        return self._array(steps)
+        return ti.ndarray(ti.i32, shape=steps * self.places)
 
     def reset(self) -> None:
         """Return to the initial order."""
@@ -141,7 +124,7 @@ class ParticleOrder:
         """Return :attr:`numbers` as they are now, whatever order comes next."""
         if not self._engine.sorts:
             return self.numbers
-        copy = self._array(1)
+        copy = self.allocate(1)
         copy_numbers(self.numbers, 0, copy, 0, self.places)
         return copy
 
@@ -155,37 +138,9 @@ class ParticleOrder:
         stamp: int,
         moves: ti.Ndarray | None = None,
     ) -> None:
-        """Put a state into the order of its cells and take that as the current order.
-
-        Args:
-            state: Particle states.
-            slot: Time slot of the state.
-            target: Where the state goes, another array or slot.
-            target_slot: Time slot there.
-            t: Environment step, the entry of ``moves`` that is written.
-            stamp: A fresh stamp.
-            moves: From :meth:`allocate`; the order's own, with room for step 0, if None.
-        """
+        """Put a state into the order of its cells, in another array or time slot, and take that as the
+        current order; ``moves``, the order's own with room for step 0 if None, is written for step t."""
         moves = self._moves if moves is None else moves
-        self._sorting.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
+        self._engine.sort(state, slot, target, target_slot, self.numbers, self._spare, moves, t, stamp)
         self.numbers, self._spare = self._spare, self.numbers
         self._changed = True
-
-    def move(
-        self, source: ti.Ndarray, slot: int, target: ti.Ndarray, to: int, moves: ti.Ndarray, t: int
-    ) -> None:
-        """Copy a state into another order.
-
-        Args:
-            source: Particle states, of which ``slot`` is copied.
-            slot: Time slot of the state.
-            target: Particle states to which it is copied.
-            to: Time slot there.
-            moves: What :meth:`sort` has written.
-            t: Environment step, the entry of ``moves``.
-        """
-        self._sorting.move(source, slot, target, to, moves, t)
-
-    def move_back(self, bar: ti.Ndarray, target: ti.Ndarray, moves: ti.Ndarray, t: int) -> None:
-        """Copy the adjoint of a moved state back into the order before; arguments as for :meth:`move`."""
-        self._sorting.move_back(bar, target, moves, t)

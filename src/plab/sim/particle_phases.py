@@ -5,6 +5,7 @@ import taichi as ti
 
 from plab.sim.spectral import spectral_parameter_adjoint, spectral_return_map, spectral_return_map_adjoint
 from plab.sim.storage import AT_C, AT_F, AT_V, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
+from plab.sim.tensors import Array
 
 __all__ = ["ParticlePhases"]
 
@@ -30,6 +31,12 @@ class ParticlePhases(Storage):
         return entry
 
     @ti.func
+    def particle_of(self, q):
+        """Environment and number of thread q's particle; numbers from ``particles`` on are padding."""
+        e = q // (self.tiles * self.lanes)
+        return e, q - e * (self.tiles * self.lanes)
+
+    @ti.func
     def load(self, state: ti.template(), entry, lane, count: ti.template()):
         """``count`` scalars of one particle."""
         return [state[entry + i][lane] for i in range(count)]
@@ -40,19 +47,11 @@ class ParticlePhases(Storage):
         return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
 
     @ti.kernel
-    def observe(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        slot: ti.i32,
-        order: ti.types.ndarray(ndim=1),
-        stride: ti.i32,
-        out: ti.types.ndarray(ndim=1),
-    ):
+    def observe(self, state: Array, slot: ti.i32, order: Array, stride: ti.i32, out: Array):
         """Write position and velocity of every ``stride``-th particle of a time slot, as ``order`` numbers
         them."""
         for q in range(self.batch * self.tiles * self.lanes):
-            e = q // (self.tiles * self.lanes)
-            place = q - e * (self.tiles * self.lanes)
+            e, place = self.particle_of(q)
             number = order[q]
             if place < self.particles and number % stride == 0:
                 entry = self.tile_entry(slot, e, place // self.lanes)
@@ -154,12 +153,8 @@ class ParticlePhases(Storage):
 
     @ti.func
     def parameters_of_tile(self, e: ti.template(), entry9: ti.template()):
-        """mu, lambda and yield strain of a tile's particles, which are numbers, or lanes where bodies differ.
-
-        Args:
-            e: Environment.
-            entry9: Entry of the tile in ``affine``.
-        """
+        """mu, lambda and yield strain of a tile's particles, which are numbers, or lanes where bodies differ;
+        ``entry9`` is the tile's in ``affine``."""
         if ti.static(self.mixed):
             return [self.place_material[entry9 // 3 + i] for i in range(3)]
         else:

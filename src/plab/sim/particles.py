@@ -30,12 +30,7 @@ class Particles:
     """
 
     def __init__(self, engine: CpuEngine, numpy_real: type) -> None:
-        """Allocate; neither state nor order is set.
-
-        Args:
-            engine: The kernels.
-            numpy_real: NumPy's type of the simulation's numbers.
-        """
+        """Allocate; neither state nor order is set. ``numpy_real`` is NumPy's type of numbers."""
         self.engine = engine
         self.order = ParticleOrder(engine)
         self.current = self.array(1)
@@ -84,15 +79,8 @@ class Particles:
         entries: tuple[int, int] = (0, 0),
         moves: ti.Ndarray | None = None,
     ) -> None:
-        """Advance the current state by environment step t, in place.
-
-        Args:
-            poses: History of the manipulators' poses.
-            actions: Actions of all steps.
-            t: Environment step.
-            entries: Entries of the pose history before and after the step.
-            moves: Where to keep the step's order of the particles, if it is needed later.
-        """
+        """Advance the current state by environment step t, in place, from one entry of the pose history to
+        another; ``moves`` keeps the step's order of the particles, if it is needed later."""
         if self.engine.sorts:
             entry = 0 if moves is None else t
             self.order.sort(self.current, 0, self._spare, 0, entry, self.take_stamps(1), moves)
@@ -133,13 +121,8 @@ class Particles:
         return np.ascontiguousarray(tiles).reshape(-1, engine.lanes)
 
     def unpack(self, tiles: np.ndarray, poses: np.ndarray, order: np.ndarray | None = None) -> State:
-        """Tiles to user arrays.
-
-        Args:
-            tiles: Numbers of an array of one state.
-            poses: Poses to go with them, as in :class:`plab.sim.State`.
-            order: Order of the particles, shape [batch, particle]; the current one if None.
-        """
+        """Tiles of one state to user arrays, with poses to go with them; ``order`` of the particles is the
+        current one if None, shape [batch, particle]."""
         engine = self.engine
         b, n = engine.batch, engine.particles
         order = self.order.current() if order is None else order

@@ -3,16 +3,12 @@
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.motion import (
-    advance_pose_adjoint,
-    rotation_matrix,
-    rotation_matrix_adjoint,
-)
+from plab.sim.motion import advance_pose_adjoint, rotation_matrix, rotation_matrix_adjoint
 from plab.sim.storage import Storage
+from plab.sim.tensors import Array
 
 __all__ = ["PosePhases", "vec7", "with_unit_rotation"]
 
-vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
 vec7 = ti.types.vector(7, ti.f64)
 vec8 = ti.types.vector(8, ti.f64)
@@ -57,15 +53,16 @@ class PosePhases(Storage):
             if self.touched[e] == 0:
                 self.untouched_step[e] = t
 
-    @ti.func
-    def place_manipulators(self, e, poses: ti.template(), slot):
+    @ti.kernel
+    def place(self, poses: Array, slot: ti.i32):
         """Take slot ``slot`` of the pose history as the end of an environment step, for the losses."""
-        for m in ti.static(range(self.manipulators)):
-            entry = (slot * self.batch + e) * self.manipulators + m
-            for i in ti.static(range(8)):
-                self.pose[e, self.substeps, m][i] = poses[entry * 8 + i]
-            if ti.static(self.rotations_as_given):
-                self.pose[e, self.substeps, m] = with_unit_rotation(self.pose[e, self.substeps, m])
+        for e in range(self.batch):
+            for m in ti.static(range(self.manipulators)):
+                entry = (slot * self.batch + e) * self.manipulators + m
+                for i in ti.static(range(8)):
+                    self.pose[e, self.substeps, m][i] = poses[entry * 8 + i]
+                if ti.static(self.rotations_as_given):
+                    self.pose[e, self.substeps, m] = with_unit_rotation(self.pose[e, self.substeps, m])
 
     @ti.func
     def set_frame(self, e, s, m: ti.template()):

@@ -79,15 +79,8 @@ class Recorder:
     adjoints."""
 
     def __init__(self, particles: Particles, like: Any, every_step: bool, mass: bool, steps: int) -> None:
-        """Start without a state.
-
-        Args:
-            particles: The current state and the kernels.
-            like: The actions: states are tensors if these are a CUDA tensor.
-            every_step: Whether all states are taken, or the last one alone.
-            mass: Whether mass tensors are taken.
-            steps: Environment steps T of the rollout.
-        """
+        """Start without a state of the rollout's T ``steps``; states are tensors if ``like``, the actions,
+        are a CUDA tensor."""
         self._particles, self._engine = particles, particles.engine
         self._like = like if on_device(like) else None
         self._first = 0 if every_step else steps - 1
@@ -112,13 +105,8 @@ class Recorder:
             self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
 
     def recording(self, poses: Any, back: Callable[[], Any], current: Callable[[], bool]) -> Recording:
-        """Return what was noted.
-
-        Args:
-            poses: Poses after each step, shape [batch, T, manipulator, 8].
-            back: Runs the way back.
-            current: Whether it still can.
-        """
+        """Return what was noted, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the way back
+        if it is still ``current``."""
         e = self._engine
         rows = self._stacked(self._rows).reshape(e.batch, -1, e.particles, 6)
         mass = self._stacked(self._masses).reshape(e.batch, -1, e.n, e.n, e.n) if self._mass else None

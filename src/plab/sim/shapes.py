@@ -11,14 +11,7 @@ import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES, SceneError
 
-__all__ = [
-    "SURFACES",
-    "Surface",
-    "gap_slope",
-    "hessian_product",
-    "require_surfaces",
-    "signed_distance",
-]
+__all__ = ["SURFACES", "Surface", "gap_slope", "hessian_product", "require_surfaces", "signed_distance"]
 
 
 def missing(*_arguments: object) -> object:

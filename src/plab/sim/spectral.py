@@ -4,6 +4,7 @@
 Reached by few particles (strong compression, inverted or nearly singular F, stiff materials that do not
 yield), so it is written for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the
 smallest singular value carries the sign of det F) and a derivative in divided differences with their limits.
+Material parameters are called as there, matrices are 3x3.
 """
 
 import taichi as ti
@@ -43,14 +44,7 @@ def any_normal(v):
 
 @ti.func
 def svd_signed(f):
-    """F = U diag(s) V^T with proper rotations U, V and s[0] >= s[1] >= |s[2]|.
-
-    Args:
-        f: 3x3 matrix.
-
-    Returns:
-        U (3x3), s (3), V (3x3).
-    """
+    """F = U diag(s) V^T with proper rotations U, V and s[0] >= s[1] >= |s[2]|; returns U, s, V."""
     a = f
     v = f * 0.0
     for i in ti.static(range(3)):
@@ -103,12 +97,8 @@ def svd_signed(f):
 
 @ti.func
 def mapped_values(s, mu, lam, yield_strain):
-    """Return mapping of singular values.
-
-    Returns:
-        g: new singular values; t: eigenvalues of tau; e: clamped Hencky strains; k: factor of their
-            deviator; n: |dev|.
-    """
+    """Return mapping of singular values: the new ones g, eigenvalues of tau, clamped Hencky strains, factor k
+    of their deviator, and |dev|."""
     e = s * 0.0
     for i in ti.static(range(3)):
         e[i] = ti.log(ti.max(s[i], SINGULAR_VALUE_MIN))
@@ -129,17 +119,7 @@ def mapped_values(s, mu, lam, yield_strain):
 
 @ti.func
 def spectral_return_map(f_trial, mu, lam, yield_strain):
-    """Return mapping and Kirchhoff stress from the trial deformation gradient.
-
-    Args:
-        f_trial: (I + dt C) F, 3x3.
-        mu: Shear modulus.
-        lam: Lame's lambda.
-        yield_strain: Yield stress / (2 mu).
-
-    Returns:
-        New F (3x3) and tau (3x3).
-    """
+    """New F and Kirchhoff stress tau, 3x3, from the trial deformation gradient (I + dt C) F."""
     u, s, v = svd_signed(f_trial)
     g, t, _e, k, _n = mapped_values(s, mu, lam, yield_strain)
     f_new = f_trial
@@ -151,21 +131,9 @@ def spectral_return_map(f_trial, mu, lam, yield_strain):
 
 @ti.func
 def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strain, tiny):
-    """Adjoint of the trial deformation gradient under :func:`spectral_return_map`.
-
-    Args:
-        f_trial: (I + dt C) F, 3x3.
-        f_new_bar: Adjoint of the new F, 3x3.
-        tau_bar: Adjoint of tau, 3x3, symmetric.
-        mu: Shear modulus.
-        lam: Lame's lambda.
-        yield_strain: Yield stress / (2 mu).
-        tiny: Relative difference of two singular values below which a divided difference is taken at its
-            limit.
-
-    Returns:
-        Adjoint of f_trial, 3x3.
-    """
+    """Adjoint of the trial deformation gradient under :func:`spectral_return_map`; ``tau_bar`` is symmetric.
+    Where two singular values differ by less than ``tiny``, relatively, a divided difference is taken at its
+    limit."""
     u, s, v = svd_signed(f_trial)
     g, _t, e, k, n = mapped_values(s, mu, lam, yield_strain)
     p = u.transpose() @ f_new_bar @ v
@@ -213,8 +181,7 @@ def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_stra
 
 @ti.func
 def spectral_parameter_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strain):
-    """Adjoints of mu, lambda and yield strain under :func:`spectral_return_map`; arguments as for
-    :func:`spectral_return_map_adjoint`."""
+    """Adjoints of mu, lambda and yield strain under :func:`spectral_return_map`."""
     u, s, v = svd_signed(f_trial)
     g, _t, e, k, n = mapped_values(s, mu, lam, yield_strain)
     p = u.transpose() @ f_new_bar @ v

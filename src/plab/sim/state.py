@@ -69,12 +69,8 @@ class Rollout:
 
 
 def rest_state(x: np.ndarray, poses: np.ndarray) -> State:
-    """Return particles at rest and without strain.
-
-    Args:
-        x: Positions [domain units], shape [batch, particle, 3].
-        poses: Poses as in :class:`State`.
-    """
+    """Return particles at rest and without strain, at positions of shape [batch, particle, 3]; poses as in
+    :class:`State`."""
     shape = (*x.shape, 3)
     identity = np.broadcast_to(np.eye(3), shape)
     return State(x, np.zeros_like(x), np.zeros(shape), identity, poses)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 import taichi as ti
@@ -95,14 +96,8 @@ class Storage:
     def __init__(
         self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips, full_gradient: bool = False
     ) -> None:
-        """Allocate what forward simulation needs.
-
-        Args:
-            scenes: One per environment, alike in all but the per-environment data.
-            runtime: The Taichi runtime in force.
-            skips: What is not computed where it is not needed.
-            full_gradient: Whether gradients include those with respect to initial state and material.
-        """
+        """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
+        data; gradients include those by initial state and material if ``full_gradient``."""
         self.full_gradient = full_gradient
         first = scenes[0]
         self.skips = skips
@@ -115,10 +110,17 @@ class Storage:
         self.tiles = -(-self.particles // self.lanes)
         self.chunks = 1 if self.cuda else CHUNKS
         self.substeps = first.substeps
-        self._set_material(scenes, runtime.precision)
+        # Threads beyond one per environment team up on its chunks.
+        self.threads = runtime.threads
+        self.team_size = min(self.chunks, max(1, runtime.threads // self.batch))
+        # Materials of an environment: 1, or one per body.
+        self.materials = first.material_count
+        self.mixed = self.materials > 1
+        self.series = Series.for_precision(runtime.precision)
+        if not skips.singular_values:
+            self.series = replace(self.series, z_squared_max=-1.0)
         self._set_grid(first)
-        self._set_threads(runtime.threads)
-        self._set_manipulators(scenes)
+        self._set_manipulators(first)
         self._allocate()
         self.fill_parameters(scenes)
 
@@ -137,39 +139,19 @@ class Storage:
         self.nodes = self.axis**3
         self.blocks = self.blocks_per_axis**3
 
-    def _set_material(self, scenes: Sequence[Scene], precision: str) -> None:
-        series = Series.for_precision(precision)
-        if not self.skips.singular_values:
-            series = replace(series, z_squared_max=-1.0)
-        # Materials of an environment: 1, or one per body.
-        self.materials = scenes[0].material_count
-        self.mixed = self.materials > 1
-        self.series = series
-
-    def _set_threads(self, threads: int) -> None:
-        self.threads = threads
-        # Threads beyond one per environment team up on its chunks.
-        self.team_size = min(self.chunks, max(1, threads // self.batch))
-
-    def _set_manipulators(self, scenes: Sequence[Scene]) -> None:
-        manipulators = scenes[0].manipulators
-        self.rotations_as_given = scenes[0].numbers == "release"
+    def _set_manipulators(self, scene: Scene) -> None:
+        manipulators = scene.manipulators
+        self.rotations_as_given = scene.numbers == "release"
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
         require_surfaces(self.shapes)
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
-        dims = [m.action_dim for m in manipulators]
-        self.action_offsets = tuple(int(o) for o in np.cumsum([0, *dims])[:-1])
-        self.action_dims = tuple(dims)
-        self.actions_per_step = sum(dims)
+        self.action_dims = tuple(m.action_dim for m in manipulators)
+        self.action_offsets = tuple(sum(self.action_dims[:m]) for m in range(self.manipulators))
+        self.actions_per_step = scene.action_dim
         # Consecutive manipulators of one shape share one loop, hence one compiled body.
-        ranges: list[tuple[str, int, int]] = []
-        for number, shape in enumerate(self.shapes):
-            if ranges and ranges[-1][0] == shape:
-                ranges[-1] = (shape, ranges[-1][1], number + 1)
-            else:
-                ranges.append((shape, number, number + 1))
-        self.shape_ranges = tuple(ranges)
+        runs = [list(run) for _, run in groupby(range(self.manipulators), key=lambda m: self.shapes[m])]
+        self.shape_ranges = tuple((self.shapes[run[0]], run[0], run[-1] + 1) for run in runs)
 
     def moves(self, shape: str) -> bool:
         """Whether manipulators of this shape can move; decided while compiling, as what follows."""
@@ -260,12 +242,8 @@ class Storage:
             self.place_material.from_numpy(values.reshape(-1, self.lanes))
 
     def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:
-        """Write whose particles are where, and what they are made of; nothing where all are of one material.
-
-        Args:
-            scenes: One scene per environment.
-            order: Number of the particle at each place, shape [batch, particle].
-        """
+        """Write whose particles are where, by their numbers at each place, shape [batch, particle], and what
+        they are made of; nothing where all are of one material."""
         if not self.mixed:
             return
         bodies = np.zeros((self.batch, self.tiles * self.lanes), np.int32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import taichi as ti
 
@@ -25,13 +26,9 @@ class Tape:
     """
 
     def __init__(self, particles: Particles) -> None:
-        """Allocate nothing yet.
-
-        Args:
-            particles: The current state, from which :meth:`forward` starts.
-        """
+        """Allocate nothing yet; :meth:`forward` starts from the particles' current state."""
         self._particles = particles
-        self._engine = particles.engine
+        self._engine: Any = particles.engine
         self._history: list[ti.Ndarray] = []
         self._checkpoints: ti.Ndarray | None = None
         self._moves: ti.Ndarray | None = None
@@ -73,25 +70,22 @@ class Tape:
         Raises:
             MemoryError: If no length fits into the budget, or none into arrays that Taichi can address.
         """
-        slot_bytes, slots_per_step = self._particles.slot_bytes, self._slots_per_step
-        self._engine.allocate_adjoint()
+        engine, slot_bytes, reach = self._engine, self._particles.slot_bytes, self._reach_max
+        engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
-        engine = self._engine
         fixed = held_bytes(engine, *engine.terms, self._particles, self._particles.order) + slot_bytes
-        if self._engine.sorts:
+        if engine.sorts:
             # The orders of all steps, and the adjoint's other half.
             fixed += 4 * steps * self._particles.order.places + slot_bytes
 
-        reach = self._reach_max
-
         def cost(length: int) -> int:
-            return kept_states(steps, slots_per_step, length, reach) * slot_bytes + fixed
+            return kept_states(steps, self._slots_per_step, length, reach) * slot_bytes + fixed
 
-        segments_max = ENTRIES_MAX[self._engine.device] // self._particles.slot_entries
+        segments_max = ENTRIES_MAX[engine.device] // self._particles.slot_entries
         lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
         if not lengths:
             raise MemoryError(
-                f"{self._engine.batch} environments are too many for a gradient of {steps} steps, "
+                f"{engine.batch} environments are too many for a gradient of {steps} steps, "
                 "whatever the memory: simulate fewer environments together, or fewer steps"
             )
         fitting = [length for length in lengths if cost(length) <= memory_mb * 1e6]
@@ -111,6 +105,7 @@ class Tape:
         slots = [part * self._slots_per_step + 1 for part in parts]
         held = [array.shape[0] // per_slot for array in self._history]
         if len(held) < len(slots) or any(has < needs for has, needs in zip(held, slots, strict=False)):
+            # Freed before others are allocated.
             self._history.clear()
             self._history += [self._particles.array(count) for count in slots]
         if segments > 1 and (self._checkpoints is None or self._checkpoints.shape[0] < segments * per_slot):
@@ -161,8 +156,8 @@ class Tape:
                 if begins:
                     self._engine.copy_slot(particles.current, 0, self._history[0], 0)
                 self._keep_step(t, actions, poses, known=False)
-                history, slot = self._place(t)
-                state, slot = history, slot + self._engine.substeps
+                state, slot = self._place(t)
+                slot += self._engine.substeps
             else:
                 moves = self._moves if length is not None else None
                 particles.step(poses, actions, t, entries=(t, t + 1), moves=moves)
@@ -183,11 +178,11 @@ class Tape:
             end = self._reach * self._slots_per_step
             self._engine.copy_slot(self._history[number - 1], end, history, 0)
         if self._engine.sorts:
-            order = self._particles.order
-            if not known:
-                order.sort(history, slot - 1, history, slot, t, self._particles.take_stamps(1), self._moves)
+            if known:
+                self._engine.move(history, slot - 1, history, slot, self._moves, t)
             else:
-                order.move(history, slot - 1, history, slot, self._moves, t)
+                stamp = self._particles.take_stamps(1)
+                self._particles.order.sort(history, slot - 1, history, slot, t, stamp, self._moves)
         self._particles.advance(history, slot, 1, poses, actions, t, (t, t + 1))
 
     def _entry(self, t: int) -> int:
@@ -207,8 +202,8 @@ class Tape:
         """Go back through the steps that :meth:`forward` has run with a length.
 
         Args:
-            actions: The same actions.
-            poses: The same history.
+            actions: Those of :meth:`forward`, as ``poses``.
+            poses: Likewise.
             terms: Measures after each step are written to it, from the second entry.
             steps: Environment steps T.
             contact_free: Steps at the start through which particles' adjoints need not be followed.
@@ -249,7 +244,7 @@ class Tape:
                 int(t >= contact_free),
             )
             if engine.sorts:
-                self._particles.order.move_back(self.bar, self._spare_bar, self._moves, t)
+                engine.move_back(self.bar, self._spare_bar, self._moves, t)
                 self.bar, self._spare_bar = self._spare_bar, self.bar
         return actions_bar
 

@@ -24,11 +24,7 @@ class TeamChoice:
     """
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        """Start with the first team.
-
-        Args:
-            sizes: Threads that work on one environment, in the order in which they are tried.
-        """
+        """Start with the first team, of so many threads; the others are tried in their order."""
         self._sizes = tuple(dict.fromkeys(sizes))
         self._seconds: dict[int, deque[float]] = {}
         self._launches = 0

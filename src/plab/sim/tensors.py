@@ -14,11 +14,17 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 
+# What kernels take: an array of Taichi's or NumPy's or a CUDA tensor, of numbers or of vectors.
 if TYPE_CHECKING:
     import torch
     from typing_extensions import TypeIs
 
+    Array = Any
+else:
+    Array = ti.types.ndarray(ndim=1)
+
 __all__ = [
+    "Array",
     "Constants",
     "action_array",
     "clear",
@@ -53,20 +59,14 @@ class Constants:
 
 
 @ti.kernel
-def copy_numbers(
-    source: ti.types.ndarray(ndim=1),
-    first: ti.i32,
-    target: ti.types.ndarray(ndim=1),
-    at: ti.i32,
-    count: ti.i32,
-):
+def copy_numbers(source: Array, first: ti.i32, target: Array, at: ti.i32, count: ti.i32):
     """Copy some numbers of one array, from its entry ``first``, to entry ``at`` of another, in its type."""
     for i in range(count):
         target[at + i] = source[first + i]
 
 
 @ti.kernel
-def clear(array: ti.types.ndarray(ndim=1), lanes: ti.template()):
+def clear(array: Array, lanes: ti.template()):
     """Set all vectors of an array to 0: Taichi's own ``fill`` makes a kernel for each call, and keeps all of
     them; its ``zero`` multiplies, and leaves NaN."""
     for i in array:
@@ -75,14 +75,8 @@ def clear(array: ti.types.ndarray(ndim=1), lanes: ti.template()):
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
-    """Let a kernel fill a new tensor.
-
-    Args:
-        fill: Launches the kernel, given the tensor, of shape [count].
-        count: Numbers.
-        double: Whether they are float64, else float32.
-        like: A CUDA tensor, whose device and type the result takes.
-    """
+    """Let ``fill`` launch a kernel that fills a new tensor of ``count`` numbers, in float64 if ``double``;
+    the result takes device and type of a CUDA tensor."""
     torch = sys.modules["torch"]
     out = like.new_empty(count, dtype=torch.float64 if double else torch.float32)
     if count:
@@ -95,14 +89,8 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
 def numbers_of(
     array: ti.Ndarray, shape: tuple[int, ...], like: object, first: int = 0
 ) -> "np.ndarray | torch.Tensor":
-    """What an array on the device holds, as a tensor like a CUDA tensor or else as an array.
-
-    Args:
-        array: Array on the device of the simulation.
-        shape: Shape of the result; what the array holds beyond it is left out.
-        like: Given a CUDA tensor, the result is one too, of its type.
-        first: Entry of the array with which the result begins.
-    """
+    """What an array on the device holds from its entry ``first``, as an array of some shape, or as a tensor
+    of the type of a CUDA tensor ``like``; what is beyond is left out."""
     count = int(np.prod(shape))
     if on_device(like):
         filled = output_for(lambda out: copy_numbers(array, first, out, 0, count), count, True, like)
@@ -113,16 +101,8 @@ def numbers_of(
 def step_actions(
     actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
 ) -> "np.ndarray | torch.Tensor | ti.Ndarray":
-    """Actions of one environment step for the kernels, which take them from where they are.
-
-    Args:
-        actions: Shape [batch, action].
-        batch: Number of environments.
-        components: Action components.
-        device: Device of the simulation, ``cpu`` or ``cuda``.
-
-    Returns:
-        Actions of all environments, float64.
+    """Actions of one environment step, shape [batch, component], for the kernels, which take them from where
+    they are; float64.
 
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
@@ -140,16 +120,7 @@ def step_actions(
 def action_array(
     actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
 ) -> ti.Ndarray:
-    """Actions of a rollout for the kernels.
-
-    Args:
-        actions: Shape [batch, T, action].
-        batch: Number of environments.
-        components: Action components per environment step.
-        device: Device of the simulation, ``cpu`` or ``cuda``.
-
-    Returns:
-        Actions of all environments, step by step, float64.
+    """Actions of a rollout, shape [batch, T, component], for the kernels: step by step, float64.
 
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
@@ -165,11 +136,7 @@ def action_array(
 def _of_shape(
     actions: "np.ndarray | torch.Tensor", expected: tuple[object, ...], named: str
 ) -> "np.ndarray | torch.Tensor":
-    """Actions as a CUDA tensor if they are one, else as an array of float64.
-
-    Raises:
-        ValueError: If they have another shape.
-    """
+    """Actions as a CUDA tensor if they are one, else as an array of float64; refused with another shape."""
     actions = actions if on_device(actions) else _array(actions)
     if tuple(actions.shape) != expected:
         raise ArgumentError(f"actions have shape {tuple(actions.shape)}, not {expected} {named}")
@@ -184,11 +151,7 @@ def _array(actions: ArrayLike) -> np.ndarray:
 
 
 def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor":
-    """Actions one after the other, float64; a CUDA tensor is complete when this returns.
-
-    Raises:
-        ValueError: If one of them is not finite.
-    """
+    """Actions one after the other, float64, all finite; a CUDA tensor is complete when this returns."""
     if on_device(actions):
         flat = actions.detach().reshape(-1).double().contiguous()
         finite = bool(flat.isfinite().all())

@@ -17,8 +17,10 @@ import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
+from plab.sim.pose_phases import vec4, vec8
 from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import AT_V, Storage
+from plab.sim.tensors import Array
 from plab.sim.transfer import spline, spline_slope
 
 __all__ = ["EXTRA_MEASURES", "TermPhases"]
@@ -26,9 +28,6 @@ __all__ = ["EXTRA_MEASURES", "TermPhases"]
 EXTRA_MEASURES = 2
 """Measures of a state after its terms: the largest mass of a node, and the fault: the number of the substep
 in which the state broke, from 1 on, or 0."""
-
-vec4 = ti.types.vector(4, ti.f64)
-vec8 = ti.types.vector(8, ti.f64)
 
 
 class TermPhases(Storage):
@@ -166,13 +165,8 @@ class TermPhases(Storage):
 
     @ti.func
     def node_measures(self, e, i, mass):
-        """What a node adds to the terms of the mass tensor, and its mass; and the loss's slope there.
-
-        Args:
-            e: Environment.
-            i: Array index of the node.
-            mass: Its mass.
-        """
+        """What a node, by its array index, adds to the terms of the mass tensor, and its mass; and the loss's
+        slope there."""
         values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         slope = 0.0 * mass
         node = i - 1
@@ -345,18 +339,11 @@ class TermPhases(Storage):
     # -- derivatives that others have computed ------------------------------------------------------
 
     @ti.kernel
-    def add_cotangents(
-        self,
-        bar: ti.types.ndarray(ndim=1),
-        order: ti.types.ndarray(ndim=1),
-        given: ti.types.ndarray(ndim=1),
-        first: ti.i32,
-    ):
+    def add_cotangents(self, bar: Array, order: Array, given: Array, first: ti.i32):
         """Add derivatives by positions (``first`` is 0) or velocities (3), numbered as ``order`` says, to the
         particles' adjoints."""
         for q in range(self.batch * self.tiles * self.lanes):
-            e = q // (self.tiles * self.lanes)
-            place = q - e * (self.tiles * self.lanes)
+            e, place = self.particle_of(q)
             if place < self.particles:
                 entry = self.tile_entry(0, e, place // self.lanes) + first
                 row = (e * self.particles + order[q]) * 3
@@ -365,17 +352,10 @@ class TermPhases(Storage):
                     bar[entry + i][lane] = bar[entry + i][lane] + ti.cast(given[row + i], self.real)
 
     @ti.kernel
-    def add_mass_cotangents(
-        self,
-        state: ti.types.ndarray(ndim=1),
-        slot: ti.i32,
-        bar: ti.types.ndarray(ndim=1),
-        given: ti.types.ndarray(ndim=1),
-    ):
+    def add_mass_cotangents(self, state: Array, slot: ti.i32, bar: Array, given: Array):
         """Add derivatives by the mass tensors, n^3 per environment, to the particles' adjoints."""
         for q in range(self.batch * self.tiles * self.lanes):
-            e = q // (self.tiles * self.lanes)
-            place = q - e * (self.tiles * self.lanes)
+            e, place = self.particle_of(q)
             if place < self.particles:
                 lane = place % self.lanes
                 x = self.vector(state, self.tile_entry(slot, e, place // self.lanes), lane)
@@ -386,7 +366,7 @@ class TermPhases(Storage):
                     bar[entry + i][lane] = bar[entry + i][lane] + x_bar[i]
 
     @ti.kernel
-    def add_pose_cotangents(self, given: ti.types.ndarray(ndim=1)):
+    def add_pose_cotangents(self, given: Array):
         """Add derivatives by the poses, 8 per manipulator, to the poses' adjoints."""
         for e, m in self.pose_bar:
             for i in ti.static(range(8)):

@@ -47,28 +47,15 @@ def column(a: ti.template(), j: ti.template(), scale):
 
 @ti.func
 def at_base(value, row: ti.template(), f: ti.template(), scale):
-    """One component of an affine field at the base node, from its value at the particle.
-
-    Args:
-        value: The component at the particle, a number or lanes.
-        row: Its row of the matrix A, three numbers or lanes.
-        f: x / dx - base, three numbers or lanes.
-        scale: Factor of A times the grid spacing.
-    """
+    """One component of an affine field at the base node, from its value at the particle and its row of the
+    matrix A, whose factor times the grid spacing is ``scale``; numbers or lanes."""
     return value - scale * (f[0] * row[0] + f[1] * row[1] + f[2] * row[2])
 
 
 @ti.func
 def affine_field(value, last, a: ti.template(), f, scale):
-    """An affine field in the form that :func:`scatter` takes.
-
-    Args:
-        value: The field at the particle, a 3-vector.
-        last: Fourth entry at the base node.
-        a: The matrix A, 9 numbers.
-        f: x / dx - base, a 3-vector.
-        scale: Factor of A times the grid spacing.
-    """
+    """An affine field in the form that :func:`scatter` takes, from its value (3) at the particle, the fourth
+    entry at the base node, and the matrix A (9), whose factor times the grid spacing is ``scale``."""
     base = [at_base(value[i], [a[3 * i], a[3 * i + 1], a[3 * i + 2]], f, scale) for i in range(3)]
     return [widen(base, last), column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
 
@@ -84,17 +71,10 @@ def scatter(
     scratch: ti.template(),
     at,
 ):
-    """Add an affine field of 4-vectors, weighted, to a particle's stencil.
+    """Add an affine field of 4-vectors, weighted, to a particle's stencil in a grid that one thread owns.
 
-    Args:
-        grid: Field of 4-vectors that one thread owns.
-        node: Index of the base node.
-        stride_x: Index distance of neighbours along x.
-        stride_y: Index distance of neighbours along y.
-        w: :func:`spline` weights.
-        q: The field's value at the base node, and its increments along x, y and z.
-        scratch: Field of 4-vectors for intermediate results.
-        at: First of nine entries.
+    ``q`` is the field's value at the base node, and its increments along x, y and z; ``scratch`` holds nine
+    intermediate results from entry ``at``.
     """
     # Weighted along z, node by node: the values at the base node, and increments along x and y.
     for k in ti.static(range(3)):
@@ -128,16 +108,8 @@ def scatter(
 def gather(grid: ti.template(), node, stride_x, stride_y, w: ti.template(), scratch: ti.template(), at):
     """Zeroth and first moments of a grid field of 4-vectors over a particle's stencil.
 
-    Args:
-        grid: Field of 4-vectors.
-        node: Index of the base node.
-        stride_x: Index distance of neighbours along x.
-        stride_y: Index distance of neighbours along y.
-        w: :func:`spline` weights.
-        scratch: Field of 4-vectors for the result: LLVM vectorises what ends in consecutive stores, and only
-            that.
-        at: First entry of the result: sum of w g, then of w g times the node's offset (0, 1, 2) along x, y
-            and z.
+    They go to ``scratch``, from entry ``at``: sum of w g, then of w g times the node's offset (0, 1, 2) along
+    x, y and z. LLVM vectorises what ends in consecutive stores, and only that.
     """
     for i in ti.static(range(3)):
         row = node + i * stride_x
@@ -189,21 +161,11 @@ def gather_adjoint(
 ):
     """What a particle's adjoint needs of the grid, in one pass over its stencil.
 
-    Args:
-        velocity: Field of grid velocities, 4-vectors whose last entry is ignored.
-        momentum_bar: Field of adjoints of the grid's momentum and mass, 4-vectors.
-        node: Index of the base node.
-        stride_x: Index distance of neighbours along x.
-        stride_y: Index distance of neighbours along y.
-        w: :func:`spline` weights.
-        dw: :func:`spline_slope`.
-        scratch: Field of 4-vectors. On entry, from ``at + 7``: the scattered affine field q (value at base
-            node and increments along x, y, z, with the mass at the end) and that of the velocity's adjoint
-            h, likewise, with 0 at the end. On return, from ``at``: moments of momentum_bar as in
-            :func:`gather`, then the sum over nodes of grad_f w (momentum_bar . q + velocity . h) as three
-            4-vectors, still to be summed over their entries. Entries 15 to 17 hold the weights along x,
-            their slopes and the offsets 0, 1, 2.
-        at: First entry in ``scratch``.
+    In ``scratch`` there is, from ``at + 7``, the scattered affine field q (value at base node and increments
+    along x, y, z, with the mass at the end) and that of the velocity's adjoint h, likewise, with 0 at the
+    end; then the weights along x, their slopes and the offsets 0, 1, 2. On return it holds, from ``at``,
+    moments of momentum_bar as in :func:`gather`, then the sum over nodes of grad_f w (momentum_bar . q +
+    velocity . h) as three 4-vectors, still to be summed over their entries.
     """
     zero = velocity[node] * 0.0
     for i in ti.static(range(7)):

@@ -16,13 +16,7 @@ from plab.targets.build import (
 )
 from plab.targets.files import MassTarget, PointsTarget
 from plab.targets.geometric import BodiesTarget, RingTarget, TargetBody
-from plab.targets.recipe import (
-    EPISODE_STEPS,
-    GeometricRecipe,
-    ScriptedRecipe,
-    TargetError,
-    TensorRecipe,
-)
+from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
 from plab.targets.store import load_release_target
 
 __all__ = [

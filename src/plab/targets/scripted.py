@@ -11,7 +11,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,12 +58,8 @@ class Track:
         return len(self._actions)
 
     def go(self, way: ArrayLike, steps: int = 1) -> None:
-        """Add a straight, even motion.
-
-        Args:
-            way: Motion in all, one entry per action component [domain units or radians].
-            steps: Environment steps to take at least; more if the way is too long for them.
-        """
+        """Add a straight, even motion, one entry per action component [domain units or radians], in so many
+        steps at least; in more if the way is too long for them."""
         way = np.asarray(way, dtype=float)
         # A component that cannot move has scale 0.
         share = np.divide(way, self._scale, out=np.zeros_like(way), where=self._scale > 0)
@@ -81,11 +76,8 @@ class Track:
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A].
-
-        Raises:
-            _TooLong: If the way takes longer than an episode.
-        """
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if the way takes
+        longer."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
@@ -143,8 +135,9 @@ class PressTarget(Script):
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
-        tool, (track, *_) = _mover(scene, 0), tracks
-        x, z = _draw(rng, "offset", self.offset, 2) * rng.choice([-1.0, 1.0], size=2)
+        tool, (track, *_) = _mover(scene), tracks
+        offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
+        x, z = offset * rng.choice([-1.0, 1.0], size=2)
         depth = _draw(rng, "depth", self.depth)
         height = tool.position[1] - _below(tool) - _top(scene.bodies[0])
         track.go([x, -height, z])
@@ -170,7 +163,7 @@ class DrawTarget(Script):
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
-        tool, (track, *_) = _mover(scene, 0), tracks
+        tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
         depth = _draw(rng, "depth", self.depth)
         track.go([0.0, _top(body) - depth - (tool.position[1] - _below(tool)), 0.0])
@@ -210,7 +203,7 @@ class DentTarget(Script):
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
-        tool, (track, *_) = _mover(scene, 0), tracks
+        tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
         centre, half = np.asarray(body.center), body.half_extent()
         radius = tool.size[0]
@@ -247,7 +240,7 @@ class RollTarget(Script):
 
     def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
-        tool, (track, *_) = _mover(scene, 0), tracks
+        tool, (track, *_) = _mover(scene), tracks
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
         angle = _draw(rng, "reach", self.reach) / ROLL_RADIUS
         side = rng.choice([-1.0, 1.0])
@@ -339,7 +332,7 @@ class PushTarget(Script):
         """See :meth:`Script.plan`."""
         if not 0 < self.legs <= len(scene.bodies):
             raise TargetError(f"target.legs must be in 1 .. {len(scene.bodies)}, not {self.legs}")
-        tool, (track, *_) = _mover(scene, 0), tracks
+        tool, (track, *_) = _mover(scene), tracks
         leg = scene.bodies[rng.integers(self.legs)]
         way = (np.asarray(leg.center) - np.asarray(tool.position)) * [1.0, 0.0, 1.0]
         length = float(np.linalg.norm(way))
@@ -351,17 +344,11 @@ class PushTarget(Script):
         track.delay()
 
 
-@overload
-def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float: ...
-@overload
-def _draw(rng: np.random.Generator, name: str, limits: Sequence[float], size: int) -> np.ndarray: ...
-def _draw(
-    rng: np.random.Generator, name: str, limits: Sequence[float], size: int | None = None
-) -> float | np.ndarray:
+def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
     """Draw uniformly from a range [low, high]; all of a recipe's ranges are checked here."""
     if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
         raise TargetError(f"target.{name} must be a range [low, high], not {list(limits)}")
-    return rng.uniform(limits[0], limits[1], size)
+    return rng.uniform(limits[0], limits[1])
 
 
 def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
@@ -371,9 +358,9 @@ def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
     return int(rng.integers(limits[0], limits[1] + 1))
 
 
-def _mover(scene: Scene, number: int) -> Manipulator:
-    """The manipulator with that number among those that can move."""
-    return [m for m in scene.manipulators if m.action_dim][number]
+def _mover(scene: Scene) -> Manipulator:
+    """The first manipulator that can move."""
+    return next(m for m in scene.manipulators if m.action_dim)
 
 
 def _top(body: Body) -> float:
@@ -390,13 +377,8 @@ def _below(tool: Manipulator) -> float:
 
 
 def _touch(half: np.ndarray, direction: np.ndarray, radius: float) -> float:
-    """Distance from a box's centre at which a sphere on its way there meets it [domain units].
-
-    Args:
-        half: Half of the box's edges, shape [3].
-        direction: Unit vector from the centre to the sphere, shape [3].
-        radius: The sphere's.
-    """
+    """Distance from the centre of a box, of half edges [3], at which a sphere meets it that comes from a
+    direction [3] [domain units]."""
     ways = np.linspace(0.0, np.linalg.norm(half) + radius, 1000)
     gaps = np.linalg.norm(np.maximum(ways[:, None] * np.abs(direction) - half, 0.0), axis=1)
     return float(np.interp(radius, gaps, ways))

@@ -48,12 +48,7 @@ class TargetStore:
         self._made_by = (simulator.precision, simulator.device)
 
     def path(self, scene: Scene, actions: np.ndarray) -> Path:
-        """Return the file of a target.
-
-        Args:
-            scene: The scene.
-            actions: The demonstration, shape [T, A].
-        """
+        """Return the file of the target that a demonstration, shape [T, A], makes of a scene."""
         # The length of later episodes has no part in it; a mesh is what its file holds.
         facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
         text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
