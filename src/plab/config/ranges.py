@@ -117,8 +117,7 @@ FRACTION, SHARE, UNIT = within(_fraction), within(_share), within(_unit)
 POINT, DECAYS = within(vector, 3), within(_decays)
 NAME, THREADS = within(folder_name), within(_threads)
 WIDTHS = within(lambda path, value: [at_least(path, width, 1) for width in value])
-"""Metadata of fields that have to be positive, at least 1, at least 0, finite and at least 0, in [0, 1), (0, 1] or
-[0, 1], three or two numbers, a folder's name, numbers of torch's threads or of a layer's units."""
+"""What fields have to be; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
 
 
 class Section:
