@@ -33,7 +33,7 @@ import numpy as np
 
 # Imported once for all processes, as far as that starts no threads and no device.
 import plab.runners.planners.planner
-import plab.runners.planners.stages
+import plab.runners.planners.sampling
 import plab.runners.population.runner
 import plab.runners.rl
 import plab.runners.trajectory  # noqa: F401

@@ -20,8 +20,7 @@ from plab.results.checking import problems
 from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
-from plab.runners.planners.cem import Cem
-from plab.runners.planners.sampling import actions_of, knots_of
+from plab.runners.planners.sampling import Cem, actions_of, knots_of
 from plab.runners.planners.starts import ContactStarts, support
 from plab.scene import Manipulator
 from plab.sim import Simulator

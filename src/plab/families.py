@@ -180,10 +180,10 @@ FAMILIES: dict[str, Family] = {
         contact="hard",
         rules={
             "multistart": Rule(f"{_PLANNERS}.multistart:Multistart", f"{_TYPES}:MultistartConfig"),
-            "cem": Rule(f"{_PLANNERS}.cem:Cem", f"{_TYPES}:CemConfig"),
-            "mppi": Rule(f"{_PLANNERS}.mppi:Mppi", f"{_TYPES}:MppiConfig"),
+            "cem": Rule(f"{_PLANNERS}.sampling:Cem", f"{_TYPES}:CemConfig"),
+            "mppi": Rule(f"{_PLANNERS}.sampling:Mppi", f"{_TYPES}:MppiConfig"),
             "cmaes": Rule(f"{_PLANNERS}.cmaes:Cmaes", f"{_TYPES}:CmaesConfig"),
-            "stages": Rule(f"{_PLANNERS}.stages:Stages", f"{_TYPES}:StagesConfig"),
+            "stages": Rule(f"{_PLANNERS}.planner:Stages", f"{_TYPES}:StagesConfig"),
         },
         methods={
             "multistart": Appearance("Multistart", "#6699CC"),

@@ -76,7 +76,7 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder, torch_settings(method.torch_threads):
         batch = EpisodeBatch([cfg] * method.num_envs, contact=method.contact)
         trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
-        trainer.set_logger(Logger(folder=None, output_formats=[]))
+        trainer.model.set_logger(Logger(folder=None, output_formats=[]))
         trainer.advance(CallbackList([]))
         with _timed(batch, trainer, seconds):
             start = time.perf_counter()

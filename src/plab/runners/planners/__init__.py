@@ -1,4 +1,4 @@
 """Planners: searches for a sequence of actions with many candidates, which a simulator tries together.
 
-One file per planner; :mod:`plab.runners.planners.planner` has what they share.
+:mod:`plab.runners.planners.planner` has what they share.
 """

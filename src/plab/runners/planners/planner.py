@@ -3,6 +3,12 @@
 A planner asks for candidates to be tried, by ``yield``, and is sent what they gave; the runner tries those of
 all runs of a batch together. Candidates, losses, scores and gradients are tensors on the simulator's device.
 A row of the results is the best candidate of an iteration, always in the hard contact model.
+
+``hybrid`` and ``solve`` are planners one after the other; which, in what order and with what numbers is in
+their YAML. To reproduce a result:
+
+    python -m plab.run task=Move variant=1 method=hybrid seed=0
+    python -m plab.run task=Move variant=1 method=solve seed=0
 """
 
 from __future__ import annotations
@@ -28,7 +34,7 @@ from plab.runners.runner import Runner, Step, Track
 from plab.scene import Scene
 from plab.sim.memory import batch_limit
 
-__all__ = ["Answer", "Asking", "Planner", "PlannerRunner", "Request", "Shown", "Start", "make_planner"]
+__all__ = ["Answer", "Asking", "Planner", "PlannerRunner", "Request", "Shown", "Stages", "Start"]
 
 
 @dataclass(frozen=True)
@@ -124,12 +130,8 @@ class Planner(ABC):
 
     @abstractmethod
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Make the first candidates.
-
-        Args:
-            random: Source of random numbers.
-            found: What the stage before has found, the best first, shape [N, T, A]; N is 0 if there is none.
-        """
+        """Make the first candidates; ``found``, shape [N, T, A], is of the stage before, the best first,
+        if any."""
 
     @abstractmethod
     def iterate(self, random: torch.Generator) -> Asking:
@@ -166,11 +168,7 @@ class Planner(ABC):
         return {"iteration": self.iteration, "memory": arrays}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`.
-
-        Raises:
-            ValueError: If it is that of another run.
-        """
+        """Return to a :meth:`state`; ValueError if it is that of another run."""
         self.iteration = int(state["iteration"])
         arrays, shapes = state.get("memory", {}), self.shapes()
         for name, array in arrays.items():
@@ -188,9 +186,41 @@ class Planner(ABC):
         return {"champion": self.start.shape, "cost": ()}
 
 
-def make_planner(method: MethodConfig, start: Start) -> Any:
+def _make_planner(method: MethodConfig, start: Start) -> Any:
     """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
     return family(method.family).rule(getattr(method, "algorithm"), type)(method, start)  # noqa: B009
+
+
+class Stages:
+    """Does what a planner does, by the stage that it is in."""
+
+    def __init__(self, method: StagesConfig, start: Start) -> None:
+        """Stand before the first stage."""
+        self._methods, self._start = list(method.stages.values()), start
+        self._enter(0)
+
+    def plan(self, random: torch.Generator) -> Asking:
+        """Do the next iteration, if need be of the next stage."""
+        found = None
+        if self._planner.iteration == self._planner.method.iterations:
+            found = self._planner.found()
+            self._enter(self._stage + 1)
+        return (yield from self._planner.plan(random, found))
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next iterations depend on."""
+        return {"stage": self._stage, "planner": self._planner.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`."""
+        if not 0 <= int(state["stage"]) < len(self._methods):
+            raise ValueError(f"it has no stage {int(state['stage'])}")
+        self._enter(int(state["stage"]))
+        self._planner.restore(state["planner"])
+
+    def _enter(self, stage: int) -> None:
+        self._stage = stage
+        self._planner: Planner = _make_planner(self._methods[stage], self._start)
 
 
 class PlannerRunner(Runner):
@@ -221,7 +251,7 @@ class PlannerRunner(Runner):
         """Make the run's planner, as the file knows it if it does."""
         number = track.number
         start = Start(self.problem.scenes[number], self.problem.target_mass[number], self._device)
-        self._planners[number] = make_planner(track.cfg.method, start)
+        self._planners[number] = _make_planner(track.cfg.method, start)
         if state is not None:
             self._planners[number].restore(state)
 
@@ -289,11 +319,9 @@ class PlannerRunner(Runner):
     def _try_part(
         self, requests: Mapping[Track, Request], begin: int, first: Request, reasons: dict[int, str]
     ) -> dict[str, Tensor]:
-        """Try as many candidates of each run as there are environments for, from candidate ``begin`` on.
-
-        Returns:
-            What they gave by name, shape [candidate, run, ...]; in ``reasons``, by run, why one broke off.
-        """
+        """Try as many candidates of each run as there are environments for, from candidate ``begin`` on;
+        return what they gave, shape [candidate, run, ...], and note in ``reasons``, by run, why one broke
+        off."""
         width, runs = self._width, len(self.tracks)
         tried = torch.zeros((width, runs, *first.actions.shape[1:]), dtype=torch.float64, device=self._device)
         for track, request in requests.items():

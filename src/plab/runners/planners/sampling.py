@@ -1,4 +1,12 @@
-"""What the planners share that need no gradient: curves through a few points, drawn and ranked."""
+"""Planners that need no gradient: curves through a few points, drawn and ranked.
+
+``cem``, the cross-entropy method, fits a normal distribution to the best. ``mppi``, model-predictive path
+integral, takes the mean of all, weighted by exp(-cost); it plans a whole episode: the simulator is
+deterministic, so that planning anew on the way would gain nothing. To reproduce a result:
+
+    python -m plab.run task=Move variant=1 method=cem seed=0
+    python -m plab.run task=Move variant=1 method=mppi seed=0
+"""
 
 from __future__ import annotations
 
@@ -8,23 +16,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from plab.config import SamplerConfig
+from plab.config import CemConfig, MppiConfig, SamplerConfig
 from plab.runners.planners.planner import Asking, Planner, Request
 
-__all__ = ["Sampler", "actions_of", "knots_of"]
+__all__ = ["Cem", "Mppi", "Sampler", "actions_of", "knots_of"]
 
 
 def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
-    """Return the actions of curves.
-
-    Args:
-        knots: Points, evenly spaced in time, shape [P, K, A].
-        steps: Environment steps T.
-        curve: ``constant`` or ``linear``.
-
-    Returns:
-        Actions in [-1, 1], shape [P, T, A].
-    """
+    """Return the actions, shape [P, T, A], in [-1, 1], of ``constant`` or ``linear`` curves through points
+    evenly spaced in time, shape [P, K, A]."""
     by_component = knots.transpose(1, 2)
     if curve == "constant":
         drawn = functional.interpolate(by_component, size=steps, mode="nearest")
@@ -40,12 +40,8 @@ def knots_of(actions: Tensor, knots: int) -> Tensor:
 
 
 class Sampler(Planner):
-    """Draws curves, has them tried, and learns from what they cost; first the starts, then around the best.
-
-    Attributes:
-        method: Its numbers.
-        knots: Points K of a curve.
-    """
+    """Draws curves, has them tried, and learns from what they cost; first the starts, then around the
+    best."""
 
     method: SamplerConfig
 
@@ -110,3 +106,46 @@ class Sampler(Planner):
         """Draw standard normal numbers, shape [P, K, A]."""
         size = (self.method.population, self.knots, self.start.shape[1])
         return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
+
+
+class Cem(Sampler):
+    """Mean and standard deviation of each point follow those of the elites."""
+
+    method: CemConfig
+
+    def settle(self, point: Tensor) -> None:
+        """Begin to draw around a curve."""
+        self.memory |= {"mean": point.clone(), "std": torch.full_like(point, self.method.spread)}
+
+    def sample(self, random: torch.Generator) -> Tensor:
+        """Draw every point on its own."""
+        return self.memory["mean"] + self.memory["std"] * self.noise(random)
+
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        """Move mean and spread towards the elites'."""
+        elites = points[cost.argsort(stable=True)[: self.method.elites]]
+        mean, std = elites.mean(0), elites.std(0).clamp(min=self.method.least_spread)
+        self.memory["mean"] = torch.lerp(mean, self.memory["mean"], self.method.smoothing)
+        self.memory["std"] = torch.lerp(std, self.memory["std"], self.method.smoothing)
+
+
+class Mppi(Sampler):
+    """Only the mean is learnt; the spread falls by the clock."""
+
+    method: MppiConfig
+
+    def settle(self, point: Tensor) -> None:
+        """Begin to draw around a curve."""
+        self.memory["mean"] = point.clone()
+
+    def sample(self, random: torch.Generator) -> Tensor:
+        """Draw every point on its own."""
+        spread = self.method.spread * self.method.decay ** (self.iteration - 1)
+        return self.memory["mean"] + spread * self.noise(random)
+
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        """Weigh the curves by their costs, in units of the costs' standard deviation."""
+        through = cost[cost.isfinite()]
+        scale = through.std(correction=0).clamp(min=1e-12) * self.method.temperature
+        weights = torch.softmax(-(cost - through.min()) / scale, dim=0)
+        self.memory["mean"] = (weights[:, None, None] * points).sum(0)

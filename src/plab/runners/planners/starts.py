@@ -54,12 +54,8 @@ _SUPPORT: dict[str, Callable[[Sequence[float], np.ndarray], float]] = {
 
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
-    """Return how far a manipulator, as it stands at the start, reaches from its position in a direction.
-
-    Args:
-        tool: The manipulator; chopsticks, which hold between them what they are to carry, reach no farther.
-        direction: Unit vector [3].
-    """
+    """Return how far a manipulator, as it stands at the start, reaches from its position in a direction, a
+    unit vector [3]; chopsticks, which hold between them what they are to carry, reach no farther."""
     reach = _SUPPORT.get(tool.shape)
     return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
 
@@ -73,15 +69,7 @@ class ContactStarts:
         self._tools = [m for m in scene.manipulators if m.action_dim]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
-        """Draw starts, pushing and carrying in turn.
-
-        Args:
-            count: How many.
-            seed: Seed of the draws.
-
-        Returns:
-            Actions in [-1, 1], shape [count, T, A].
-        """
+        """Draw starts, pushing and carrying in turn: actions in [-1, 1], shape [count, T, A]."""
         rng = np.random.default_rng(seed)
         return np.stack([(self._carry if k % 2 else self._push)(rng) for k in range(count)])
 
