@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from plab.config.method import *
     from plab.config.planners import *
     from plab.config.run import *
-    from plab.config.suite import *
+    from plab.config.suite import conf_folder
     from plab.config.task import *
 
 __all__ = [

@@ -105,6 +105,11 @@ def _decays(path: str, value: Sequence[float]) -> None:
         _fraction(path, decay)
 
 
+def _widths(path: str, value: Sequence[int]) -> None:
+    for width in value:
+        at_least(path, width, 1)
+
+
 def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str, Any]:
     """Return the metadata of a field of a :class:`Section` that a function of this module is to check."""
     return {"check": lambda path, value: check(path, value, *limits, **options)}
@@ -115,8 +120,7 @@ COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
 FINITE = within(at_least, 0, finite=True)
 FRACTION, SHARE, UNIT = within(_fraction), within(_share), within(_unit)
 POINT, DECAYS = within(vector, 3), within(_decays)
-NAME, THREADS = within(folder_name), within(_threads)
-WIDTHS = within(lambda path, value: [at_least(path, width, 1) for width in value])
+NAME, THREADS, WIDTHS = within(folder_name), within(_threads), within(_widths)
 """What fields have to be; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
 
 
