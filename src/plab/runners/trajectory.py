@@ -64,9 +64,9 @@ class TrajectoryRunner(Runner):
             sequence = self._sequences[number]
             sequence.step(gradient)
             measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
-            budget = {"steps_forward": 0, "steps_gradient": len(gradient)}
+            done = measured, tried[number], sequence.state()
             seconds = share + time.perf_counter() - start
-            yield track, Step(measured, tried[number], sequence.state(), seconds=seconds, **budget)
+            yield track, Step(*done, steps_forward=0, steps_gradient=len(gradient), seconds=seconds)
 
 
 class UpdateRule:
