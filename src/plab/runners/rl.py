@@ -22,7 +22,7 @@ from stable_baselines3.common.policies import BasePolicy
 from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import PolicyRunner, policy_episode, shared_batches
+from plab.runners.environments import PolicyEpisode, PolicyRunner, policy_episode, shared_batches
 from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
 from plab.runners.policy import save_policy
@@ -71,12 +71,16 @@ class RlRunner(PolicyRunner):
         if track.iteration > 0:
             self._train(trainer, track)
             self.enter("evaluate")
-        done = policy_episode(self._evaluation, trainer.predict)
+        done = self.episode(trainer)
         measured = done.measures | trainer.take_statistics()
         simulated = trainer.steps - before + len(done.actions)
         # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
         counts = trainer.episodes, trainer.steps, simulated
         return Step(measured, done.actions, trainer.state(), *counts, keep=True)
+
+    def episode(self, trainer: Trainer) -> PolicyEpisode:
+        """Run an episode of the deterministic policy."""
+        return policy_episode(self._evaluation, trainer.predict)
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
