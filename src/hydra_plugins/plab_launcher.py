@@ -36,15 +36,8 @@ class BatchSweeper(BasicSweeper):
     """
 
     def __init__(self, max_batch_size: int | None, params: dict[str, Any] | None = None) -> None:
-        """Keep the settings.
-
-        Args:
-            max_batch_size: Jobs that go to the launcher at a time, at most; all if None.
-            params: Values of keys, as on the command line.
-
-        Raises:
-            plab.config.ConfigError: If they are of the wrong type.
-        """
+        """Keep the settings: jobs that go to the launcher at a time, at most, all if None, and values of
+        keys, as on the command line; ConfigError if they are of the wrong type."""
         from plab.config import ConfigError
 
         if max_batch_size is not None and (type(max_batch_size) is not int or max_batch_size < 1):
@@ -61,11 +54,7 @@ class BatchSweeper(BasicSweeper):
         return quote_folders(super()._parse_config())
 
     def sweep(self, arguments: list[str]) -> Any:
-        """Run the sweep.
-
-        Raises:
-            plab.config.ConfigError: If it has no jobs, or too many.
-        """
+        """Run the sweep; ConfigError if it has no jobs, or too many."""
         from plab.config import ConfigError
         from plab.config.words import parse, require_few
         from plab.results.files import make_folder, remove_folders
@@ -139,7 +128,8 @@ class BatchLauncher(Launcher):
                 "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, as by "
                 "hydra/launcher=batch_joblib"
             )
-        entries = compose_jobs(job_overrides, self._compose)
+        load = self._context.config_loader.load_sweep_config
+        entries = compose_jobs(job_overrides, lambda overrides: load(self._config, overrides))
         refused = [entry for entry in entries if isinstance(entry, Refused)]
         if len(refused) == len(entries) and len({entry.reason for entry in refused}) == 1:
             # A mistake in what all jobs have in common.
@@ -164,10 +154,8 @@ class BatchLauncher(Launcher):
         for one in run_sweep(list(cfgs.values()), carry, self._size, processes):
             tally.outcomes.append(one)
             scores[one.path] = one.score
-        return [_job_return(scores[paths[n]] if n in paths else math.nan) for n in range(len(entries))]
-
-    def _compose(self, overrides: list[str]) -> DictConfig:
-        return self._context.config_loader.load_sweep_config(self._config, overrides)
+        values = [scores[paths[n]] if n in paths else math.nan for n in range(len(entries))]
+        return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
 
     def _carry_elsewhere(
         self, overrides: dict[str, Sequence[str]]
@@ -210,7 +198,3 @@ def _processes(inner: DictConfig) -> int:
         return 1
     # As joblib counts: -1 is one for each core.
     return wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
-
-
-def _job_return(value: Any) -> JobReturn:
-    return JobReturn(_return_value=value, status=JobStatus.COMPLETED)

@@ -71,7 +71,7 @@ def measure(cfg: Config, batches: int) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder, torch_settings(method.torch_threads):
         batch = EpisodeBatch([cfg] * method.num_envs, contact=method.contact)
         trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
-        trainer.set_logger(Logger(folder=None, output_formats=[]))
+        trainer.model.set_logger(Logger(folder=None, output_formats=[]))
         trainer.advance(CallbackList([]))
         simulator, model = batch.problem.simulator, trainer.model
         parts: list[tuple[Any, str, str]] = [(simulator, name, part) for name, part in SIMULATOR_PARTS]

@@ -10,49 +10,12 @@ from typing import TYPE_CHECKING, Any
 from plab.errors import ConfigError
 
 if TYPE_CHECKING:
-    from plab.config.compose import (
-        EXPERIMENT,
-        GROUPS,
-        build_scene,
-        check_overrides,
-        choices,
-        drawn_configs,
-        finish,
-        load_config,
-        variant_task,
-    )
-    from plab.config.method import (
-        CONTACTS,
-        DEVICES,
-        ApgConfig,
-        MethodConfig,
-        OffPolicyConfig,
-        PpoConfig,
-        RlConfig,
-        SacConfig,
-        ShacConfig,
-        Td3Config,
-        TrajectoryConfig,
-    )
-    from plab.config.planners import (
-        CemConfig,
-        CmaesConfig,
-        MppiConfig,
-        MultistartConfig,
-        PlannerConfig,
-        SamplerConfig,
-        StagesConfig,
-    )
-    from plab.config.run import PRECISIONS, Config, ProtocolConfig, SimConfig, TargetsConfig
+    from plab.config.compose import *
+    from plab.config.method import *
+    from plab.config.planners import *
+    from plab.config.run import *
     from plab.config.suite import conf_folder
-    from plab.config.task import (
-        BodyConfig,
-        DrawConfig,
-        ManipulatorConfig,
-        RandomConfig,
-        RangeConfig,
-        TaskConfig,
-    )
+    from plab.config.task import *
 
 __all__ = [
     "CONTACTS",

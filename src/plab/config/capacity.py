@@ -26,16 +26,9 @@ _CANDIDATES = 3 * 8
 
 
 def check_size(cfg: Config, scene: Scene, environments: int = 1) -> None:
-    """Refuse a configuration that needs more memory than there is.
-
-    Args:
-        cfg: The configuration.
-        scene: Its scene.
-        environments: How many are simulated together, beside what the method says.
-
-    Raises:
-        ConfigError: If it does; names the key that takes the most, and the largest value that would do.
-    """
+    """Raise ConfigError for a configuration that needs more memory than there is; names the key that takes
+    the most, and the largest value that would do. ``environments`` are simulated together, beside what the
+    method says."""
     method = cfg.method
     values, smallest = _values(cfg.sim, method)
     base = scene.particle_count / cfg.sim.particles_scale

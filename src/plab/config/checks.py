@@ -15,13 +15,8 @@ __all__ = ["check_device", "check_packages", "check_sources", "cuda_devices", "c
 
 
 def check_sources(cfg: Config) -> None:
-    """Find mistakes in the scene and in what the target comes from.
-
-    Raises:
-        plab.config.ConfigError: If the variant does not exist.
-        plab.scene.SceneError: If the scene cannot be simulated.
-        plab.targets.TargetError: If the target cannot be built or read.
-    """
+    """Find mistakes in the scene and in what the target comes from: ConfigError, SceneError or
+    TargetError."""
     scene, source = build_scene(cfg), cfg.targets.source
     if source is None:
         check_target(scene, cfg.task.target)
@@ -30,21 +25,13 @@ def check_sources(cfg: Config) -> None:
 
 
 def check_device(cfg: Config) -> None:
-    """Find out whether this computer has the device.
-
-    Raises:
-        plab.config.ConfigError: If not.
-    """
+    """Raise ConfigError unless this computer has the device."""
     if cfg.sim.device == "cuda" and not cuda_is_usable():
         raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
 
 
 def check_packages(cfg: Config) -> None:
-    """Find out whether the optional packages that a run uses are installed.
-
-    Raises:
-        plab.config.ConfigError: If not.
-    """
+    """Raise ConfigError unless the optional packages that a run uses are installed."""
     if cfg.logger != "none" and find_spec(cfg.logger) is None:
         name = {"tensorboard": "TensorBoard", "wandb": "Weights & Biases"}[cfg.logger]
         raise ConfigError(f"logger={cfg.logger} needs {name}: pip install 'plab[{cfg.logger}]'")

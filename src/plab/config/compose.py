@@ -85,16 +85,8 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Refuse a folder that is missing, or that has a file that is no text, or one with a name of plab's own.
-
-    Hydra would ignore the latter.
-
-    Args:
-        config_dir: Folder with files of the user's own, in subfolders named like the groups.
-
-    Raises:
-        ConfigError: If the folder does not do.
-    """
+    """Raise ConfigError for a folder of the user's that is missing, or that has a file that is no text, or
+    one with a name of plab's own, which Hydra would ignore."""
     if not isinstance(config_dir, str | Path):
         raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
     if not str(config_dir).strip():
@@ -122,13 +114,16 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         ConfigError: If an override or a file does not fit.
     """
     overrides = quote_folders(word_list(overrides))
-    surrounding = GlobalHydra.instance().hydra
+    surrounding, searched = GlobalHydra.instance().hydra, list[str]()
     try:
         check_overrides(overrides, config_dir)
+        if config_dir is not None:
+            quoted = str(Path(config_dir).resolve()).replace("'", "\\'")
+            searched = [f"hydra.searchpath=['file://{quoted}']"]
         # Composing must work inside a Hydra application, too, and leave it as it was.
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            composed = compose("config", overrides=[*overrides, *_searchpath(config_dir)])
+            composed = compose("config", overrides=[*overrides, *searched])
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
     except ConfigError:
@@ -163,14 +158,6 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
         )
     drawn = (load_config([f"task={name}", "variant=random", f"seed_scene={seed}"]) for seed in seeds)
     return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
-
-
-def _searchpath(config_dir: str | Path | None) -> list[str]:
-    """Return the override that makes Hydra look for files in one more folder."""
-    if config_dir is None:
-        return []
-    quoted = str(Path(config_dir).resolve()).replace("'", "\\'")
-    return [f"hydra.searchpath=['file://{quoted}']"]
 
 
 def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> None:
@@ -325,11 +312,8 @@ def build_scene(cfg: Config) -> Scene:
 
 def _typed_method(method: DictConfig) -> DictConfig:
     """Return the section ``method`` with the types of its family, unless its YAML has chosen them.
-
-    Raises:
-        ConfigError: If there is no such family, or the section is of the type of another one.
-        omegaconf.errors.OmegaConfBaseException: If a key or a value does not fit.
-    """
+    ConfigError if there is no such family, or the section is of another one's type; an
+    OmegaConfBaseException if a key or a value does not fit."""
     if not isinstance(method, DictConfig) or "family" not in method:
         raise ConfigError("method.family has no value: name the family, or its module:NAME")
     record, rule = family(str(method.family)), method.get("algorithm")
@@ -392,8 +376,7 @@ def _choose_profile(method: DictConfig) -> None:
     if "profiles" not in method or (method.profile is None and not method.profiles):
         return
     if method.profile not in method.profiles:
-        names = [str(name) for name in method.profiles]
-        chosen = str(method.profile)
+        chosen, names = str(method.profile), [str(name) for name in method.profiles]
         raise ConfigError(f"method.profile '{chosen}' does not exist; {pick(chosen, names)}")
     OmegaConf.resolve(method)
     method.profiles = {}

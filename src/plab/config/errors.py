@@ -35,14 +35,8 @@ LAUNCHER_EXTRAS = {
 
 
 def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:
-    """Return one line that says what is wrong with a configuration.
-
-    Args:
-        error: What composing it raised.
-
-    Returns:
-        The line, without a full stop.
-    """
+    """Return one line, without a full stop, on what is wrong with a configuration whose composition raised
+    an error."""
     if isinstance(error, RecursionError):
         return (
             "the configuration refers to itself, or is nested too deeply: look at defaults, ${...}, brackets"

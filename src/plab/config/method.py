@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from plab.config.ranges import (
-    at_least,
-    folder_name,
-    fraction,
-    one_of,
-    positive,
-    share,
-    threads,
-    unit,
-    vector,
-    widths,
-)
+from plab.config import ranges
 from plab.errors import ConfigError
 from plab.families import family
 from plab.losses.registry import check_terms
@@ -40,7 +29,7 @@ CONTACTS = ("soft", "hard")
 
 
 @dataclass
-class MethodConfig:
+class MethodConfig(ranges.Section):
     """What all methods have in common; a family of methods adds its own keys in a subclass.
 
     Attributes:
@@ -55,20 +44,18 @@ class MethodConfig:
             own as ``module:Class``.
     """
 
-    name: str
+    name: str = field(metadata=ranges.NAME)
     family: str
-    contact: str
-    softness: float
+    contact: str = field(metadata=ranges.within(ranges.one_of, CONTACTS))
+    softness: float = field(metadata=ranges.POSITIVE)
     loss_weights: dict[str, float]
     loss_terms: dict[str, str]
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        folder_name(f"{path}.name", self.name)
-        one_of(f"{path}.contact", self.contact, CONTACTS)
-        positive(f"{path}.softness", self.softness)
+        super().check(path)
         for name, weight in self.loss_weights.items():
-            at_least(f"{path}.loss_weights.{name}", weight, 0, finite=True)
+            ranges.at_least(f"{path}.loss_weights.{name}", weight, 0, finite=True)
         check_terms(self.loss_weights, self.loss_terms)
         if not any(self.loss_weights.values()):
             raise ConfigError(f"{path}.loss_weights are all 0: at least one must be positive")
@@ -95,31 +82,21 @@ class TrajectoryConfig(MethodConfig):
     """
 
     optimizer: str
-    lr: float
+    lr: float = field(metadata=ranges.POSITIVE)
     lr_by_task: dict[str, Any]
     contact_by_task: dict[str, Any]
-    betas: list[float]
-    eps: float
-    momentum: float
-    max_gradient_norm: float | None
+    betas: list[float] = field(metadata=ranges.DECAYS)
+    eps: float = field(metadata=ranges.POSITIVE)
+    momentum: float = field(metadata=ranges.FRACTION)
+    max_gradient_norm: float | None = field(metadata=ranges.POSITIVE)
     max_gradient_norm_by_numbers: dict[str, Any]
-    iterations: int
-    action_init: float
+    iterations: int = field(metadata=ranges.COUNT)
+    action_init: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
-        positive(f"{path}.lr", self.lr)
-        vector(f"{path}.betas", self.betas, 2)
-        for beta in self.betas:
-            fraction(f"{path}.betas", beta)
-        positive(f"{path}.eps", self.eps)
-        fraction(f"{path}.momentum", self.momentum)
-        if self.max_gradient_norm is not None:
-            positive(f"{path}.max_gradient_norm", self.max_gradient_norm)
-        at_least(f"{path}.iterations", self.iterations, 1)
-        unit(f"{path}.action_init", self.action_init)
+        ranges.one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
 
 
 @dataclass
@@ -133,18 +110,10 @@ class ApgConfig(MethodConfig):
         torch_threads: CPU threads of torch.
     """
 
-    lr: float
-    iterations: int
-    hidden: list[int]
-    torch_threads: int
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        positive(f"{path}.lr", self.lr)
-        at_least(f"{path}.iterations", self.iterations, 1)
-        widths(f"{path}.hidden", self.hidden)
-        threads(f"{path}.torch_threads", self.torch_threads)
+    lr: float = field(metadata=ranges.POSITIVE)
+    iterations: int = field(metadata=ranges.COUNT)
+    hidden: list[int] = field(metadata=ranges.WIDTHS)
+    torch_threads: int = field(metadata=ranges.THREADS)
 
 
 @dataclass
@@ -167,27 +136,20 @@ class RlConfig(MethodConfig):
 
     algorithm: str
     profile: str | None
-    episodes: int
-    num_envs: int
-    evaluate_every: int
-    torch_device: str
-    torch_threads: int
-    lr: float
-    gamma: float
-    hidden: list[int]
+    episodes: int = field(metadata=ranges.COUNT)
+    num_envs: int = field(metadata=ranges.COUNT)
+    evaluate_every: int = field(metadata=ranges.COUNT)
+    torch_device: str = field(metadata=ranges.within(ranges.one_of, DEVICES))
+    torch_threads: int = field(metadata=ranges.THREADS)
+    lr: float = field(metadata=ranges.POSITIVE)
+    gamma: float = field(metadata=ranges.SHARE)
+    hidden: list[int] = field(metadata=ranges.WIDTHS)
     profiles: dict[str, Any]
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-        for name in ("episodes", "num_envs", "evaluate_every"):
-            at_least(f"{path}.{name}", getattr(self, name), 1)
-        threads(f"{path}.torch_threads", self.torch_threads)
-        one_of(f"{path}.torch_device", self.torch_device, DEVICES)
-        positive(f"{path}.lr", self.lr)
-        share(f"{path}.gamma", self.gamma)
-        widths(f"{path}.hidden", self.hidden)
+        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
 
 
 @dataclass
@@ -203,20 +165,17 @@ class OffPolicyConfig(RlConfig):
     """
 
     buffer_size: int
-    batch_size: int
-    learning_starts: int
-    tau: float
+    batch_size: int = field(metadata=ranges.COUNT)
+    learning_starts: int = field(metadata=ranges.NOT_NEGATIVE)
+    tau: float = field(metadata=ranges.SHARE)
     gradient_steps: int
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        at_least(f"{path}.buffer_size", self.buffer_size, self.num_envs)
-        at_least(f"{path}.batch_size", self.batch_size, 1)
-        at_least(f"{path}.learning_starts", self.learning_starts, 0)
-        share(f"{path}.tau", self.tau)
+        ranges.at_least(f"{path}.buffer_size", self.buffer_size, self.num_envs)
         if self.gradient_steps != -1:
-            at_least(f"{path}.gradient_steps", self.gradient_steps, 1)
+            ranges.at_least(f"{path}.gradient_steps", self.gradient_steps, 1)
 
 
 @dataclass
@@ -235,17 +194,10 @@ class Td3Config(OffPolicyConfig):
         policy_delay: Critic updates per update of the actor.
     """
 
-    exploration_noise: float
-    target_noise: float
-    target_noise_clip: float
-    policy_delay: int
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        for name in ("exploration_noise", "target_noise", "target_noise_clip"):
-            at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)
-        at_least(f"{path}.policy_delay", self.policy_delay, 1)
+    exploration_noise: float = field(metadata=ranges.FINITE)
+    target_noise: float = field(metadata=ranges.FINITE)
+    target_noise_clip: float = field(metadata=ranges.FINITE)
+    policy_delay: int = field(metadata=ranges.COUNT)
 
 
 @dataclass
@@ -265,27 +217,16 @@ class ShacConfig(RlConfig):
         max_gradient_norm: Longer gradients are scaled down to this norm.
     """
 
-    scenes: int
-    window: int
-    value_lr: float
+    scenes: int = field(metadata=ranges.NOT_NEGATIVE)
+    window: int = field(metadata=ranges.COUNT)
+    value_lr: float = field(metadata=ranges.POSITIVE)
     lr_decay: bool
-    td_lambda: float
-    tau: float
-    value_epochs: int
-    minibatches: int
-    noise: float
-    max_gradient_norm: float
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        at_least(f"{path}.scenes", self.scenes, 0)
-        for name in ("window", "value_epochs", "minibatches"):
-            at_least(f"{path}.{name}", getattr(self, name), 1)
-        for name in ("value_lr", "noise", "max_gradient_norm"):
-            positive(f"{path}.{name}", getattr(self, name))
-        unit(f"{path}.td_lambda", self.td_lambda)
-        share(f"{path}.tau", self.tau)
+    td_lambda: float = field(metadata=ranges.UNIT)
+    tau: float = field(metadata=ranges.SHARE)
+    value_epochs: int = field(metadata=ranges.COUNT)
+    minibatches: int = field(metadata=ranges.COUNT)
+    noise: float = field(metadata=ranges.POSITIVE)
+    max_gradient_norm: float = field(metadata=ranges.POSITIVE)
 
 
 @dataclass
@@ -315,39 +256,27 @@ class PpoConfig(RlConfig):
     """
 
     lr_decay: bool
-    steps_per_update: int
-    minibatches: int
-    epochs: int
-    gae_lambda: float
-    clip_range: float
-    value_clip_range: float | None
-    value_coefficient: float
-    entropy_coefficient: float
+    steps_per_update: int = field(metadata=ranges.within(ranges.at_least, 2))
+    minibatches: int = field(metadata=ranges.COUNT)
+    epochs: int = field(metadata=ranges.COUNT)
+    gae_lambda: float = field(metadata=ranges.UNIT)
+    clip_range: float = field(metadata=ranges.POSITIVE)
+    value_clip_range: float | None = field(metadata=ranges.POSITIVE)
+    value_coefficient: float = field(metadata=ranges.FINITE)
+    entropy_coefficient: float = field(metadata=ranges.FINITE)
     entropy_mean: bool
-    max_gradient_norm: float
-    adam_eps: float
+    max_gradient_norm: float = field(metadata=ranges.POSITIVE)
+    adam_eps: float = field(metadata=ranges.POSITIVE)
     normalise: bool
-    statistics_episodes: int | None
+    statistics_episodes: int | None = field(metadata=ranges.COUNT)
     bootstrap: bool
-    policy_gain: float
-    value_gain: float
+    policy_gain: float = field(metadata=ranges.POSITIVE)
+    value_gain: float = field(metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         # Advantages are standardised: a minibatch needs two of them.
-        at_least(f"{path}.steps_per_update", self.steps_per_update, 2)
-        at_least(f"{path}.minibatches", self.minibatches, 1)
         if self.minibatches > self.steps_per_update // 2:
             most = self.steps_per_update // 2
             raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
-        at_least(f"{path}.epochs", self.epochs, 1)
-        unit(f"{path}.gae_lambda", self.gae_lambda)
-        for name in ("clip_range", "max_gradient_norm", "adam_eps", "policy_gain", "value_gain"):
-            positive(f"{path}.{name}", getattr(self, name))
-        if self.value_clip_range is not None:
-            positive(f"{path}.value_clip_range", self.value_clip_range)
-        if self.statistics_episodes is not None:
-            at_least(f"{path}.statistics_episodes", self.statistics_episodes, 1)
-        for name in ("value_coefficient", "entropy_coefficient"):
-            at_least(f"{path}.{name}", getattr(self, name), 0, finite=True)

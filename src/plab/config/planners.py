@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from plab.config import ranges
 from plab.config.method import MethodConfig
-from plab.config.ranges import at_least, fraction, one_of, positive, unit, vector
 from plab.errors import ConfigError
 from plab.families import family
 
@@ -40,21 +40,16 @@ class PlannerConfig(MethodConfig):
     """
 
     algorithm: str
-    iterations: int
-    population: int
-    objective: str
-    action_init: float
-    contact_starts: float
+    iterations: int = field(metadata=ranges.COUNT)
+    population: int = field(metadata=ranges.within(ranges.at_least, 4))
+    objective: str = field(metadata=ranges.within(ranges.one_of, OBJECTIVES))
+    action_init: float = field(metadata=ranges.UNIT)
+    contact_starts: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-        at_least(f"{path}.iterations", self.iterations, 1)
-        at_least(f"{path}.population", self.population, 4)
-        one_of(f"{path}.objective", self.objective, OBJECTIVES)
-        for name in ("action_init", "contact_starts"):
-            unit(f"{path}.{name}", getattr(self, name))
+        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
 
 
 @dataclass
@@ -68,16 +63,9 @@ class SamplerConfig(PlannerConfig):
         spread: Standard deviation of the first draws around the best start, of each point.
     """
 
-    knots: int
-    curve: str
-    spread: float
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        at_least(f"{path}.knots", self.knots, 1)
-        one_of(f"{path}.curve", self.curve, CURVES)
-        positive(f"{path}.spread", self.spread)
+    knots: int = field(metadata=ranges.COUNT)
+    curve: str = field(metadata=ranges.within(ranges.one_of, CURVES))
+    spread: float = field(metadata=ranges.POSITIVE)
 
 
 @dataclass
@@ -90,20 +78,17 @@ class CemConfig(SamplerConfig):
         least_spread: The spread falls no lower.
     """
 
-    elites: int
-    smoothing: float
-    least_spread: float
+    elites: int = field(metadata=ranges.within(ranges.at_least, 2))
+    smoothing: float = field(metadata=ranges.FRACTION)
+    least_spread: float = field(metadata=ranges.FINITE)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
-        at_least(f"{path}.elites", self.elites, 2)
         if self.elites > self.population:
             raise ConfigError(
                 f"{path}.elites must be at most population = {self.population}, not {self.elites}"
             )
-        fraction(f"{path}.smoothing", self.smoothing)
-        at_least(f"{path}.least_spread", self.least_spread, 0, finite=True)
 
 
 @dataclass
@@ -116,14 +101,8 @@ class MppiConfig(SamplerConfig):
         decay: The spread is multiplied by this after each iteration.
     """
 
-    temperature: float
-    decay: float
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
-        super().check(path)
-        positive(f"{path}.temperature", self.temperature)
-        unit(f"{path}.decay", self.decay)
+    temperature: float = field(metadata=ranges.POSITIVE)
+    decay: float = field(metadata=ranges.UNIT)
 
 
 @dataclass
@@ -148,12 +127,12 @@ class MultistartConfig(PlannerConfig):
     """
 
     lrs: list[float]
-    betas: list[float]
-    eps: float
-    updates: int
-    softness_end: float | None
-    replace_every: int
-    fresh: float
+    betas: list[float] = field(metadata=ranges.DECAYS)
+    eps: float = field(metadata=ranges.POSITIVE)
+    updates: int = field(metadata=ranges.COUNT)
+    softness_end: float | None = field(metadata=ranges.POSITIVE)
+    replace_every: int = field(metadata=ranges.COUNT)
+    fresh: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
@@ -161,18 +140,9 @@ class MultistartConfig(PlannerConfig):
         if not self.lrs:
             raise ConfigError(f"{path}.lrs is empty: give one learning rate at least")
         for lr in self.lrs:
-            positive(f"{path}.lrs", lr)
-        vector(f"{path}.betas", self.betas, 2)
-        for beta in self.betas:
-            fraction(f"{path}.betas", beta)
-        positive(f"{path}.eps", self.eps)
-        at_least(f"{path}.updates", self.updates, 1)
-        at_least(f"{path}.replace_every", self.replace_every, 1)
-        unit(f"{path}.fresh", self.fresh)
-        if self.softness_end is not None:
-            positive(f"{path}.softness_end", self.softness_end)
-            if self.contact == "hard":
-                raise ConfigError(f"{path}.softness_end has no effect with contact=hard: leave it out")
+            ranges.positive(f"{path}.lrs", lr)
+        if self.softness_end is not None and self.contact == "hard":
+            raise ConfigError(f"{path}.softness_end has no effect with contact=hard: leave it out")
 
 
 @dataclass

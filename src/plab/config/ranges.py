@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any, cast
 
 from plab.errors import ConfigError, pick
 
 __all__ = [
+    "COUNT",
+    "DECAYS",
+    "FINITE",
+    "FRACTION",
+    "NAME",
+    "NOT_NEGATIVE",
+    "POINT",
+    "POSITIVE",
+    "SHARE",
+    "THREADS",
+    "UNIT",
+    "WIDTHS",
+    "Section",
     "at_least",
     "folder_name",
-    "fraction",
     "one_of",
     "positive",
-    "share",
-    "threads",
-    "unit",
     "vector",
-    "widths",
+    "within",
 ]
 
 
@@ -61,38 +72,64 @@ def at_least(path: str, value: float, low: float, *, finite: bool = False) -> No
         raise ConfigError(f"{path} must be below 2^63, not {_shown(value)}")
 
 
-def fraction(path: str, value: float) -> None:
-    """Raise :class:`ConfigError` unless a value is in [0, 1)."""
+def _fraction(path: str, value: float) -> None:
     if not 0 <= value < 1:
         raise ConfigError(f"{path} must be in [0, 1), not {_shown(value)}")
 
 
-def share(path: str, value: float) -> None:
-    """Raise :class:`ConfigError` unless a value is in (0, 1]."""
+def _share(path: str, value: float) -> None:
     if not 0 < value <= 1:
         raise ConfigError(f"{path} must be in (0, 1], not {_shown(value)}")
 
 
-def unit(path: str, value: float) -> None:
-    """Raise :class:`ConfigError` unless a value is in [0, 1]."""
+def _unit(path: str, value: float) -> None:
     if not 0 <= value <= 1:
         raise ConfigError(f"{path} must be in [0, 1], not {_shown(value)}")
 
 
-def threads(path: str, value: int) -> None:
-    """Raise :class:`ConfigError` unless so many threads of torch make sense."""
+def _threads(path: str, value: int) -> None:
     at_least(path, value, 1)
     if value > MOST_THREADS:
         raise ConfigError(f"{path} must be at most {MOST_THREADS}, not {_shown(value)}")
-
-
-def widths(path: str, value: Sequence[int]) -> None:
-    """Raise :class:`ConfigError` unless all values are at least 1."""
-    for width in value:
-        at_least(path, width, 1)
 
 
 def vector(path: str, value: Sequence[float], length: int) -> None:
     """Raise :class:`ConfigError` unless there are ``length`` finite numbers."""
     if len(value) != length or not all(math.isfinite(entry) for entry in value):
         raise ConfigError(f"{path} must be {length} finite numbers, not {list(value)}")
+
+
+def _decays(path: str, value: Sequence[float]) -> None:
+    vector(path, value, 2)
+    for decay in value:
+        _fraction(path, decay)
+
+
+def _widths(path: str, value: Sequence[int]) -> None:
+    for width in value:
+        at_least(path, width, 1)
+
+
+def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str, Any]:
+    """Return the metadata of a field of a :class:`Section` that a function of this module is to check."""
+    return {"check": lambda path, value: check(path, value, *limits, **options)}
+
+
+POSITIVE = within(positive)
+COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
+FINITE = within(at_least, 0, finite=True)
+FRACTION, SHARE, UNIT = within(_fraction), within(_share), within(_unit)
+POINT, DECAYS = within(vector, 3), within(_decays)
+NAME, THREADS, WIDTHS = within(folder_name), within(_threads), within(_widths)
+"""What fields have to be; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
+
+
+class Section:
+    """A part of the configuration; its fields' metadata say what values they may have, beside None."""
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        for field in fields(cast(Any, self)):
+            value = getattr(self, field.name)
+            if value is not None and "check" in field.metadata:
+                field.metadata["check"](f"{path}.{field.name}", value)

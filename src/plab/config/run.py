@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
+from plab.config import ranges
 from plab.config.method import DEVICES, MethodConfig
-from plab.config.ranges import at_least, folder_name, one_of, positive
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
 from plab.losses.registry import check_terms
@@ -25,7 +25,7 @@ Method = TypeVar("Method", bound=MethodConfig)
 
 
 @dataclass
-class SimConfig:
+class SimConfig(ranges.Section):
     """How the scene is simulated.
 
     Attributes:
@@ -39,29 +39,22 @@ class SimConfig:
         particles_scale: Factor on every body's number of particles.
     """
 
-    precision: str
-    device: str
-    memory_mb: float
-    grid_size: int
-    dt: float
-    substeps: int
-    horizon: int
-    particles_scale: float
+    precision: str = field(metadata=ranges.within(ranges.one_of, PRECISIONS))
+    device: str = field(metadata=ranges.within(ranges.one_of, DEVICES))
+    memory_mb: float = field(metadata=ranges.POSITIVE)
+    grid_size: int = field(metadata=ranges.within(ranges.at_least, 8))
+    dt: float = field(metadata=ranges.POSITIVE)
+    substeps: int = field(metadata=ranges.COUNT)
+    horizon: int = field(metadata=ranges.COUNT)
+    particles_scale: float = field(metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
-        one_of(f"{path}.precision", self.precision, PRECISIONS)
-        one_of(f"{path}.device", self.device, DEVICES)
-        positive(f"{path}.memory_mb", self.memory_mb)
+        super().check(path)
         if self.memory_mb > MOST_MEMORY_MB:
             raise ConfigError(
                 f"{path}.memory_mb must be at most {MOST_MEMORY_MB:g}, not {self.memory_mb:g}: it is in MB"
             )
-        at_least(f"{path}.grid_size", self.grid_size, 8)
-        positive(f"{path}.dt", self.dt)
-        at_least(f"{path}.substeps", self.substeps, 1)
-        at_least(f"{path}.horizon", self.horizon, 1)
-        positive(f"{path}.particles_scale", self.particles_scale)
 
 
 SCORES = ("best", "last")
@@ -69,7 +62,7 @@ SCORES = ("best", "last")
 
 
 @dataclass
-class ProtocolConfig:
+class ProtocolConfig(ranges.Section):
     """What is done as the PlasticineLab release does it, where that is not what the paper says.
 
     Attributes:
@@ -82,19 +75,16 @@ class ProtocolConfig:
         contact: Which term ``method.loss_terms.contact`` is, unless that says so itself.
     """
 
-    name: str
-    start: str
-    numbers: str
-    floor: str
-    score: str
+    name: str = field(metadata=ranges.NAME)
+    start: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
+    numbers: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
+    floor: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
+    score: str = field(metadata=ranges.within(ranges.one_of, SCORES))
     contact: str
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
-        folder_name(f"{path}.name", self.name)
-        for part in ("start", "numbers", "floor"):
-            one_of(f"{path}.{part}", getattr(self, part), CHOICES)
-        one_of(f"{path}.score", self.score, SCORES)
+        super().check(path)
         check_terms({"contact": 1.0}, {"contact": self.contact})
 
 
@@ -150,10 +140,10 @@ class Config:
         for key in ("seed", "seed_particles"):
             if (seed := getattr(self, key)) >= 2**32:
                 raise ConfigError(f"{key} must be below 2^32 = {2**32}, not {seed}")
-            at_least(key, seed, 0)
-        at_least("seed_scene", self.seed_scene or 0, 0)
-        one_of("logger", self.logger, LOGGERS)
-        at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
+            ranges.at_least(key, seed, 0)
+        ranges.at_least("seed_scene", self.seed_scene or 0, 0)
+        ranges.one_of("logger", self.logger, LOGGERS)
+        ranges.at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)
         if not self.results_dir.strip():
             raise ConfigError("results_dir is empty: give a folder, such as results")
         if self.targets.source is not None and self.seed_scene is not None:

@@ -47,27 +47,17 @@ class Selection:
     keys: dict[str, list[str]] = field(default_factory=dict)
 
     def __call__(self, values: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
-        """Return whether a run is among the chosen ones.
-
-        Args:
-            values: The run's values of the names.
-            config: Its configuration.
-        """
+        """Return whether a run with these values of the names and this configuration is among the chosen
+        ones."""
         return all(str(values[name]) in texts for name, texts in self.choices.items()) and all(
             any(_same(lookup(config, key), text) for text in texts) for key, texts in self.keys.items()
         )
 
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
-    """Read the words of a command line.
-
-    Args:
-        words: ``name=value``, with several values as in a sweep: ``seed=0,1,2`` or ``seed=range(3)``.
-        names: Names without a dot that may be given; every dotted name is a key of the configuration.
-
-    Raises:
-        SelectionError: If a word cannot be read, or its name is none of ``names``.
-    """
+    """Read the words of a command line, ``name=value``, with several values as in a sweep: ``seed=0,1,2``
+    or ``seed=range(3)``. Every dotted name is a key of the configuration; SelectionError if a word cannot
+    be read, or its name is neither that nor one of ``names``."""
     if not words:
         return Selection()
     # Imported here: without words nobody should have to wait for Hydra.
@@ -94,13 +84,8 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
 
 
 def _texts(override: Override) -> list[str]:
-    """Return the values that a word gives, as texts.
-
-    Raises:
-        SelectionError: If it gives none.
-        plab.config.ConfigError: If it gives too many.
-        hydra.errors.HydraException: If its values cannot be enumerated.
-    """
+    """Return the values that a word gives, as texts; SelectionError if there are none, ConfigError if too
+    many, HydraException if they cannot be enumerated."""
     from hydra.core.override_parser.types import Glob, OverrideType
 
     from plab.config.words import require_few
@@ -117,14 +102,8 @@ def _texts(override: Override) -> list[str]:
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
-    """Return the name of the protocol that runs have in common, plab's own where there are none.
-
-    Args:
-        configs: The runs' configurations.
-
-    Raises:
-        SelectionError: If there are several: they are not to be pooled.
-    """
+    """Return the name of the protocol that runs have in common, plab's own where there are none;
+    SelectionError if there are several: they are not to be pooled."""
     names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
     if len(names) > 1:
         advice = f"choose one, for example protocol.name={names[0]}"
@@ -151,18 +130,9 @@ def _same(value: Any, text: str) -> bool:
 
 
 def require_possible(chosen: Selection, found: Iterable[_Run]) -> None:
-    """Refuse a choice as ``plab.run`` would refuse it.
-
-    What some run of the results has is possible, such as a task of somebody's own, which only the command
-    line of that run could compose.
-
-    Args:
-        chosen: The choice.
-        found: The runs of the results.
-
-    Raises:
-        ConfigError: If plab could compose no run with one of its values; says what would do.
-    """
+    """Refuse a choice among the runs found as ``plab.run`` would refuse it: ConfigError if plab could
+    compose no run with one of its values; says what would do. What some run has is possible, such as a
+    task of somebody's own, which only the command line of that run could compose."""
     runs = list(found) if chosen.choices or chosen.keys else []
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
@@ -204,11 +174,8 @@ def _word(key: str, text: str) -> str:
 
 
 def _require_composed(attempts: Sequence[list[str]]) -> None:
-    """Compose until one of the attempts succeeds.
-
-    Raises:
-        ConfigError: If none can: what is wrong with the one that came closest.
-    """
+    """Compose until one of the attempts succeeds; if none can, raise the ConfigError of the one that came
+    closest."""
     from plab.config.compose import load_config
 
     errors = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from plab.config.ranges import at_least, folder_name, positive, vector
+from plab.config import ranges
 from plab.errors import ConfigError
 from plab.scene import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
 from plab.shape_files import ShapeError, pinned
@@ -15,7 +15,7 @@ __all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "Ran
 
 
 @dataclass
-class BodyConfig:
+class BodyConfig(ranges.Section):
     """A body of plasticine.
 
     Attributes:
@@ -33,23 +33,14 @@ class BodyConfig:
     """
 
     shape: str
-    center: list[float]
+    center: list[float] = field(metadata=ranges.POINT)
     size: list[float]
-    particles: int
+    particles: int = field(metadata=ranges.COUNT)
     file: str | None = None
     sha256: str | None = None
-    youngs_modulus: float | None = None
+    youngs_modulus: float | None = field(default=None, metadata=ranges.POSITIVE)
     poisson_ratio: float | None = None
-    yield_stress: float | None = None
-
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
-        vector(f"{path}.center", self.center, 3)
-        at_least(f"{path}.particles", self.particles, 1)
-        if self.youngs_modulus is not None:
-            positive(f"{path}.youngs_modulus", self.youngs_modulus)
-        if self.yield_stress is not None:
-            at_least(f"{path}.yield_stress", self.yield_stress, 0)
+    yield_stress: float | None = field(default=None, metadata=ranges.NOT_NEGATIVE)
 
     def build(self, particles_scale: float = 1.0) -> Body:
         """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
@@ -64,7 +55,7 @@ class BodyConfig:
 
 
 @dataclass
-class ManipulatorConfig:
+class ManipulatorConfig(ranges.Section):
     """A rigid manipulator.
 
     Attributes:
@@ -82,29 +73,24 @@ class ManipulatorConfig:
 
     shape: str
     size: list[float]
-    position: list[float]
-    rotation: list[float]
+    position: list[float] = field(metadata=ranges.POINT)
+    rotation: list[float] = field(metadata=ranges.within(ranges.vector, 4))
     scale: list[float]
     friction: float
-    lower_bound: list[float]
-    upper_bound: list[float]
-    gap: float | None = None
-    minimal_gap: float | None = None
+    lower_bound: list[float] = field(metadata=ranges.POINT)
+    upper_bound: list[float] = field(metadata=ranges.POINT)
+    gap: float | None = field(default=None, metadata=ranges.POSITIVE)
+    minimal_gap: float | None = field(default=None, metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
-        vector(f"{path}.rotation", self.rotation, 4)
-        vector(f"{path}.scale", self.scale, len(self.scale))
-        for name in ("position", "lower_bound", "upper_bound"):
-            vector(f"{path}.{name}", getattr(self, name), 3)
+        super().check(path)
+        ranges.vector(f"{path}.scale", self.scale, len(self.scale))
         for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
             if not low <= at <= high:
                 raise ConfigError(
                     f"{path}.position: {axis} = {at:g} is outside its bounds {low:g} .. {high:g}"
                 )
-        for name in ("gap", "minimal_gap"):
-            if getattr(self, name) is not None:
-                positive(f"{path}.{name}", getattr(self, name))
 
     def build(self) -> Manipulator:
         """Return the scene's manipulator."""
@@ -130,8 +116,8 @@ class RangeConfig:
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for bounds between which nothing can be drawn."""
-        vector(f"{path}.low", self.low, len(self.low))
-        vector(f"{path}.high", self.high, len(self.low))
+        ranges.vector(f"{path}.low", self.low, len(self.low))
+        ranges.vector(f"{path}.high", self.high, len(self.low))
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
             raise ConfigError(f"{path}: low {self.low} is above high {self.high}")
 
@@ -148,7 +134,7 @@ class DrawConfig(RangeConfig):
 
 
 @dataclass
-class RandomConfig:
+class RandomConfig(ranges.Section):
     """What ``variant=random`` draws.
 
     Attributes:
@@ -162,22 +148,21 @@ class RandomConfig:
 
     variant: str | None = None
     shift: RangeConfig | None = None
-    reach: float | None = None
+    reach: float | None = field(default=None, metadata=ranges.POSITIVE)
     ranges: dict[str, DrawConfig] | None = None
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
         if self.shift is not None:
-            vector(f"{path}.shift.low", self.shift.low, 3)
+            ranges.vector(f"{path}.shift.low", self.shift.low, 3)
             self.shift.check(f"{path}.shift")
-        if self.reach is not None:
-            positive(f"{path}.reach", self.reach)
         for name, draw in (self.ranges or {}).items():
             draw.check(f"{path}.ranges.{name}")
 
 
 @dataclass
-class TaskConfig:
+class TaskConfig(ranges.Section):
     """What is in the scene, and what shape the plasticine is to take.
 
     Attributes:
@@ -198,12 +183,12 @@ class TaskConfig:
             configuration.
     """
 
-    name: str
-    youngs_modulus: float
+    name: str = field(metadata=ranges.NAME)
+    youngs_modulus: float = field(metadata=ranges.POSITIVE)
     poisson_ratio: float
-    yield_stress: float
-    floor_friction: float
-    gravity: list[float]
+    yield_stress: float = field(metadata=ranges.NOT_NEGATIVE)
+    floor_friction: float = field(metadata=ranges.NOT_NEGATIVE)
+    gravity: list[float] = field(metadata=ranges.POINT)
     bodies: dict[str, BodyConfig]
     manipulators: dict[str, ManipulatorConfig]
     target: dict[str, Any]
@@ -213,13 +198,9 @@ class TaskConfig:
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
-        folder_name(f"{path}.name", self.name)
+        super().check(path)
         for variant in self.variants:
-            folder_name(f"{path}.variants", variant)
-        vector(f"{path}.gravity", self.gravity, 3)
-        positive(f"{path}.youngs_modulus", self.youngs_modulus)
-        at_least(f"{path}.yield_stress", self.yield_stress, 0)
-        at_least(f"{path}.floor_friction", self.floor_friction, 0)
+            ranges.folder_name(f"{path}.variants", variant)
         for group in ("bodies", "manipulators"):
             for name, item in getattr(self, group).items():
                 item.check(f"{path}.{group}.{name}")

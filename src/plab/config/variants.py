@@ -8,7 +8,7 @@ particles.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -49,15 +49,8 @@ _NUMBERS, _TARGET_SEED = 1, 2
 
 
 def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return what a variant changes.
-
-    Args:
-        task: A task, with all its variants.
-        name: Name of the variant.
-
-    Raises:
-        ConfigError: If the task has no such variant.
-    """
+    """Return what a variant changes, of a task with all its variants; ConfigError if there is no such
+    variant."""
     if name not in task.variants:
         names = [*task.variants, *([RANDOM] if task.random else [])]
         advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
@@ -70,15 +63,8 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
 
 
 def merge_variant(task: DictConfig, name: str) -> DictConfig:
-    """Return the task with a variant merged over it, and no other variant.
-
-    Args:
-        task: A task, with all its variants.
-        name: Name of the variant.
-
-    Raises:
-        ConfigError: If the variant does not exist or does not fit the task.
-    """
+    """Return a task, which has all its variants, with one merged over it and no other; ConfigError if it
+    does not exist or does not fit."""
     changes = variant_changes(task, name)
     try:
         merged = OmegaConf.merge(task, changes)
@@ -90,15 +76,8 @@ def merge_variant(task: DictConfig, name: str) -> DictConfig:
 
 
 def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:
-    """Return the first key that an override sets and the variant sets again: the override has no effect.
-
-    Args:
-        changes: What the variant changes.
-        overrides: As on the command line.
-
-    Returns:
-        The key below ``task``, or None.
-    """
+    """Return the first key below ``task`` that an override sets and the variant's changes set again, if
+    any: the override has no effect."""
     for override in parse(overrides):
         group, _, key = override.key_or_group.partition(".")
         if group == "task" and key and OmegaConf.select(changes, key) is not None:
@@ -107,19 +86,10 @@ def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
-    """Draw what a variant changes.
-
-    Args:
-        task: A composed task, with all its variants and the section ``random``.
-        seed_scene: Which one to draw, >= 0.
-
-    Returns:
-        A part of the task's structure, as the entries of ``variants`` are.
-
-    Raises:
-        ConfigError: If the task does not say what to draw, or none of :data:`ATTEMPTS` draws is valid.
-        omegaconf.errors.OmegaConfBaseException: If the task lacks a value or has one of the wrong type.
-    """
+    """Draw what a variant changes, a part of the task's structure as the entries of ``variants`` are.
+    ConfigError if the task, which has all its variants, does not say what to draw, or none of
+    :data:`ATTEMPTS` draws is valid; an OmegaConfBaseException if it lacks a value or has one of the wrong
+    type."""
     if not task.random:
         raise ConfigError(
             f"task {task.name} has no section 'random' to draw from; choose from: {', '.join(task.variants)}"
@@ -176,7 +146,9 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
             OmegaConf.update(changes, key, values)
     if random.shift is not None:
         displacement = _uniform(random.shift, rng)
-        for key in _places(base):
+        moving = [name for name, item in base.manipulators.items() if item.scale]
+        places = [f"bodies.{name}.center" for name in base.bodies]
+        for key in [*places, *(f"manipulators.{name}.position" for name in moving)]:
             if OmegaConf.select(changes, key) is None:
                 start = OmegaConf.select(base, key, throw_on_missing=True)
                 # Rounding takes off the digits that adding decimals leaves, nothing else.
@@ -189,12 +161,6 @@ def _uniform(bounds: RangeConfig, rng: np.random.Generator) -> list[float]:
     unit = rng.random(len(bounds.low))
     drawn = [low + u * (high - low) for low, high, u in zip(bounds.low, bounds.high, unit, strict=True)]
     return np.clip(np.round(drawn, DECIMALS), bounds.low, bounds.high).tolist()
-
-
-def _places(base: DictConfig) -> Iterator[str]:
-    """Yield the keys of the centres of all bodies and of the positions of all manipulators that move."""
-    yield from (f"bodies.{name}.center" for name in base.bodies)
-    yield from (f"manipulators.{name}.position" for name, item in base.manipulators.items() if item.scale)
 
 
 def _require_list(base: DictConfig, key: str, path: str) -> None:

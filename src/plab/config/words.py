@@ -46,11 +46,7 @@ _SHOWN = 60
 
 
 def word_list(words: Sequence[str]) -> list[str]:
-    """Return overrides as a list.
-
-    Raises:
-        ConfigError: If they are no list of texts.
-    """
+    """Return overrides as a list; ConfigError if they are no list of texts."""
     if isinstance(words, str) or not isinstance(words, Iterable):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
     given = list(words)
@@ -60,12 +56,8 @@ def word_list(words: Sequence[str]) -> list[str]:
 
 
 def parse(words: Sequence[str]) -> list[Override]:
-    """Read overrides.
-
-    Raises:
-        ConfigError: If a number has too many digits, or brackets are nested too deeply.
-        hydra.errors.HydraException: If one cannot be parsed.
-    """
+    """Read overrides; ConfigError if a number has too many digits, or brackets are nested too deeply,
+    HydraException if one cannot be parsed."""
     parser, found = OverridesParser.create(), []
     for word in words:
         try:
@@ -97,11 +89,8 @@ def shortened(word: str) -> str:
 
 
 def value_count(override: Override) -> int | None:
-    """Return how many values an override gives, None if that depends on the files that there are.
-
-    Raises:
-        ConfigError: If they cannot be counted, such as those of a range without a step.
-    """
+    """Return how many values an override gives, None if that depends on the files that there are;
+    ConfigError if they cannot be counted, such as those of a range without a step."""
     value, line = override.value(), shortened(str(override.input_line))
     if isinstance(value, IntervalSweep):
         raise ConfigError(f"'{line}': an interval has no values to run: use range")
@@ -117,11 +106,8 @@ def value_count(override: Override) -> int | None:
 
 
 def require_few(overrides: Sequence[Override]) -> None:
-    """Refuse a sweep of no runs, or of more than :data:`MOST_RUNS`, before they are enumerated.
-
-    Raises:
-        ConfigError: If it is one.
-    """
+    """Raise ConfigError for a sweep of no runs, or of more than :data:`MOST_RUNS`, before they are
+    enumerated."""
     runs = 1
     for override in overrides:
         count, line = value_count(override), shortened(str(override.input_line))
@@ -135,16 +121,8 @@ def require_few(overrides: Sequence[Override]) -> None:
 
 
 def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None:
-    """Refuse overrides that change nothing where they are given.
-
-    Args:
-        words: Overrides.
-        idle: Keys, and sections, without an effect.
-        what: On what.
-
-    Raises:
-        ConfigError: If there is such an override, or one cannot be read.
-    """
+    """Raise ConfigError for an override of an idle key or section, without an effect on ``what``, and for
+    one that cannot be read."""
     try:
         overrides = parse(quote_folders(words))
     except HydraException as error:
@@ -182,12 +160,8 @@ def _quote_folder(word: str) -> str:
 
 
 def unusable(error: Exception, words: Sequence[str]) -> str | None:
-    """Return what Hydra says to settings of its own that it cannot use, None where no override is one.
-
-    Args:
-        error: What it raised.
-        words: All overrides.
-    """
+    """Return what Hydra's error says to settings of its own that it cannot use, None where no override is
+    one."""
     if not (settings := [shortened(word) for word in words if word.lstrip("+~").startswith("hydra")]):
         return None
     return (

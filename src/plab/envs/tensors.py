@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
+from plab.config import Config
 from plab.envs.core import EpisodeBatch, Transition
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["TensorEnv"]
 

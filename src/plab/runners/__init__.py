@@ -10,8 +10,9 @@ from __future__ import annotations
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from plab.config import Config
 from plab.errors import TRACEBACK, ConfigError, traceback_wanted
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile
@@ -20,9 +21,6 @@ from plab.reuse import SimulatorCache
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
 from plab.runners.runner import Runner, Step, Track
 from plab.tally import Outcome
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["Job", "RunError", "Runner", "SimulatorCache", "Step", "Track", "run_batch", "run_config"]
 
@@ -113,8 +111,9 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
                 own = family(job.cfg.method.family)
                 kind = _runner(job, in_sweep=in_sweep)
                 # What a runner that does everything itself goes on from only it knows.
-                if kind.run is Runner.run:
-                    _require_usable(job.run)
+                if kind.run is Runner.run and (fault := resume_fault(job.run.result)):
+                    what = f"{job.run.partial_path} cannot be gone on from: {fault}"
+                    raise ResultsError(f"{what}; start afresh with force=true")
                 shares = own.batching or kind is not own.runner_type()
                 parties.setdefault((kind, None if shares else number), []).append(job)
             except Exception as error:
@@ -124,14 +123,6 @@ def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_
     finally:
         for job in jobs:
             job.run.release()
-
-
-def _require_usable(run: RunFile) -> None:
-    """Raise ResultsError if a run cannot go on from what an earlier process left."""
-    if fault := resume_fault(run.result):
-        raise ResultsError(
-            f"{run.partial_path} cannot be gone on from: {fault}; start afresh with force=true"
-        )
 
 
 def _carry_out(jobs: Sequence[Job], kind: type[Runner], note: str, cache: SimulatorCache) -> None:

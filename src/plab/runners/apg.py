@@ -10,37 +10,34 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
 
 from plab.autograd import policy_gradient
 from plab.config import ApgConfig
-from plab.runners.environments import shared_batches, torch_settings
+from plab.runners.environments import PolicyRunner, shared_batches
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
-from plab.runners.runner import Runner, Step, Track
+from plab.runners.runner import Step, Track
 
 __all__ = ["ApgRunner", "PolicyTraining"]
 
 
-class ApgRunner(Runner):
+class ApgRunner(PolicyRunner):
     """Trains a policy network; each iteration is an episode of it, with gradient."""
 
-    def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
-        return torch_settings(self._method.torch_threads)
+    kind = ApgConfig
 
     def build(self) -> None:
         """Make the environment."""
-        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], 1, self._method.contact))
+        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], 1, self.method.contact))
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the network, or take that of the file."""
         (entries,), (size,) = self._episode.observation_space.shape, self._episode.action_space.shape
         device = torch.device(track.cfg.sim.device)
-        self._training = PolicyTraining(self._method, entries, size, track.cfg.seed, device)
+        self._training = PolicyTraining(self.method, entries, size, track.cfg.seed, device)
         if state is not None:
             self._training.restore(state)
 
@@ -64,10 +61,6 @@ class ApgRunner(Runner):
         state, steps = training.state(), len(actions)
         return Step(measured, actions, state, track.iteration, steps_forward=0, steps_gradient=steps)
 
-    @property
-    def _method(self) -> ApgConfig:
-        return self.tracks[0].cfg.method_as(ApgConfig)
-
 
 class PolicyTraining:
     """A policy network and the optimiser that improves it.
@@ -79,15 +72,7 @@ class PolicyTraining:
     def __init__(
         self, method: ApgConfig, observation_size: int, action_dim: int, seed: int, device: torch.device
     ) -> None:
-        """Make the network, with torch's own initial weights.
-
-        Args:
-            method: Widths of the layers and learning rate.
-            observation_size: Entries of an observation.
-            action_dim: Length A of the action vector.
-            seed: Seed of the initial weights.
-            device: Where the network is to be.
-        """
+        """Make the network, with torch's own initial weights, drawn by the seed."""
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.policy = _network([observation_size, *method.hidden, action_dim]).to(device)
@@ -106,11 +91,7 @@ class PolicyTraining:
         return {"policy": module_arrays(self.policy), "optimizer": optimizer_arrays(self._optimizer)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`.
-
-        Raises:
-            ValueError: If it is that of another network, or was pickled.
-        """
+        """Return to a :meth:`state`; ValueError if it is that of another network, or was pickled."""
         if "training" in state:
             raise ValueError("its network is pickled, as by earlier versions of plab")
         restore_module(self.policy, state["policy"])

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from plab.config import Config
 from plab.errors import ConfigError, out_of_memory
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError
 from plab.sim import DeviceError, SimulationError, Simulator
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = [
     "COLUMNS",
@@ -71,17 +69,8 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
 
 
 def checked_array(array: Any, shape: Sequence[int], dtype: str, name: str) -> np.ndarray:
-    """Return an array of a state to go on from.
-
-    Args:
-        array: The array.
-        shape: Shape that it has to have.
-        dtype: Type of its numbers that it has to have.
-        name: What it is, for the message.
-
-    Raises:
-        ValueError: If its shape or type is another.
-    """
+    """Return an array of a state to go on from; ValueError, with its name, unless shape and type are
+    these."""
     if not isinstance(array, np.ndarray) or array.shape != tuple(shape):
         raise ValueError(f"{name} has shape {list(np.shape(array))}, not {list(shape)}")
     if array.dtype != dtype:

@@ -5,22 +5,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from plab.config import Config, MethodConfig
 from plab.envs.core import EpisodeBatch
 from plab.reuse import SimulatorCache
 from plab.runners.common import LAST, episode_columns
-
-if TYPE_CHECKING:
-    from plab.config import Config
+from plab.runners.runner import Runner
 
 __all__ = [
     "PolicyEpisode",
+    "PolicyRunner",
     "environment_key",
     "policy_episode",
     "shared_batches",
@@ -28,15 +28,25 @@ __all__ = [
 ]
 
 
+class PolicyRunner(Runner):
+    """Trains policies; a subclass says of which ``kind`` the section ``method`` is."""
+
+    kind: ClassVar[type[MethodConfig]]
+
+    @property
+    def method(self) -> Any:
+        """The section ``method`` that the runs have in common."""
+        return self.tracks[0].cfg.method_as(self.kind)
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self.method.torch_threads)
+
+
 @dataclass(frozen=True)
 class PolicyEpisode:
-    """What an episode of a policy gave.
-
-    Attributes:
-        observations: Observations before each step, shape [T, entry].
-        actions: Actions, shape [T, A].
-        measures: Values of :func:`plab.runners.common.episode_columns`.
-    """
+    """What an episode of a policy gave: observations before each step, shape [T, entry], actions, shape
+    [T, A], and values of :func:`plab.runners.common.episode_columns`."""
 
     observations: np.ndarray
     actions: np.ndarray
@@ -44,12 +54,8 @@ class PolicyEpisode:
 
 
 def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> PolicyEpisode:
-    """Run an episode of a policy in a batch of one.
-
-    Args:
-        batch: The environment.
-        policy: Maps observations, shape [1, entry], to actions, shape [1, A].
-    """
+    """Run an episode of a policy, observations, shape [1, entry], to actions, shape [1, A], in a batch of
+    one."""
     observation, _ = batch.reset()
     sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
     observations, actions = [], []
@@ -73,16 +79,9 @@ def environment_key(cfg: Config) -> str:
 
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
-    """Return batches of environments, those kept from the last run if they fit.
-
-    Args:
-        cache: Simulators of earlier runs.
-        kinds: Of each batch: configurations, which environments have in turn; number of environments; contact
-            model.
-
-    Returns:
-        One batch per kind, in its initial state.
-    """
+    """Return batches of environments, in their initial states, those kept from the last run if they fit;
+    each is of some configurations, which the environments have in turn, a number of environments and a
+    contact model."""
 
     def build() -> list[EpisodeBatch]:
         return [
@@ -101,14 +100,9 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
 
 @contextmanager
 def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
-    """Let torch use some CPU threads, and not check distributions' arguments, inside the ``with`` block.
-
-    The checks cost a tenth of an update; states and losses are checked for NaN anyway.
-
-    Args:
-        threads: CPU threads.
-        tf32: Whether products of float32 matrices on CUDA may be TF32's, of factors with 11 significant bits.
-    """
+    """Let torch use some CPU threads, on CUDA TF32's products, of factors with 11 significant bits, if
+    ``tf32``, and not check distributions' arguments, inside the ``with`` block. The checks cost a tenth of
+    an update; states and losses are checked for NaN anyway."""
     before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
     precision = torch.get_float32_matmul_precision()
     torch.set_num_threads(threads)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from plab.config import Config
 from plab.errors import ConfigError, PlabError
 from plab.families import family
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
@@ -14,9 +14,6 @@ from plab.results.schema import counts_last
 from plab.scene import SceneError
 from plab.tally import Outcome
 from plab.targets import TargetError
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = [
     "USER_ERRORS",

@@ -9,17 +9,13 @@ from __future__ import annotations
 import math
 import os
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
+from plab.config import Config
 from plab.results import ResultsError, RunFile
 
-if TYPE_CHECKING:
-    from plab.config import Config
-
-__all__ = ["Logger", "RunLog"]
+__all__ = ["RunLog"]
 
 PROJECT = "plab"
 """Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
@@ -28,30 +24,13 @@ _LONGEST_ID = 128
 """Letters of a run's id there, at most."""
 
 
-class Logger(ABC):
-    """Takes numbers of one run."""
-
-    @abstractmethod
-    def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers that are finite, at some number of environment steps."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Write what has not been written yet."""
-
-
 class RunLog:
     """What a run logs, if anything. Nothing is opened before the first numbers come."""
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
-        """Keep the run.
-
-        Args:
-            cfg: Its configuration, whose ``logger`` says where the numbers go.
-            run: Its file.
-        """
+        """Keep the run's configuration and file."""
         self._cfg, self._run = cfg, run
-        self._logger: Logger | None = None
+        self._logger: TensorBoard | WeightsAndBiases | None = None
 
     @property
     def wanted(self) -> bool:
@@ -59,15 +38,8 @@ class RunLog:
         return self._cfg.logger != "none"
 
     def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers; those that are not finite are left out.
-
-        Args:
-            values: Numbers by name.
-            steps: Environment steps done.
-
-        Raises:
-            ResultsError: If that fails.
-        """
+        """Log numbers by name at some environment steps, those that are not finite left out; ResultsError
+        if that fails."""
         if not self.wanted:
             return
         finite = {name: float(value) for name, value in values.items() if math.isfinite(value)}
@@ -88,7 +60,7 @@ class RunLog:
             self._logger = None
 
 
-class TensorBoard(Logger):
+class TensorBoard:
     """TensorBoard's event files, in the folder ``<name>.tensorboard`` beside the result."""
 
     def __init__(self, cfg: Config, run: RunFile, steps: int) -> None:
@@ -109,7 +81,7 @@ class TensorBoard(Logger):
         self._writer.close()
 
 
-class WeightsAndBiases(Logger):
+class WeightsAndBiases:
     """A run at Weights & Biases, which goes on where one of the same configuration was; its own files are in
     the folder ``wandb`` of ``results_dir``."""
 
@@ -144,4 +116,7 @@ class WeightsAndBiases(Logger):
         self._run.finish()
 
 
-_KINDS: dict[str, type] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+_KINDS: dict[str, type] = {
+    "tensorboard": TensorBoard,
+    "wandb": WeightsAndBiases,
+}

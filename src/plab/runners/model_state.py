@@ -40,26 +40,15 @@ _LIKE_PARAMETERS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer"
 
 
 def alike(array: Any, own: Tensor, name: str) -> Tensor:
-    """Return an array of a state as a tensor like another one, with memory of its own.
-
-    Args:
-        array: The array.
-        own: Tensor of the shape, type and device that it has to have.
-        name: What it is, for the message.
-
-    Raises:
-        ValueError: If its shape or type is another.
-    """
+    """Return an array of a state as a tensor with memory of its own, in shape, type and device like
+    ``own``; ValueError, with the array's name, if its shape or type is another."""
     dtype = str(own.dtype).removeprefix("torch.")
     return torch.tensor(checked_array(array, own.shape, dtype, name), device=own.device)
 
 
 def moments(state: Mapping[str, Any], parameter: Tensor) -> dict[str, Tensor]:
-    """Return what an optimiser keeps of a parameter, from one entry of :func:`optimizer_arrays`.
-
-    Raises:
-        ValueError: If it is that of a parameter of another shape.
-    """
+    """Return what an optimiser keeps of a parameter, from one entry of :func:`optimizer_arrays`;
+    ValueError if it is another's."""
     if not isinstance(state, Mapping):
         raise ValueError("the optimiser's state is none")
     return {
@@ -74,11 +63,7 @@ def module_arrays(module: torch.nn.Module) -> dict[str, np.ndarray]:
 
 
 def restore_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
-    """Give a module the parameters of :func:`module_arrays`.
-
-    Raises:
-        ValueError: If they are those of another module.
-    """
+    """Give a module the parameters of :func:`module_arrays`; ValueError if they are another module's."""
     own = module.state_dict()
     if other := own.keys() ^ arrays.keys():
         raise ValueError(f"its networks are others: {min(other)}")
@@ -95,11 +80,8 @@ def optimizer_arrays(optimizer: Optimizer) -> dict[str, dict[str, np.ndarray]]:
 
 
 def restore_optimizer(optimizer: Optimizer, arrays: Mapping[str, Any]) -> None:
-    """Give an optimiser what :func:`optimizer_arrays` has of the same parameters.
-
-    Raises:
-        ValueError: If it is that of other parameters.
-    """
+    """Give an optimiser what :func:`optimizer_arrays` has of the same parameters; ValueError if it is of
+    others."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     states = {}
     for number, own in arrays.items():
@@ -128,11 +110,8 @@ def model_arrays(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore_model(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
-    """Give a new model what :func:`model_arrays` has of one of the same configuration.
-
-    Raises:
-        ValueError: If it is that of another model, or was pickled.
-    """
+    """Give a new model what :func:`model_arrays` has of one of the same configuration; ValueError if it is
+    of another, or was pickled."""
     if not isinstance(state, Mapping):
         raise ValueError(_PICKLED)
     networks, optimizers = _parts(model)

@@ -95,11 +95,7 @@ class EpisodeReplay(ReplayBuffer):
         self._copies = self._copy_to_device() if self.device.type == "cuda" else None
 
     def _copy_to_device(self) -> dict[str, torch.Tensor]:
-        """Return copies of the whole buffer on the device.
-
-        Raises:
-            ResultsError: If the device has no room for them.
-        """
+        """Return copies of the whole buffer on the device; ResultsError if it has no room for them."""
         arrays = {name: getattr(self, name) for name in ("observations", "actions", "rewards")}
         try:
             # Without an earlier process there is nothing to copy yet.
@@ -143,12 +139,7 @@ class EpisodeReplay(ReplayBuffer):
         return min(self.added, self._window)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Draw transitions uniformly.
-
-        Args:
-            batch_size: How many.
-            env: Statistics to scale observations and rewards by.
-        """
+        """Draw transitions uniformly; observations and rewards are scaled by the statistics of ``env``."""
         steps = np.random.randint(self.added - self.size(), self.added, size=batch_size)  # noqa: NPY002
         return self._get_samples(steps % self._capacity, env)
 
@@ -183,11 +174,7 @@ class EpisodeReplay(ReplayBuffer):
         )
 
     def flush(self) -> None:
-        """Wait until the disk has everything that was added.
-
-        Raises:
-            ResultsError: If it does not take it.
-        """
+        """Wait until the disk has everything that was added; ResultsError if it does not take it."""
         try:
             self._file.flush()
         except OSError as error:

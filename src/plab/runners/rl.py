@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any, cast
 
 import numpy as np
@@ -23,42 +22,39 @@ from stable_baselines3.common.policies import BasePolicy
 from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import PolicyEpisode, policy_episode, shared_batches, torch_settings
+from plab.runners.environments import PolicyEpisode, PolicyRunner, policy_episode, shared_batches
 from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
 from plab.runners.policy import save_policy
 from plab.runners.rl_models import Spaces, model_kind, total_steps
 from plab.runners.rl_trainer import Trainer
-from plab.runners.runner import Runner, Step, Track
+from plab.runners.runner import Step, Track
 
 __all__ = ["RlRunner", "check_torch_device"]
 
 
-class RlRunner(Runner):
+class RlRunner(PolicyRunner):
     """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy."""
 
+    kind = RlConfig
     _trainer: Trainer | None = None
     _watch: _Watch | None = None
-
-    def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
-        return torch_settings(self._method.torch_threads)
 
     def build(self) -> None:
         """Make the environments of the training, and the one in the hard contact model that judges."""
         cfgs = [self.tracks[0].cfg]
-        check_torch_device(self._method)
-        kinds = (cfgs, self._method.num_envs, self._method.contact), (cfgs, 1, "hard")
+        check_torch_device(self.method)
+        kinds = (cfgs, self.method.num_envs, self.method.contact), (cfgs, 1, "hard")
         self._training, self._evaluation = shared_batches(self.cache, *kinds)
         self.problem = self._evaluation.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the model, or take that of the last checkpoint, unless its training is over."""
         self._replay_path = track.job.run.path.with_suffix(REPLAY_SUFFIX)
-        if state is None or int(state["steps"]) < total_steps(self._method, track.cfg.sim.horizon):
+        if state is None or int(state["steps"]) < total_steps(self.method, track.cfg.sim.horizon):
             self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
             outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
-            self._trainer.set_logger(Logger(folder=None, output_formats=outputs))
+            self._trainer.model.set_logger(Logger(folder=None, output_formats=outputs))
         else:
             # Now, where what does not fit is answered.
             self._policy(state)
@@ -89,8 +85,8 @@ class RlRunner(Runner):
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
         horizon = self.tracks[0].cfg.sim.horizon
-        total = total_steps(self._method, horizon) // horizon
-        return total if self._trainer is None else self._trainer.episodes, total, self._method.evaluate_every
+        total = total_steps(self.method, horizon) // horizon
+        return total if self._trainer is None else self._trainer.episodes, total, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Leave it to the training, which reports every episode."""
@@ -106,33 +102,25 @@ class RlRunner(Runner):
         moments = None
         if state["statistics"]:
             moments = state["statistics"]["observation"]["mean"], state["statistics"]["observation"]["var"]
-        save_policy(track.job.run.path, self._method, self._policy(state), moments)
+        save_policy(track.job.run.path, self.method, self._policy(state), moments)
         self._replay_path.unlink(missing_ok=True)
 
     def _policy(self, state: Mapping[str, Any]) -> BasePolicy:
-        """Return the policy of a checkpoint.
-
-        Raises:
-            ValueError: If it is that of another model, or was pickled.
-        """
-        kind = model_kind(self._method.family, self._method.algorithm)
+        """Return the policy of a checkpoint; ValueError if it is that of another model, or was pickled."""
+        kind = model_kind(self.method.family, self.method.algorithm)
         spaces = Spaces(self._evaluation.observation_space, self._evaluation.action_space)
-        policy = kind.policy(self._method, spaces)
+        policy = kind.policy(self.method, spaces)
         restore_policy(policy, state["model"])
         return policy
 
     def _train(self, trainer: Trainer, track: Track) -> None:
         self.enter("optimise")
         rows = track.job.run.result.iterations
-        due = int(rows["episodes"].iloc[-1]) + self._method.evaluate_every
+        due = int(rows["episodes"].iloc[-1]) + self.method.evaluate_every
         self._watch = self._watch or _Watch(trainer, self.report)
         self._watch.score = float(rows["score"].iloc[-1])
         while trainer.episodes < due and trainer.steps < trainer.total_steps:
             trainer.advance(self._watch)
-
-    @property
-    def _method(self) -> RlConfig:
-        return self.tracks[0].cfg.method_as(RlConfig)
 
 
 class _Watch(BaseCallback):
@@ -188,11 +176,7 @@ class _Diagnostics(KVWriter):
 
 
 def check_torch_device(method: RlConfig) -> None:
-    """Find out before anything is built whether torch has the device.
-
-    Raises:
-        ConfigError: If not.
-    """
+    """Raise ConfigError, before anything is built, if torch does not have the device."""
     if method.torch_device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(
             "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"

@@ -46,12 +46,7 @@ ACTION_GAIN = 0.01
 
 
 class Spaces(NamedTuple):
-    """Spaces of environments.
-
-    Attributes:
-        observation_space: That of an observation.
-        action_space: That of an action.
-    """
+    """Spaces of an observation and of an action."""
 
     observation_space: Box
     action_space: Box
@@ -96,11 +91,8 @@ class ModelKind:
 
 
 class LinearDecay:
-    """A learning rate that falls linearly from its first value to 0.
-
-    Attributes:
-        remaining: Share of the run that is left when the current update begins, in (0, 1].
-    """
+    """A learning rate that falls linearly to 0; ``remaining`` is the share of the run, in (0, 1], that is
+    left when the current update begins."""
 
     def __init__(self, lr: float) -> None:
         self._lr = lr
@@ -112,15 +104,8 @@ class LinearDecay:
 
 
 def model_kind(name: str, algorithm: str) -> ModelKind:
-    """Return the learning algorithm that a family has by some name.
-
-    Args:
-        name: The family, as ``method.family`` names it.
-        algorithm: As ``method.algorithm`` names it.
-
-    Raises:
-        plab.config.ConfigError: If it cannot be imported, or is no :class:`ModelKind`.
-    """
+    """Return the learning algorithm ``method.algorithm`` of a family; ConfigError if there is none to
+    import."""
     return family(name).rule(algorithm, ModelKind)
 
 

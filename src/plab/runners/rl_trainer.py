@@ -6,18 +6,17 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from plab.config import OffPolicyConfig, PpoConfig, RlConfig
+from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.runners.model_state import model_arrays, restore_model
@@ -30,9 +29,6 @@ from plab.runners.rl_models import (
     observed_steps,
     total_steps,
 )
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["Trainer", "scaled"]
 
@@ -94,10 +90,6 @@ class Trainer:
         """Complete episodes so far."""
         return self.steps // self.horizon
 
-    def set_logger(self, logger: Logger) -> None:
-        """Choose where the model's diagnostics go."""
-        self.model.set_logger(logger)
-
     def advance(self, callback: BaseCallback) -> None:
         """Train for one cycle: an update of PPO, a batch of episodes of the others."""
         schedule = self.model.learning_rate
@@ -112,15 +104,8 @@ class Trainer:
         return self.model.predict(observation, deterministic=True)[0]
 
     def note_step(self, actions: np.ndarray, infos: list[dict[str, Any]]) -> bool:
-        """Note what a step of training did.
-
-        Args:
-            actions: Actions, shape [env, A].
-            infos: The environments' infos.
-
-        Returns:
-            Whether the step ended the episodes.
-        """
+        """Note what a step of training did, actions, shape [env, A], and infos; return whether it ended
+        the episodes."""
         if "episode" not in infos[0]:
             self._episode_actions.append(np.array(actions))
             return False

@@ -11,11 +11,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
-from plab.config import ConfigError
+from plab.config import Config, ConfigError
 from plab.config.checks import check_packages
 from plab.families import SOLVED, family
 from plab.problem import Episodes, Problem
@@ -27,9 +27,6 @@ from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_t
 from plab.runners.loggers import RunLog
 from plab.sim import DeviceError, SimulationError
 from plab.sim.compiling import watch_compiling
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["Runner", "Step", "Track"]
 

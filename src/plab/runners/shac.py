@@ -14,7 +14,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -27,12 +26,12 @@ from stable_baselines3.common.torch_layers import create_mlp
 from plab.autograd import Stretch, policy_gradient
 from plab.config import Config, ConfigError, RlConfig, ShacConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
-from plab.runners.environments import policy_episode, shared_batches, torch_settings
+from plab.runners.environments import PolicyRunner, policy_episode, shared_batches
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.policy import Policy, save_policy
 from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import CLIP, ModelKind, Spaces
-from plab.runners.runner import Runner, Step, Track
+from plab.runners.runner import Step, Track
 
 __all__ = ["SHAC", "ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
 
@@ -88,17 +87,15 @@ SHAC = ShacKind(cast(Any, None), _no_arguments)
 """What reads a policy's file; the name that ``method.algorithm`` gives it is in :mod:`plab.families`."""
 
 
-class ShacRunner(Runner):
+class ShacRunner(PolicyRunner):
     """Trains policy and value function; each iteration is some episodes of training, then one of the
     deterministic policy."""
 
-    def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
-        return torch_settings(self._method.torch_threads)
+    kind = ShacConfig
 
     def build(self) -> None:
         """Make the environments of the training, and the one in the hard contact model that judges."""
-        cfg, method = self.tracks[0].cfg, self._method
+        cfg, method = self.tracks[0].cfg, self.method
         check_torch_device(method)
         if method.torch_device != cfg.sim.device:
             raise ConfigError(
@@ -115,7 +112,7 @@ class ShacRunner(Runner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the networks, or take those of the file."""
-        self._training = ShacTraining(self._method, self._training_batch, track.cfg.seed)
+        self._training = ShacTraining(self.method, self._training_batch, track.cfg.seed)
         if state is not None:
             self._training.restore(state)
 
@@ -129,7 +126,7 @@ class ShacRunner(Runner):
         before = training.episodes
         if track.iteration > 0:
             self.enter("optimise")
-            due = before + self._method.evaluate_every
+            due = before + self.method.evaluate_every
             while training.episodes < due and training.episodes < training.total_episodes:
                 training.train()
             self.enter("evaluate")
@@ -149,7 +146,7 @@ class ShacRunner(Runner):
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
-        return self._training.episodes, self._training.total_episodes, self._method.evaluate_every
+        return self._training.episodes, self._training.total_episodes, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Report how it goes after an evaluation."""
@@ -161,11 +158,7 @@ class ShacRunner(Runner):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy."""
-        save_policy(track.job.run.path, self._method, self._training.policy, self._training.moments())
-
-    @property
-    def _method(self) -> ShacConfig:
-        return self.tracks[0].cfg.method_as(ShacConfig)
+        save_policy(track.job.run.path, self.method, self._training.policy, self._training.moments())
 
 
 class ShacTraining:
@@ -179,13 +172,7 @@ class ShacTraining:
     """
 
     def __init__(self, method: ShacConfig, batch: EpisodeBatch, seed: int) -> None:
-        """Begin.
-
-        Args:
-            method: Widths of the layers, rates and so on.
-            batch: The environments of the training.
-            seed: Seed of the initial weights, of the actions' noise and of the minibatches.
-        """
+        """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
         self._method, self._batch = method, batch
         self._device = torch.device(method.torch_device)
         spaces = Spaces(batch.observation_space, batch.action_space)
@@ -282,11 +269,7 @@ class ShacTraining:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`.
-
-        Raises:
-            ValueError: If it is that of other networks.
-        """
+        """Return to a :meth:`state`; ValueError if it is that of other networks."""
         for name, module in self._modules().items():
             restore_module(module, state[name])
         for name, one in self._optimizers().items():
@@ -323,17 +306,9 @@ class _Drawing(torch.nn.Module):
 
 
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:
-    """Return the TD(lambda) targets of a stretch of an episode that goes on behind it.
-
-    Args:
-        rewards: Shape [T, env].
-        values: Values of the observations before each step and after the last, shape [T + 1, env].
-        gamma: Discount factor.
-        decay: Lambda: 0 looks one step ahead, 1 to the end of the stretch.
-
-    Returns:
-        Shape [T, env].
-    """
+    """Return the TD(lambda) targets, shape [T, env], of a stretch of an episode that goes on behind it, by
+    rewards, shape [T, env], and values before each step and after the last, shape [T + 1, env]. A
+    ``decay`` (lambda) of 0 looks one step ahead, of 1 to the end."""
     targets, ahead = [], values[-1]
     for reward, value in zip(rewards.flip(0), values[1:].flip(0), strict=True):
         ahead = reward + gamma * ((1.0 - decay) * value + decay * ahead)

@@ -64,18 +64,9 @@ class TrajectoryRunner(Runner):
             sequence = self._sequences[number]
             sequence.step(gradient)
             measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
+            done = measured, tried[number], sequence.state()
             seconds = share + time.perf_counter() - start
-            yield (
-                track,
-                Step(
-                    measured,
-                    tried[number],
-                    sequence.state(),
-                    steps_forward=0,
-                    steps_gradient=len(gradient),
-                    seconds=seconds,
-                ),
-            )
+            yield track, Step(*done, steps_forward=0, steps_gradient=len(gradient), seconds=seconds)
 
 
 class UpdateRule:
@@ -90,11 +81,7 @@ class UpdateRule:
     """
 
     def __init__(self, method: TrajectoryConfig) -> None:
-        """Keep nothing yet.
-
-        Args:
-            method: Rates.
-        """
+        """Keep the rates, and nothing yet."""
         self.method = method
         self.state: dict[str, np.ndarray] = {}
 
@@ -138,14 +125,7 @@ class ActionSequence:
     """
 
     def __init__(self, method: TrajectoryConfig, horizon: int, action_dim: int, seed: int) -> None:
-        """Draw the first actions, uniform in +-``method.action_init``.
-
-        Args:
-            method: Update rule and its parameters.
-            horizon: Environment steps T.
-            action_dim: Length A of the action vector.
-            seed: Seed of the draw.
-        """
+        """Draw the first actions, uniform in +-``method.action_init``."""
         self.actions = (2.0 * uniform(seed, (horizon, action_dim)) - 1.0) * method.action_init
         rule: Any = family(method.family).rule(method.optimizer, Callable)  # type: ignore[arg-type]
         self._rule = rule(method)
@@ -164,11 +144,7 @@ class ActionSequence:
         return {"actions": self.actions, "optimizer": dict(self._rule.state)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`.
-
-        Raises:
-            ValueError: If it is that of other actions.
-        """
+        """Return to a :meth:`state`; ValueError if it is that of other actions."""
         if not isinstance(state["optimizer"], Mapping):
             raise ValueError("the optimiser's state is none")
         shape = self.actions.shape

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
 from plab import runners
+from plab.config import Config
 from plab.locks import held, lock_path
 from plab.results import ResultsError, RunFile, read, result_path
 from plab.results.schema import PARTIAL_SUFFIX
@@ -15,11 +16,6 @@ from plab.reuse import SimulatorCache
 from plab.runners.jobs import outcome
 from plab.sweep.plan import plan
 from plab.tally import Outcome
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-    from plab.config import Config
 
 __all__ = ["BatchTask", "Carrier", "carry_here", "look_up", "run_sweep"]
 
@@ -30,16 +26,9 @@ Carrier = Callable[[list[list["Config"]], Callable[[], str]], Iterator[Outcome]]
 def run_sweep(
     cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1
 ) -> Iterator[Outcome]:
-    """Carry out the runs of a sweep that are not finished, and yield how each ended.
-
-    Runs that another process computes are left to it. Should it end before they do, they are taken up here.
-
-    Args:
-        cfgs: The composed and checked configurations.
-        carry: Who computes.
-        size: Runs of a batch, at most; as many as fit the memory if None.
-        processes: How many carry out batches at a time.
-    """
+    """Carry out the runs of a sweep that are not finished, in batches of at most ``size``, or as many as
+    fit the memory, ``processes`` at a time, and yield how each ended. Runs that another process computes
+    are left to it. Should it end before they do, they are taken up here."""
     # The same run given twice is one run.
     wanted = {result_path(cfg): cfg for cfg in cfgs}
     ended: dict[str, Outcome] = {}

@@ -25,36 +25,21 @@ from plab.targets import TargetError
 
 __all__ = ["Refused", "compose_jobs"]
 
-_SEED = "seed"
-"""The key that nothing else in a configuration depends on."""
-
 Compose = Callable[[list[str]], DictConfig]
 """Composes a configuration from overrides, Hydra's own section included."""
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A job whose configuration makes no sense.
-
-    Attributes:
-        overrides: The job's overrides.
-        reason: What is wrong, one line.
-    """
+    """A job, by its overrides, whose configuration makes no sense, and why, in one line."""
 
     overrides: tuple[str, ...]
     reason: str
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], compose: Compose) -> list[Config | Refused]:
-    """Compose and check the configurations of a sweep.
-
-    Args:
-        jobs: The overrides of each job.
-        compose: Hydra's way to compose one.
-
-    Returns:
-        One entry per job, in their order.
-    """
+    """Compose and check the configurations of a sweep by Hydra's way to compose one; one entry per job,
+    given by its overrides, in their order."""
     composer = _Composer(jobs, compose)
     return [composer.job(overrides) for overrides in jobs]
 
@@ -72,7 +57,8 @@ class _Composer:
     def job(self, overrides: Sequence[str]) -> Config | Refused:
         """Return the configuration of a job."""
         parsed = OverridesParser.create().parse_overrides(list(overrides))
-        seed = next((o for o in parsed if o.key_or_group == _SEED and _sets_a_value(o)), None)
+        # Nothing else in a configuration depends on the seed.
+        seed = next((o for o in parsed if o.key_or_group == "seed" and _sets_a_value(o)), None)
         value = None if seed is None else seed.value()
         if seed is not None and type(value) is int:
             parsed.remove(seed)
@@ -104,20 +90,21 @@ class _Composer:
         later = [o for o in parsed if o.key_or_group in self._varying and _sets_a_value(o)]
         first = _lines([override for override in parsed if override not in later])
         if first not in self._composed:
-            composed = self._compose(list(first))
-            with open_dict(composed):
-                del composed["hydra"]
-            self._composed[first] = composed
+            self._composed[first] = self._without_hydra(first)
         config = copy.deepcopy(self._composed[first])
         try:
             for override in later:
                 OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
         except OmegaConfBaseException:
             # A key that does not exist, or a value of the wrong type: Hydra words it better.
-            config = self._compose(list(_lines(parsed)))
-            with open_dict(config):
-                del config["hydra"]
+            config = self._without_hydra(_lines(parsed))
         return config
+
+    def _without_hydra(self, overrides: Sequence[str]) -> DictConfig:
+        composed = self._compose(list(overrides))
+        with open_dict(composed):
+            del composed["hydra"]
+        return composed
 
     def _check(self, cfg: Config) -> str | None:
         """Return what is wrong with scene and target, if anything is."""
@@ -142,10 +129,7 @@ def _varying_keys(jobs: Sequence[Sequence[str]]) -> set[str]:
     common = set.intersection(*lines) if lines else set()
     differing = sorted(set().union(*lines) - common)
     keys = {override.key_or_group for override in OverridesParser.create().parse_overrides(differing)}
-    return {key for key in keys if key in _TOP_LEVEL or "." in key}
-
-
-_TOP_LEVEL = {"variant", "seed_scene", "seed_particles"}
+    return {key for key in keys if key in ("variant", "seed_scene", "seed_particles") or "." in key}
 
 
 def _lines(parsed: Sequence[Override]) -> tuple[str, ...]:

@@ -9,18 +9,16 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from plab import runners
+from plab.config import Config
 from plab.config.checks import cuda_devices
 from plab.errors import ConfigError
 from plab.progress import forward_to, show_several
 from plab.reuse import SimulatorCache
 from plab.sweep.carry import Carrier, look_up
 from plab.tally import Outcome
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["carry_on", "gpus"]
 
@@ -32,11 +30,7 @@ PATIENCE = 30.0
 
 
 def gpus() -> list[str]:
-    """Return the names of the GPUs that this process may use.
-
-    Raises:
-        ConfigError: If there are none.
-    """
+    """Return the names of the GPUs that this process may use; ConfigError if there are none."""
     named = os.environ.get(VISIBLE)
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):
@@ -45,11 +39,7 @@ def gpus() -> list[str]:
 
 
 def carry_on(names: Sequence[str]) -> Carrier:
-    """Return what carries out batches on some GPUs.
-
-    Args:
-        names: The GPUs, as ``CUDA_VISIBLE_DEVICES`` names them.
-    """
+    """Return what carries out batches on some GPUs, named as ``CUDA_VISIBLE_DEVICES`` names them."""
 
     def carry(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
         waiting = list(reversed(batches))

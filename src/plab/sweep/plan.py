@@ -6,18 +6,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from plab.config import RlConfig
+from plab.config import Config, RlConfig
 from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
+from plab.scene import Scene
 from plab.sim.memory import batch_limit
 from plab.sizes import most_environments
-
-if TYPE_CHECKING:
-    from plab.config import Config
-    from plab.scene import Scene
 
 __all__ = ["plan"]
 

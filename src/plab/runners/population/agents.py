@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -13,16 +12,13 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 from torch.optim import Adam
 
-from plab.config import OffPolicyConfig, RlConfig
+from plab.config import Config, OffPolicyConfig, RlConfig
 from plab.families import family
 from plab.runners.population.draws import Block, Draws
 from plab.runners.population.graphs import CapturedUpdate
 from plab.runners.population.networks import Networks, fill, flat
 from plab.runners.population.replay import Replay, Sizes
 from plab.runners.rl_models import Spaces, model_kind, total_steps
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["Agents", "OffPolicyAgents", "first_policy", "trained_policy"]
 
@@ -37,11 +33,8 @@ def first_policy(cfg: Config, spaces: Spaces) -> BasePolicy:
 
 
 def trained_policy(cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
-    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`.
-
-    Raises:
-        ValueError: If they are others.
-    """
+    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`; ValueError if
+    they are others."""
     method = cfg.method_as(RlConfig)
     policy = first_policy(cfg, spaces)
     kind: type[Agents] = family(method.family).agents(method.algorithm)
@@ -77,13 +70,8 @@ class Agents:
     watched = False
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks.
-
-        Args:
-            cfgs: One configuration per agent; all have the same section ``method``.
-            spaces: Spaces of an observation and of an action.
-            device: Where everything is.
-        """
+        """Begin with untrained networks; all configurations, one per agent, have the same section
+        ``method``."""
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
         (observed,), (actions,) = (space.shape for space in spaces)
@@ -111,14 +99,9 @@ class Agents:
 
     @abstractmethod
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
-        """Take what the latest actions led to, and make the updates that are due.
-
-        Args:
-            rewards: Rewards, shape [agent, env].
-            last: Observations after the step, shape [agent, env, entry].
-            observations: What the next step starts from: the same, unless the episodes are over.
-            over: Whether they are.
-        """
+        """Take what the latest actions led to, rewards, shape [agent, env], and the observations after it,
+        shape [agent, env, entry]; make the updates that are due. The next step starts from
+        ``observations``, which are the last ones unless the episodes are ``over``."""
 
     def states(self) -> list[dict[str, Any]]:
         """Return each agent's state: all that further training depends on, except a replay buffer."""
@@ -132,18 +115,16 @@ class Agents:
                 tables[f"{name}_{moment}"] = flat(own, self.count)
         rows = {name: table.detach().cpu().numpy() for name, table in tables.items()}
         shared = {"steps": self.steps, "updates": self.updates}
-        shared |= {f"{name}_steps": self._optimizer_steps(name) for name in self.optimizers}
+        for name, optimizer in self.optimizers.items():
+            shared[f"{name}_steps"] = int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
         return [
             {**shared, **{name: table[k].copy() for name, table in rows.items()}, "random": random}
             for k, random in enumerate(self.draws.states())
         ]
 
     def restore(self, states: Sequence[Mapping[str, Any]]) -> None:
-        """Return to :meth:`states`, of agents that stand at the same step.
-
-        Raises:
-            ValueError: If one of them is that of another agent.
-        """
+        """Return to :meth:`states`, of agents that stand at the same step; ValueError if one is another
+        agent's."""
         for state, own in zip(states, self.states(), strict=True):
             for name, value in own.items():
                 if (shape := np.asarray(state[name]).shape) != np.shape(value):
@@ -179,10 +160,6 @@ class Agents:
         if self.watched:
             for name, row in zip(self.LOSSES, losses, strict=False):
                 self._losses.setdefault(name, []).append(row.clone())
-
-    def _optimizer_steps(self, name: str) -> int:
-        optimizer = self.optimizers[name]
-        return int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
 
     def _block(self, draw: Callable[..., Tensor], *shape: int) -> Block:
         """Return blocks of random numbers of which a checkpoint drops the rest."""
@@ -240,10 +217,6 @@ class OffPolicyAgents(Agents):
             for _ in range(self.sizes.envs if wanted < 0 else wanted):
                 self.updates += 1
                 self.update()
-
-    def read_replay(self, paths: Sequence[Path]) -> None:
-        """Take the replay buffers as they were at :attr:`steps`."""
-        self.replay.read(paths, self.steps // self.sizes.envs)
 
     def _explore(self, observations: Tensor, noise: Tensor) -> Tensor:
         with torch.no_grad():

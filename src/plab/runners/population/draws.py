@@ -58,13 +58,8 @@ class Block:
     """
 
     def __init__(self, draw: Callable[..., Tensor], length: int, *shape: int) -> None:
-        """Take over what draws.
-
-        Args:
-            draw: Method of :class:`Draws`.
-            length: Entries of a block.
-            shape: Shape of an entry of one agent.
-        """
+        """Take over a method of :class:`Draws`, and the length of a block and the shape of an agent's
+        entry."""
         self._draw, self._shape = draw, (length, *shape)
         self.drop()
 

@@ -35,11 +35,7 @@ class CapturedUpdate:
     """
 
     def __init__(self, update: Callable[..., Tensor]) -> None:
-        """Take over an update.
-
-        Args:
-            update: Function of tensors that returns one.
-        """
+        """Take over an update, a function of tensors that returns one."""
         self._update = update
         self._recordings: dict[tuple[torch.Size, ...], _Recording] = {}
         self._calls = 0
@@ -78,12 +74,8 @@ class CapturedUpdate:
 
 
 def require_capturable(optimizer: Optimizer, lr: float) -> None:
-    """Set an optimiser's learning rate where a recorded step reads it, and make the step one to record.
-
-    Args:
-        optimizer: Adam of parameters on a CUDA device.
-        lr: Learning rate.
-    """
+    """Set the learning rate of Adam on a CUDA device where a recorded step reads it, and make the step one
+    to record."""
     for group in optimizer.param_groups:
         group["capturable"] = True
         if isinstance(group["lr"], Tensor):

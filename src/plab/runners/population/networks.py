@@ -28,13 +28,7 @@ class Networks:
     def __init__(
         self, policies: Sequence[nn.Module], parts: Mapping[str, Sequence[str]], device: torch.device
     ) -> None:
-        """Stack copies of the policies' parameters.
-
-        Args:
-            policies: One policy per agent.
-            parts: Names of the modules of each part in a policy.
-            device: Where the stacks are to be.
-        """
+        """Stack copies of the policies' parameters; ``parts`` names the modules of each part in a policy."""
         named = [dict(policy.named_parameters()) for policy in policies]
         self._modules = {part: tuple(modules) for part, modules in parts.items()}
         self._count = len(policies)
@@ -90,15 +84,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 def mlp(x: Tensor, part: Part, name: str, activation: nn.Module, *, last: bool) -> Tensor:
-    """Evaluate stacked ``nn.Sequential`` of linear layers with an activation after each.
-
-    Args:
-        x: Shape [stack, row, in].
-        part: The parameters.
-        name: Name of the sequence in the part, empty if it is the part.
-        activation: Function after each layer.
-        last: Whether the last layer has none after it.
-    """
+    """Evaluate stacked ``nn.Sequential`` of linear layers, named ``name`` in the part or the part itself,
+    for x of shape [stack, row, in]; an activation is after each, but the last if ``last``."""
     prefix = f"{name}." if name else ""
     numbers = [int(n[len(prefix) : -len(".weight")]) for n in part if n.startswith(prefix) and "weight" in n]
     for number in sorted(numbers):
@@ -128,13 +115,8 @@ def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
 
 
 def descend(optimizer: Adam, losses: Tensor, longest: float | None = None) -> None:
-    """Make one step of an optimiser against the loss of each agent.
-
-    Args:
-        optimizer: Adam of stacked parameters.
-        losses: Shape [agent]; none depends on another agent's parameters.
-        longest: Largest norm of an agent's gradient, longer ones are scaled down; None sets no limit.
-    """
+    """Make one step of an optimiser against the loss of each agent, shape [agent], none of which depends
+    on another's parameters; gradients longer than ``longest`` are scaled down to that, agent by agent."""
     parameters = optimizer.param_groups[0]["params"]
     gradients = torch.autograd.grad(losses.sum(), parameters)
     if longest is not None:

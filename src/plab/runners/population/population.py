@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from plab.config import RlConfig
+from plab.config import Config, RlConfig
+from plab.envs.core import Transition
 from plab.envs.tensors import TensorEnv
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
 from plab.runners.environments import torch_settings
 from plab.runners.population.agents import Agents
 from plab.runners.rl_models import Spaces, cycle_steps, total_steps
-
-if TYPE_CHECKING:
-    from plab.config import Config
-    from plab.envs.core import Transition
 
 __all__ = ["Evaluation", "Population", "population_settings"]
 
@@ -38,13 +35,9 @@ def population_settings(method: RlConfig) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an episode of an agent's deterministic policy gave.
-
-    Attributes:
-        measures: Values of :func:`plab.runners.common.episode_columns`.
-        actions: Actions, shape [T, A].
-        failure: Why it broke off, empty if it did not.
-    """
+    """What an episode of an agent's deterministic policy gave: values of
+    :func:`plab.runners.common.episode_columns`, actions, shape [T, A], and why it broke off, empty if it
+    did not."""
 
     measures: dict[str, float]
     actions: np.ndarray
@@ -70,15 +63,9 @@ class Population:
         evaluation: TensorEnv,
         states: Sequence[Mapping[str, Any] | None],
     ) -> None:
-        """Build the agents; those with a replay buffer have to read it afterwards.
-
-        Args:
-            cfgs: One configuration per agent, alike in ``method``.
-            numbers: Number of each agent among those for whom there are environments.
-            training: Environments, N for each number.
-            evaluation: Environments of the evaluation, one for each number.
-            states: One of :meth:`states` per agent, or None for all of them.
-        """
+        """Build the agents, of configurations alike in ``method``, new or from one of :meth:`states` each;
+        those with a replay buffer have to read it afterwards. Their ``numbers`` are among those for whom
+        there are environments: of the training N each, of the evaluation one."""
         method = cfgs[0].method_as(RlConfig)
         self._training, self._evaluation = training, evaluation
         self._device = torch.device(method.torch_device)
@@ -157,11 +144,6 @@ class Population:
         self._ended = []
         agents = range(ended.shape[2])
         return [{n: float(np.mean(ended[:, i, k].copy())) for i, n in enumerate(names)} for k in agents]
-
-    def watch(self) -> None:
-        """Keep the losses of the updates from now on."""
-        for stack in self.stacks:
-            stack.watched = True
 
     def take_losses(self) -> list[dict[str, float]]:
         """Return each agent's mean losses over the updates since the last call, if they are kept."""

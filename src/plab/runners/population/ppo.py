@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from plab.config import PpoConfig
+from plab.config import Config, PpoConfig
 from plab.runners.population.agents import Agents
 from plab.runners.population.graphs import require_capturable
 from plab.runners.population.networks import adam, descend, linear, mlp
 from plab.runners.rl_models import CLIP, Spaces, entropy_weight, observed_steps, rollout_steps
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["PpoAgents", "Statistics"]
 
@@ -143,12 +140,8 @@ class PpoAgents(Agents):
         return ((observations - mean) / std).clamp(-CLIP, CLIP).float()
 
     def judge(self, last_values: Tensor, over: Sequence[bool]) -> None:
-        """Compute advantages and returns of the rollout.
-
-        Args:
-            last_values: Values after the last step, shape [agent, env].
-            over: Whether the episodes were over after each step.
-        """
+        """Compute advantages and returns of the rollout, by the values after its last step, shape [agent,
+        env], and whether the episodes were over after each step."""
         gamma, table = self.method.gamma, self.rollout
         goes_on = 1.0 - torch.tensor(over, dtype=torch.float32, device=self.device)
         values = table["values"]
@@ -163,14 +156,9 @@ class PpoAgents(Agents):
         table["returns"].copy_(table["advantages"] + values)
 
     def minibatch(self, numbers: Tensor) -> Tensor:
-        """Update from some transitions of the rollout.
-
-        Args:
-            numbers: Which, shape [agent, row]: step after step of the first environment, then the next.
-
-        Returns:
-            Losses of policy, value and entropy, shape [3, agent].
-        """
+        """Update from some transitions of the rollout, numbered step after step of the first environment,
+        then the next, shape [agent, row]; return the losses of policy, value and entropy, shape [3,
+        agent]."""
         m = self.method
         where = (numbers + torch.arange(self.count, device=self.device).unsqueeze(1) * self._size).reshape(-1)
         observations, actions = (

@@ -19,14 +19,8 @@ __all__ = ["Replay", "Samples", "Sizes", "require_file"]
 
 
 class Sizes(NamedTuple):
-    """Sizes of an agent's episodes.
-
-    Attributes:
-        envs: Environments of an agent, N.
-        horizon: Steps T of an episode.
-        observed: Entries of an observation.
-        actions: Components of an action.
-    """
+    """Of an agent's episodes: environments N, steps T of an episode, entries of an observation, components
+    of an action."""
 
     envs: int
     horizon: int
@@ -39,12 +33,7 @@ class Sizes(NamedTuple):
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
     def capacity(self, method: OffPolicyConfig, total_steps: int) -> int:
-        """Return how many episodes of N environments a buffer holds.
-
-        Args:
-            method: Has the transitions that can be sampled.
-            total_steps: Transitions of the whole training.
-        """
+        """Return how many episodes of N environments a buffer holds, in a training of so many transitions."""
         window = max(method.buffer_size // self.envs, 1)
         # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
         return min(math.ceil(total_steps / self.envs / self.horizon), math.ceil(window / self.horizon) + 1)
@@ -67,15 +56,8 @@ class Replay:
     """
 
     def __init__(self, agents: int, sizes: Sizes, capacity: int, window: int, device: torch.device) -> None:
-        """Make room.
-
-        Args:
-            agents: Number of agents K.
-            sizes: Sizes of their episodes.
-            capacity: Episodes of N environments per agent.
-            window: Steps of N environments that can be sampled, the latest ones.
-            device: Where the buffers are.
-        """
+        """Make room for ``capacity`` episodes of each agent; of the steps of N environments the last
+        ``window`` can be sampled."""
         self.added = 0
         self._agents, self._sizes, self._capacity, self._window = agents, sizes, capacity, window
         n, horizon = sizes.envs, sizes.horizon
@@ -108,11 +90,8 @@ class Replay:
         self._count.fill_(max(count, 1))
 
     def sample(self, numbers: Tensor) -> Samples:
-        """Take transitions, uniformly from those that can be sampled.
-
-        Args:
-            numbers: Large random integers, shape [agent, row].
-        """
+        """Take transitions, uniformly from those that can be sampled, by large random integers, shape
+        [agent, row]."""
         n, horizon = self._sizes.envs, self._sizes.horizon
         env, steps = numbers % n, self._first + numbers // n % self._count
         episode = self._agent * self._capacity + steps // horizon % self._capacity
@@ -134,15 +113,8 @@ class Replay:
         return 4 * self._agents * self._capacity * self._sizes.entries
 
     def write(self, agent: int, path: Path) -> None:
-        """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew.
-
-        Args:
-            agent: Number of the agent.
-            path: The file.
-
-        Raises:
-            ResultsError: If it cannot be written.
-        """
+        """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew;
+        ResultsError if that fails."""
         since, last = self._written[agent], self.added // self._sizes.horizon
         try:
             with path.open("r+b" if since else "wb") as file:
@@ -156,15 +128,8 @@ class Replay:
         self._written[agent] = last
 
     def read(self, paths: Sequence[Path], added: int) -> None:
-        """Take what the agents' files hold.
-
-        Args:
-            paths: A file per agent.
-            added: Steps of N environments, in whole episodes, that were added by earlier processes.
-
-        Raises:
-            ResultsError: If a file cannot be read.
-        """
+        """Take what the agents' files hold of steps of N environments, in whole episodes; ResultsError if
+        that fails."""
         self._count_to(added)
         last = added // self._sizes.horizon
         self._written = [last] * self._agents
@@ -189,10 +154,6 @@ class Replay:
 
 
 def require_file(path: Path, sizes: Sizes, episodes: int) -> None:
-    """Check that an agent's file holds some episodes of N environments.
-
-    Raises:
-        ResultsError: If it does not.
-    """
+    """Raise ResultsError unless an agent's file holds some episodes of N environments."""
     if episodes and (not path.exists() or path.stat().st_size < episodes * sizes.entries * 4):
         raise ResultsError(f"{path}, the replay buffer of the run, is gone: start afresh with force=true")

@@ -21,7 +21,7 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import environment_key
+from plab.runners.environments import PolicyRunner, environment_key
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
 from plab.runners.population.agents import OffPolicyAgents, trained_policy
@@ -29,29 +29,30 @@ from plab.runners.population.population import Population, population_settings
 from plab.runners.population.replay import Sizes, require_file
 from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import Spaces, total_steps
-from plab.runners.runner import Runner, Step, Track
+from plab.runners.runner import Step, Track
 
 __all__ = ["PopulationRunner"]
 
 
-class PopulationRunner(Runner):
+class PopulationRunner(PolicyRunner):
     """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
 
     Runs that stand at different evaluations are trained one group after the other, until all are abreast.
     """
 
+    kind = RlConfig
     _population: Population | None = None
     _members: Sequence[Track] = ()
     _rate = 0.0
 
     def context(self) -> AbstractContextManager[Any]:
         """Give torch its settings."""
-        return population_settings(self._method)
+        return population_settings(self.method)
 
     def build(self) -> None:
         """Make the environments of the training, and those in the hard contact model that judge."""
-        check_torch_device(self._method)
-        cfgs, method = [track.cfg for track in self.tracks], self._method
+        check_torch_device(self.method)
+        cfgs, method = [track.cfg for track in self.tracks], self.method
         kinds = (method.num_envs, method.contact), (1, "hard")
         self._spaces = Spaces(*spaces(build_scenes(cfgs)))
         (observed,), (actions,) = (space.shape for space in self._spaces)
@@ -80,7 +81,7 @@ class PopulationRunner(Runner):
         if state is not None:
             # Now, where what does not fit is answered.
             trained_policy(track.cfg, self._spaces, state)
-        if isinstance(self._method, OffPolicyConfig) and self.has_more(track):
+        if isinstance(self.method, OffPolicyConfig) and self.has_more(track):
             try:
                 require_file(_replay_path(track), self._sizes, self._episodes(state) // self._sizes.envs)
             except ResultsError as error:
@@ -103,7 +104,7 @@ class PopulationRunner(Runner):
         if least > 0:
             self.enter("optimise", members)
             rows = members[0].job.run.result.iterations
-            population.train(int(rows["episodes"].iloc[-1]) + self._method.evaluate_every)
+            population.train(int(rows["episodes"].iloc[-1]) + self.method.evaluate_every)
             failures = population.take_failures()
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
@@ -116,7 +117,9 @@ class PopulationRunner(Runner):
                 track.fail(failure)
                 continue
             try:
-                self._write_replay(population, place, track)
+                stack, number = population.place(place)
+                if isinstance(stack, OffPolicyAgents):
+                    stack.replay.write(number, _replay_path(track))
                 trained_by = {f"train/{name}": loss for name, loss in losses[place].items()}
                 track.log.write(trained_by, population.steps)
             except ResultsError as error:
@@ -132,7 +135,7 @@ class PopulationRunner(Runner):
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
         total = self._total // self._sizes.horizon
-        return self._least(self.tracks), total, self._method.evaluate_every
+        return self._least(self.tracks), total, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Report how the agents that were evaluated do on average, and the transitions of all per second."""
@@ -149,9 +152,9 @@ class PopulationRunner(Runner):
         state = track.job.run.result.resume or {}
         policy = trained_policy(track.cfg, self._spaces, state)
         moments = None
-        if getattr(self._method, "normalise", False):
+        if getattr(self.method, "normalise", False):
             moments = state["observation_mean"], state["observation_var"]
-        save_policy(track.job.run.path, self._method, policy, moments)
+        save_policy(track.job.run.path, self.method, policy, moments)
         _replay_path(track).unlink(missing_ok=True)
 
     def _population_of(self, members: Sequence[Track]) -> Population:
@@ -169,27 +172,17 @@ class PopulationRunner(Runner):
                     f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
                 ) from error
             self._members = members
-            if any(track.log.wanted for track in members):
-                self._population.watch()
             paths = [_replay_path(track) for track in members]
             for stack in self._population.stacks:
+                stack.watched = any(track.log.wanted for track in members)
                 own, paths = paths[: stack.count], paths[stack.count :]
                 if isinstance(stack, OffPolicyAgents) and stack.steps:
-                    stack.read_replay(own)
+                    stack.replay.read(own, stack.steps // stack.sizes.envs)
         return self._population
 
-    def _write_replay(self, population: Population, agent: int, track: Track) -> None:
-        stack, number = population.place(agent)
-        if isinstance(stack, OffPolicyAgents):
-            stack.replay.write(number, _replay_path(track))
-
     def _require_memory(self) -> None:
-        """Find out whether there is room for all replay buffers; on the CPU there always is for one.
-
-        Raises:
-            RunError: If there is not.
-        """
-        method, cfg = self._method, self.tracks[0].cfg
+        """Raise RunError if there is no room for all replay buffers; on the CPU there always is for one."""
+        method, cfg = self.method, self.tracks[0].cfg
         if not isinstance(method, OffPolicyConfig):
             return
         each = 4 * self._sizes.entries * self._sizes.capacity(method, self._total)
@@ -210,10 +203,6 @@ class PopulationRunner(Runner):
 
     def _episodes(self, state: Mapping[str, Any] | None) -> int:
         return 0 if state is None else int(state["steps"]) // self._sizes.horizon
-
-    @property
-    def _method(self) -> RlConfig:
-        return self.tracks[0].cfg.method_as(RlConfig)
 
 
 def _replay_path(track: Track) -> Path:

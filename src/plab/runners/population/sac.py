@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from plab.config import Config
 from plab.runners.population.agents import OffPolicyAgents
-from plab.runners.population.networks import Part, adam, descend, follow, linear, mlp, twin_values
+from plab.runners.population.networks import adam, descend, follow, linear, mlp, twin_values
 from plab.runners.rl_models import Spaces
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["SacAgents"]
 
@@ -68,16 +66,9 @@ class SacAgents(OffPolicyAgents):
         self._note(self._captured(self.descent, *drawn))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
-        """Update entropy coefficient, critics, actor and targets.
-
-        Args:
-            numbers: Which transitions; see :meth:`plab.runners.population.replay.Replay.sample`.
-            noise: Standard normal noise of the actions, shape [agent, row, action].
-            next_noise: That of the next actions.
-
-        Returns:
-            Entropy coefficient, its loss, and those of critics and actor, shape [4, agent].
-        """
+        """Update entropy coefficient, critics, actor and targets from some transitions, see
+        :meth:`plab.runners.population.replay.Replay.sample`, with standard normal noise of the actions and
+        of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         own_actions, log_prob = self._drawn(observations, noise)
@@ -104,7 +95,9 @@ class SacAgents(OffPolicyAgents):
         """Return mean and logarithm of the standard deviation of actions before tanh."""
         actor = self.networks["actor"]
         latent = mlp(observations, actor, "latent_pi", RELU, last=False)
-        mean, log_std = (linear(latent, *_layer(actor, name)) for name in ("mu", "log_std"))
+        mean, log_std = (
+            linear(latent, actor[f"{name}.weight"], actor[f"{name}.bias"]) for name in ("mu", "log_std")
+        )
         return mean, log_std.clamp(*LOG_STD)
 
     def _drawn(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +108,3 @@ class SacAgents(OffPolicyAgents):
         # Of the normal distribution at mean + std noise.
         density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         return actions, (density - torch.log(1.0 - actions.square() + EPSILON)).sum(2)
-
-
-def _layer(part: Part, name: str) -> tuple[Tensor, Tensor]:
-    return part[f"{name}.weight"], part[f"{name}.bias"]

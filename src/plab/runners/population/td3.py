@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from plab.config import Td3Config
+from plab.config import Config, Td3Config
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.population.replay import Samples
 from plab.runners.rl_models import Spaces
-
-if TYPE_CHECKING:
-    from plab.config import Config
 
 __all__ = ["Td3Agents"]
 
@@ -64,15 +61,9 @@ class Td3Agents(OffPolicyAgents):
         self._note(self._captured(update, self._numbers.next(), self._smoothing.next()))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
-        """Update the critics.
-
-        Args:
-            numbers: Which transitions; see :meth:`plab.runners.population.replay.Replay.sample`.
-            noise: Standard normal noise of the target policy, shape [agent, row, action].
-
-        Returns:
-            Their losses, shape [1, agent].
-        """
+        """Update the critics from some transitions, see
+        :meth:`plab.runners.population.replay.Replay.sample`, with standard normal noise of the target
+        policy, shape [agent, row, action]; losses of shape [1, agent]."""
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
     def both(self, numbers: Tensor, noise: Tensor) -> Tensor:
