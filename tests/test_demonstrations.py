@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import plab.demonstrations as demonstrations
+import synthetic
+from plab.bench.results import synthetic_run
 from plab.cli.demonstrations import main, replay
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, load_actions, recorded_scores, save_actions
-from plab.demonstrations.search import carry, search
+from plab.results import config_dict
 from plab.targets import demonstration
 
 pytestmark = pytest.mark.physics
@@ -92,35 +94,30 @@ def test_recording_replaces_one_demonstration_and_keeps_the_rest(records):
 
 def test_a_scripted_demonstration_reaches_its_target_and_rest_does_not(device):
     cfgs = [config("RollingPin", v, *COARSE, f"sim.device={device}") for v in ("1", "4")]
-    for item in replay(cfgs):
+    for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs]):
         assert item.scores.score > 0.95
         assert item.idle.score < 0.5
 
 
-def test_a_search_improves_on_where_it_starts(device, records):
-    # At the start the ball already reaches into the target, so that every motion shows in the score.
-    near = "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]"
-    cfgs = [config("Move", "1", *COARSE, "sim.horizon=6", near, f"sim.device={device}")]
-    (records / "Move.csv").unlink()
-    before = search(cfgs, [0.1], iterations=0, every=1)[0]
-    after = search(cfgs, [0.1], iterations=8, every=2)[0]
-    assert after.score > before.score
-    assert after.actions.shape == (6, 6) and np.abs(after.actions).max() <= 1
-
-
-def test_bodies_are_carried_the_straight_way_to_the_nearest_goal():
-    cfg = config("TripleMove", "5")
-    scene = build_scene(cfg)
-    for actions in carry(scene, cfg.task.target):
-        assert actions.shape == (50, 18) and np.abs(actions).max() <= 1
-        # Each pair of spheres moves as one, but for its grip, and to another goal than the others.
-        ways = (actions.sum(axis=0) * 0.01).reshape(6, 3)
-        np.testing.assert_allclose(ways[0::2, 1:], ways[1::2, 1:], atol=1e-6)
-        ends = np.array([body.center for body in scene.bodies]) + (ways[0::2] + ways[1::2]) / 2
-        goals = np.array([body["center"] for body in cfg.task.target["bodies"].values()])
-        np.testing.assert_allclose(np.sort(ends, axis=0), np.sort(goals, axis=0), atol=3e-3)
-    rope = config("Rope", "1")
-    assert carry(build_scene(rope), rope.task.target) == []
+def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records, capsys):
+    coarse = [*COARSE, f"sim.device={device}"]
+    better = load_actions("Move", "1")
+    results = records / "results"
+    given = ((better, 0.5, "finished"), (-better, 0.4, "finished"), (-better, 0.9, "stopped"))
+    for seed, (actions, score, status) in enumerate(given):
+        cfg = load_config(["task=Move", "variant=1", f"seed={seed}", f"results_dir={results}", *coarse])
+        run = synthetic_run(config_dict(cfg), rows=3, score=score)
+        run.best_actions, run.status = actions, status
+        synthetic.save(run)
+    worse = {v: 0.0 * load_actions("Move", v) for v in VARIANTS}
+    for variant, actions in worse.items():
+        save_actions("Move", variant, actions, ["0_x", "0_y", "0_z", "1_x", "1_y", "1_z"], 0.0)
+    assert (
+        main(["--task", "Move", "--from", str(results), *(w for w in coarse if w != "progress=false")]) == 0
+    )
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[-5:]]
+    assert [float(row[-2]) > 0 for row in rows] == [True, False, False, False, False]
+    assert np.array_equal(load_actions("Move", "1"), worse["1"])  # only --record writes
 
 
 @pytest.mark.parametrize(
@@ -140,7 +137,8 @@ def test_mistakes_are_told_in_one_line(arguments, message, capsys):
 @pytest.mark.parametrize("task", TASKS)
 def test_demonstrations_reach_what_is_recorded(task, device):
     """At full resolution; float32 differs from float64 by up to 0.005, CUDA runs from each other by less."""
-    replays = replay([config(task, variant, f"sim.device={device}") for variant in VARIANTS])
+    cfgs = [config(task, variant, f"sim.device={device}") for variant in VARIANTS]
+    replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
     expected = recorded_scores().set_index(["task", "variant"])["score"]
     for item in replays:
         recorded = expected[(task, item.cfg.variant)]

@@ -10,14 +10,15 @@ from typing import NoReturn
 
 from plab.config.suite import suite_tasks
 from plab.errors import ArgumentError, pick
+from plab.examples import EXAMPLES, resolve
 
 __all__ = [
     "Parser",
     "folder",
     "name_flag",
     "positive",
-    "rates",
     "refuse_task",
+    "results_source",
     "seed",
     "sources_and_words",
     "task_list",
@@ -60,17 +61,6 @@ def seed(text: str) -> int:
     return positive(text, 0)
 
 
-def rates(text: str) -> list[float]:
-    """Read learning rates with commas between them."""
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if not numbers or not all(0.0 < number < float("inf") for number in numbers):
-        raise ArgumentTypeError(f"'{text}' is no list of numbers above 0, such as 0.1,0.01")
-    return numbers
-
-
 def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Tell folders and archives from words that choose among their runs, as ``task=Rope`` does.
 
@@ -100,6 +90,12 @@ def folder(text: str) -> Path:
     if not text.strip():
         raise ArgumentTypeError("is empty: give the name of a folder, or . for this one")
     return Path(text)
+
+
+def results_source(text: str) -> Path:
+    """Read a folder, file or archive of results, or a word that stands for real runs."""
+    # As a path ./example would be the word.
+    return resolve(text) if text in EXAMPLES else folder(text)
 
 
 def to_write(text: str) -> Path:

@@ -1,9 +1,9 @@
-"""Replay, record or search for demonstrations.
+"""Replay and record demonstrations.
 
 python -m plab.demonstrations                          replay all and print a table
 python -m plab.demonstrations --task Torus,Rope        only these
-python -m plab.demonstrations --record                 record the scripts' own actions and what they reach
-python -m plab.demonstrations --search --task Move     search for better ones, record them (geometric targets)
+python -m plab.demonstrations --from results           the best runs of some results where they score more
+python -m plab.demonstrations --record                 record what is replayed and what it reaches
 
 More overrides of the configuration, such as sim.device=cuda, may follow.
 """
@@ -14,22 +14,23 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from plab.cli.arguments import Parser, positive, rates, refuse_task, seed, task_list, to_write
+from plab.cli.arguments import Parser, refuse_task, results_source, task_list, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import markdown, print_table
-from plab.config import Config, ConfigError, TrajectoryConfig, build_scene, load_config
+from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import IDLE, require_effect
-from plab.demonstrations import action_names, known_actions, recorded_scores, save_actions
-from plab.demonstrations.search import search
+from plab.demonstrations import action_names, known_actions, save_actions
 from plab.objective import Scores
 from plab.problem import Problem
+from plab.render.recording import stored
+from plab.results.loading import Row, readable_rows
 from plab.targets import EPISODE_STEPS
+from plab.targets.scripted import DECIMALS
 
 __all__ = ["Replay", "main", "replay"]
 
@@ -41,23 +42,6 @@ plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
 [suite.md](suite.md#demonstrations) explains.
 
 """
-
-
-SEARCH: dict[str, Any] = {"lr": [0.1, 0.03, 0.01], "iterations": 200, "every": 10, "seed": 0}
-"""What ``--search`` does unless told otherwise."""
-
-_NOT_SEARCHED = (
-    "name",
-    "optimizer",
-    "lr",
-    "lr_by_task",
-    "contact_by_task",
-    "momentum",
-    "max_gradient_norm",
-    "max_gradient_norm_by_numbers",
-    "iterations",
-)
-"""Settings of the method that ``--search`` has flags of its own for, or does not use."""
 
 
 @dataclass(frozen=True)
@@ -82,14 +66,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     ]
     for cfgs in tasks:
         check_sources(cfgs[0])
-    if args.search:
-        _require_searchable([cfgs[0] for cfgs in tasks])
+    runs = [] if args.source is None else readable_rows(args.source)[0]
     for cfgs in tasks:
-        if args.search or args.record:
+        if args.record:
             _require_own_resolution(cfgs[0])
-        if args.search and _is_geometric(cfgs[0]):
-            _search(cfgs, args)
-        replays = replay(cfgs)
+        replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
+        found = [_found(cfg, runs) for cfg in cfgs]
+        if any(actions is not None for actions in found):
+            pairs = zip(replays, replay(cfgs, found), strict=True)
+            replays = [max(pair, key=lambda item: item.scores.score) for pair in pairs]
         for item in replays if args.record else ():
             names = action_names(build_scene(item.cfg))
             save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
@@ -97,17 +82,32 @@ def main(argv: Sequence[str] | None = None) -> None:
     _show(rows, args.markdown)
 
 
-def replay(cfgs: Sequence[Config]) -> list[Replay]:
-    """Replay the demonstrations of configurations that fit into one batch, and an episode without any motion;
-    those without a demonstration are replayed at rest."""
+def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[Replay]:
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch, and an episode without
+    motion, which takes the place of actions that are None."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
-    known = [known_actions(cfg) for cfg in cfgs]
-    actions = np.stack([still if item is None else item for item in known])
-    reached = problem.rollout(actions, gradient=False).scores
-    idle = problem.rollout(np.zeros_like(actions), gradient=False).scores
-    return [Replay(*item) for item in zip(cfgs, actions, reached, idle, strict=True)]
+    tried = np.stack([still if item is None else item for item in actions])
+    reached = problem.rollout(tried, gradient=False).scores
+    idle = problem.rollout(np.zeros_like(tried), gradient=False).scores
+    return [Replay(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
+
+
+def _found(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
+    """Return the actions of the run with the highest score that has a configuration's scene and target,
+    rounded as they are recorded; None without one, or where a script's actions are the demonstration."""
+    if "seed" in cfg.task.target:
+        return None
+    names = cfg.task.name, cfg.variant
+    fitting = [row for row in runs if (row.values["task"], row.values["variant"]) == names]
+    for row in sorted(fitting, key=lambda row: np.nan_to_num(row.values["score_best"]), reverse=True):
+        own = row.config["targets"]["source"] is None and row.config["task"]["target"] == cfg.task.target
+        if own and row.values["status"] == "finished":
+            run, actions = stored(row.path)
+            if build_scene(run) == build_scene(cfg):
+                return np.round(actions, DECIMALS)
+    return None
 
 
 def _require_own_resolution(cfg: Config) -> None:
@@ -116,33 +116,6 @@ def _require_own_resolution(cfg: Config) -> None:
     if build_scene(cfg) != build_scene(own):
         why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
         raise ConfigError(why)
-
-
-def _is_geometric(cfg: Config) -> bool:
-    """Return whether the target is no outcome of a script, whose actions are the demonstration."""
-    return "seed" not in cfg.task.target
-
-
-def _require_searchable(cfgs: Sequence[Config]) -> None:
-    """Refuse a search for what is known, or by a method without Adam's settings."""
-    if not any(map(_is_geometric, cfgs)):
-        names = ", ".join(cfg.task.name for cfg in cfgs)
-        raise ConfigError(
-            f"--search has no effect on {names}: their targets are made by scripts; leave it out"
-        )
-    for cfg in cfgs:
-        if not isinstance(cfg.method, TrajectoryConfig):
-            raise ConfigError(
-                f"--search takes the settings of adam, gd or adam_h: leave out method={cfg.method.name}"
-            )
-
-
-def _search(cfgs: Sequence[Config], args: argparse.Namespace) -> None:
-    known = {(row.task, row.variant): row.score for row in recorded_scores().itertuples()}
-    names = action_names(build_scene(cfgs[0]))
-    for cfg, found in zip(cfgs, search(cfgs, args.lr, args.iterations, args.every, args.seed), strict=True):
-        if found.score > known.get((cfg.task.name, cfg.variant), -1.0):
-            save_actions(cfg.task.name, cfg.variant, found.actions, names, found.score)
 
 
 def _row(item: Replay) -> dict[str, object]:
@@ -178,20 +151,10 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
+    what = "of these results the best runs, where they score more than what is known (geometric targets)"
+    parser.add_argument("--from", dest="source", type=results_source, metavar="RESULTS", help=what)
     parser.add_argument("--record", action="store_true", help="record what is replayed")
-    parser.add_argument("--search", action="store_true", help="search for better ones (geometric targets)")
-    parser.add_argument("--lr", type=rates, help="--search: learning rates of random starts: 0.1,0.01")
-    parser.add_argument("--iterations", type=positive, help="--search: updates of each candidate")
-    parser.add_argument("--every", type=positive, help="--search: updates between evaluations")
-    parser.add_argument("--seed", type=seed, help="--search: seed of the first actions")
     options = parser.parse_intermixed_args(argv)
     refuse_task(parser, options.overrides)
-    given = {name: value for name in SEARCH if (value := getattr(options, name)) is not None}
-    if given and not options.search:
-        parser.error(f"--{next(iter(given))} has no effect without --search: leave it out")
-    vars(options).update(SEARCH | given)
-    idle = tuple(f"method.{key}" for key in _NOT_SEARCHED) if options.search else ("method", "progress")
-    require_effect(
-        options.overrides, (*idle, "seed", *(key for key in IDLE if key != "progress")), "demonstrations"
-    )
+    require_effect(options.overrides, ("method", "seed", *IDLE), "demonstrations")
     return options

@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from plab.cli.arguments import Parser, folder, positive, sources_and_words
+from plab.cli.arguments import Parser, folder, positive, results_source, sources_and_words
 from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
@@ -90,12 +90,7 @@ def _add_forms(parser: Parser) -> None:
 
 def _add_sources(parser: Parser) -> None:
     what = f"each a {_SOURCES} (default: results)"
-    parser.add_argument("sources", nargs="*", type=_source, default=[Path("results")], help=what)
-
-
-def _source(text: str) -> Path:
-    # As a path ./example would be the word.
-    return resolve(text) if text in EXAMPLES else folder(text)
+    parser.add_argument("sources", nargs="*", type=results_source, default=[Path("results")], help=what)
 
 
 def _names(text: str) -> list[str]:
@@ -127,7 +122,7 @@ def _pack_arguments(parser: Parser) -> None:
 
 def _unpack_arguments(parser: Parser) -> None:
     """Make files of the runs of an archive; files that are there stay."""
-    parser.add_argument("archive", type=_source, help="archive to read")
+    parser.add_argument("archive", type=results_source, help="archive to read")
     parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
     parser.set_defaults(run=_unpack)
 

@@ -1,9 +1,8 @@
 """Reference demonstrations: for every configuration of the suite the best actions that are known.
 
-For a scripted target they are the script's own; for a geometric one they were found by
-:mod:`plab.demonstrations.search`. One file per task, ``<Task>.csv``, has a row per variant and environment
-step; ``scores.csv`` says what they reached when they were recorded. ``python -m plab.demonstrations`` replays
-them all.
+For a scripted target they are the script's own, for a geometric one the best of all runs. One file per
+task, ``<Task>.csv``, has a row per variant and environment step; ``scores.csv`` says what they reached when
+they were recorded. ``python -m plab.demonstrations`` replays them all.
 """
 
 from __future__ import annotations
