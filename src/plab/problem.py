@@ -106,7 +106,14 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
     """
     sim, method = cfg.sim, cfg.method
     terms = make_terms(method.loss_weights, method.loss_terms)
-    return Simulator(scenes, terms=terms, precision=sim.precision, device=sim.device, memory_mb=sim.memory_mb)
+    return Simulator(
+        scenes,
+        terms=terms,
+        precision=sim.precision,
+        device=sim.device,
+        memory_mb=sim.memory_mb,
+        deterministic=sim.deterministic,
+    )
 
 
 def _kinds(cfgs: Sequence[Config]) -> list[str]:

@@ -126,6 +126,7 @@ def build(
         precision=cfg.sim.precision,
         device=cfg.sim.device,
         memory_mb=cfg.sim.memory_mb,
+        deterministic=cfg.sim.deterministic,
         skips=skips or Skips(),
     )
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)

@@ -32,6 +32,7 @@ class SimConfig(ranges.Section):
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
         memory_mb: Memory of the simulator with a gradient [MB]; checkpoints are spaced to fit.
+        deterministic: Whether CUDA gives the same bits in every run and batch, as the CPU does.
         grid_size: Grid nodes per axis.
         dt: Time step of one substep [s].
         substeps: Substeps per environment step.
@@ -42,6 +43,7 @@ class SimConfig(ranges.Section):
     precision: str = field(metadata=ranges.within(ranges.one_of, PRECISIONS))
     device: str = field(metadata=ranges.within(ranges.one_of, DEVICES))
     memory_mb: float = field(metadata=ranges.POSITIVE)
+    deterministic: bool
     grid_size: int = field(metadata=ranges.within(ranges.at_least, 8))
     dt: float = field(metadata=ranges.POSITIVE)
     substeps: int = field(metadata=ranges.COUNT)

@@ -49,6 +49,7 @@ _HARMLESS = (
     "protocol.name",
     "sim.device",
     "sim.memory_mb",
+    "sim.deterministic",
     "method.tensorboard",
     "method.lr_by_task",
     "method.contact_by_task",

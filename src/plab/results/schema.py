@@ -237,6 +237,9 @@ def config_hash(cfg: Any) -> str:
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
     # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
+    # Without it runs keep the hashes that they had before there was a choice; the CPU has none.
+    if not plain["sim"].get("deterministic") or plain["sim"]["device"] == "cpu":
+        plain["sim"].pop("deterministic", None)
     # Where older files say what `logger` says now.
     plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
     # Name and score change nothing in a result, and the contact term acts where the method says so. Runs of

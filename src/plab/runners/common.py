@@ -64,7 +64,7 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
         return build_simulator(scenes, cfgs[0])
 
     loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
-    key = scenes, loss, sim.precision, sim.device, sim.memory_mb
+    key = scenes, loss, sim.precision, sim.device, sim.memory_mb, sim.deterministic
     return Problem(cfgs, cache.get(key, build, check=Simulator.reset))
 
 

@@ -6,7 +6,7 @@ how many blocks are active is known on the device only, so loops over nodes have
 which share the nodes evenly.
 
 Sums over particles at a node are atomic, in whatever order the device runs them: results differ between
-runs by rounding.
+runs by rounding, unless the simulator is deterministic (:mod:`plab.sim.cuda_sums`).
 """
 
 import ctypes
@@ -61,14 +61,14 @@ class CudaEngine(ThreadPhases):
     def resident(self) -> bool:
         """Whether a step is one launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
-        return few and self.skips.launches
+        return few and self.skips.launches and not self.deterministic
 
     @property
     def sorts(self) -> bool:
         """Whether particles are put into the order of their cells before each step: where there are so many
         that atomics, not launches, take the time. Not where bodies have materials of their own, which are
-        looked up by place."""
-        return not self.resident and not self.mixed
+        looked up by place, nor where results must not depend on timing, as the order within a cell does."""
+        return not self.resident and not self.mixed and not self.deterministic
 
     # -- public methods -----------------------------------------------------------------------------
 
@@ -154,7 +154,7 @@ class CudaEngine(ThreadPhases):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
-            self.scatter_thread(state, before, after, q, stamp)
+            self.scatter_thread(state, before, after, q, time, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
@@ -195,7 +195,7 @@ class CudaEngine(ThreadPhases):
                 before = slot + s * stride
                 for turn in range(self.resident_turns(w, self.particle_threads)):
                     q = w + turn * self.resident_threads
-                    self.scatter_thread(state, before, before + stride, q, stamp)
+                    self.scatter_thread(state, before, before + stride, q, t * self.substeps + s, stamp)
                 meetings = self.meet(w, meetings)
                 for turn in range(self.resident_turns(w, self.active_nodes())):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
@@ -211,8 +211,7 @@ class CudaEngine(ThreadPhases):
         """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
         self.block_count[0] = 0
         for e in range(self.batch):
-            self.node_part[e, 0] = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
-            self.particle_part[e, 0] = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
+            self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
         for q in range(self.particle_threads):
             e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
             run, first, _rank, _total, doublings = self.run_of(node, node >= 0, q % WARP)
@@ -234,6 +233,7 @@ class CudaEngine(ThreadPhases):
                                 q // (DISTANCE_GROUPS * self.manipulators), m, q % DISTANCE_GROUPS
                             )
         for e in range(self.batch):
+            self.take_measures(e)
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
 
     @ti.kernel
@@ -251,6 +251,8 @@ class CudaEngine(ThreadPhases):
             for q in range(self.particle_threads):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
+            if ti.static(self.beyond_nearest):
+                self.take_poses(e)
             self.nearest_gradient(state, slot, bar, e)
 
     @ti.kernel
@@ -258,6 +260,11 @@ class CudaEngine(ThreadPhases):
         self, state: Array, bar: Array, before: ti.i32, after: ti.i32, s: ti.i32, stamp: ti.i32
     ):
         """Adjoint of substep s: scatter again, with the adjoint of the grid velocities, and go back."""
+        if ti.static(self.deterministic):
+            for e in range(self.batch):
+                self.adjoint_bound[e] = 0
+            for q in range(self.particle_threads):
+                self.bound_thread(state, bar, before, after, q)
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
             self.scatter_thread_adjoint(state, bar, before, after, q, stamp)
@@ -300,6 +307,9 @@ class CudaEngine(ThreadPhases):
             for m in ti.static(range(self.manipulators)):
                 if r // self.batch == m:
                     self.share_frame(r % self.batch, m, s)
+        if ti.static(self.full_gradient):
+            for row in range(self.batch * self.materials):
+                self.take_material(row)
         for q in range(self.pose_threads):
             for m in ti.static(range(self.manipulators)):
                 if q // self.batch == m:

@@ -47,6 +47,7 @@ class CudaPhases(OrderPhases, PosePhases):
         super().attach(terms)
         threads = self.batch * self.tiles * self.lanes
         moving = self.distance_terms and any(self.moves(shape) for shape in self.shapes)
+        self.measure_sums = self.sums(self.batch * max(1, len(self.node_terms) + len(self.particle_terms)))
         # Distances of all particles, written and tallied once per loss; static manipulators leave theirs out.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
 
@@ -59,9 +60,10 @@ class CudaPhases(OrderPhases, PosePhases):
         shares = (self.batch, self.substeps, max(1, self.manipulators))
         self.end_share = ti.Vector.field(8, ti.f64, shape=shares)
         self.start_share = ti.Vector.field(8, ti.f64, shape=shares)
-        self.frame_part = ti.field(
-            ti.f64, shape=(self.batch * self.substeps, max(1, self.manipulators), FRAME_ADJOINT)
-        )
+        self.adjoint_bound = ti.field(ti.i32, shape=self.batch)
+        self.frame_sums = self.sums(self.batch * self.substeps * max(1, self.manipulators) * FRAME_ADJOINT)
+        self.pose_sums = self.sums(self.batch * max(1, self.manipulators) * 8)
+        self.material_sums = self.sums(self.material_bar.shape[0] * 3)
 
     # -- particles ----------------------------------------------------------------------------------
 
@@ -255,7 +257,7 @@ class CudaPhases(OrderPhases, PosePhases):
         """Add to a material's adjoint, which all threads of an environment share."""
         bars = (mu_bar, lam_bar, yield_bar)
         for i in ti.static(range(3)):
-            ti.atomic_add(self.material_bar[row, i], ti.cast(bars[i], ti.f64))
+            self.add_up(self.material_sums, row * 3 + i, ti.cast(bars[i], ti.f64))
 
     # -- grid ---------------------------------------------------------------------------------------
 
@@ -276,7 +278,8 @@ class CudaPhases(OrderPhases, PosePhases):
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):
         """Add to a frame's adjoint; ``grid_index`` is the substep of an environment."""
-        ti.atomic_add(self.frame_part[grid_index, m, entry], ti.cast(value, ti.f64))
+        at = (grid_index * self.manipulators + m) * FRAME_ADJOINT + entry
+        self.add_up(self.frame_sums, at, ti.cast(value, ti.f64))
 
     # -- poses --------------------------------------------------------------------------------------
 
@@ -324,11 +327,42 @@ class CudaPhases(OrderPhases, PosePhases):
         """Share the adjoint of a substep's frame out to the poses around it, and clear it."""
         frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
         for i in ti.static(range(FRAME_ADJOINT)):
-            frame[i] = self.frame_part[e * self.substeps + s, m, i]
-            self.frame_part[e * self.substeps + s, m, i] = 0.0
+            at = ((e * self.substeps + s) * self.manipulators + m) * FRAME_ADJOINT + i
+            frame[i] = self.take_sum(self.frame_sums, at)
         self.end_share[e, s, m], self.start_share[e, s, m] = self.frame_shares(e, m, s, frame)
 
     # -- terms of the loss --------------------------------------------------------------------------
+
+    @ti.func
+    def add_measure(self, e, number: ti.template(), value):
+        """Add to an environment's sum of a term of nodes, or of a term of particles: these come behind."""
+        count = ti.static(len(self.node_terms) + len(self.particle_terms))
+        self.add_up(self.measure_sums, e * count + number, value)
+
+    @ti.func
+    def take_measures(self, e):
+        """Take an environment's sums over nodes and particles to where they are joined."""
+        nodes, particles = ti.static(len(self.node_terms), len(self.particle_terms))
+        for k in ti.static(range(nodes)):
+            self.node_part[e, 0][k] = self.take_sum(self.measure_sums, e * (nodes + particles) + k)
+        for k in ti.static(range(particles)):
+            self.particle_part[e, 0][k] = self.take_sum(
+                self.measure_sums, e * (nodes + particles) + nodes + k
+            )
+
+    @ti.func
+    def take_poses(self, e):
+        """Add what the particles' distances have added up for an environment's poses to their adjoints."""
+        for m in range(self.manipulators):
+            for i in ti.static(range(8)):
+                total = self.take_sum(self.pose_sums, (e * self.manipulators + m) * 8 + i)
+                self.pose_bar[e, m][i] += total
+
+    @ti.func
+    def take_material(self, row):
+        """Add what an environment step has added up for a material to its adjoint."""
+        for i in ti.static(range(3)):
+            self.material_bar[row, i] += self.take_sum(self.material_sums, row * 3 + i)
 
     @ti.func
     def note_distances(self, e, particle, x):

@@ -3,7 +3,8 @@
 import taichi as ti
 
 from plab.sim.cuda_phases import CudaPhases
-from plab.sim.cuda_warp import NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
+from plab.sim.cuda_sums import LARGEST_MOMENTUM
+from plab.sim.cuda_warp import ALL_LANES, NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.storage import AT_V
 from plab.sim.transfer import spline, widen
@@ -66,8 +67,11 @@ class ThreadPhases(CudaPhases):
         return meetings + 1
 
     @ti.func
-    def scatter_thread(self, state: ti.template(), before, after, q, stamp):
-        """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part."""
+    def scatter_thread(self, state: ti.template(), before, after, q, time, stamp):
+        """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part.
+
+        ``time`` is noted where the state is broken by what an integer cannot hold.
+        """
         e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q)
         run, first, rank, total, doublings = self.run_of(node, node >= 0, q % WARP)
         if first:
@@ -79,15 +83,23 @@ class ThreadPhases(CudaPhases):
         heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
         self.share_heads(heads, q, node, first, rank)
         field = self.momentum_field(state, source, a, lane, fx)
+        if ti.static(self.deterministic):
+            fits = self.largest_share(field) < LARGEST_MOMENTUM * self.mass
+            if node >= 0 and not fits and self.fault[e] == 0:
+                self.fault[e] = time + 1
         w = spline(fx)
-        self.scatter_runs(self.momentum, 4, sums, heads, q, w, field, run, first, rank, total, doublings)
+        scale = self.momentum_scale(1)
+        self.scatter_runs(
+            self.momentum, 4, sums, heads, q, w, field, scale, run, first, rank, total, doublings
+        )
 
     @ti.func
     def grid_thread(self, w, q, s):
         """Grid update of node q of the active blocks by thread w; the node's momentum is cleared."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
-        total = self.take_nodes(self.momentum, shared, w, e, block, r)
+        unit = self.momentum_scale(-1)
+        total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
         # A test of which manipulators are near would cost a thread as much as contact with them.
         near = ti.static((1 << self.manipulators) - 1)
         v = self.update_node(e, s, self.node_of_block(block, r), near, total)
@@ -113,9 +125,15 @@ class ThreadPhases(CudaPhases):
         self.share_heads(heads, q, node, first, rank)
         field = self.momentum_field(state, source, a, lane, fx)
         w = spline(fx)
-        self.scatter_runs(self.momentum, 4, sums, heads, q, w, field, run, first, rank, total, doublings)
+        scale = self.momentum_scale(1)
+        self.scatter_runs(
+            self.momentum, 4, sums, heads, q, w, field, scale, run, first, rank, total, doublings
+        )
         h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
-        self.scatter_runs(self.velocity_bar, 3, sums, heads, q, w, h, run, first, rank, total, doublings)
+        scale = self.adjoint_scale(e, 1)
+        self.scatter_runs(
+            self.velocity_bar, 3, sums, heads, q, w, h, scale, run, first, rank, total, doublings
+        )
 
     @ti.func
     def grid_thread_adjoint(self, w, q, s):
@@ -124,8 +142,10 @@ class ThreadPhases(CudaPhases):
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
         i = self.node_of_block(block, r)
-        total = self.take_nodes(self.momentum, shared, w, e, block, r)
-        bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r)
+        unit = self.momentum_scale(-1)
+        total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
+        unit = self.adjoint_scale(e, -1)
+        bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r, unit)
         near = 0
         if total[3] > MASS_MIN:
             near = self.touching(e, s, self.position(i))
@@ -134,6 +154,25 @@ class ThreadPhases(CudaPhases):
         )
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
         self.put_nodes(self.momentum_bar, shared, w, e, block, r, total_bar)
+
+    @ti.func
+    def bound_thread(self, state: ti.template(), bar: ti.template(), before, after, q):
+        """Bound what thread q's particle will add to the adjoint of the grid velocities; all lanes of a warp
+        take part, and all are of one environment."""
+        e, particle = self.particle_of(q)
+        bits = 0
+        if particle < self.particles:
+            tile = particle // self.lanes
+            lane = particle % self.lanes
+            x = self.vector(state, self.tile_entry(before, e, tile), lane)
+            _base, fx = self.stencil(x)
+            target = self.tile_entry(after, e, tile)
+            h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
+            bits = self.bits_of(self.largest_share(h))
+        for k in ti.static(range(RUN_BITS)):
+            bits = ti.max(bits, ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), bits, 1 << k))
+        if q % WARP == 0:
+            ti.atomic_max(self.adjoint_bound[e], bits)
 
     @ti.func
     def gather_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q):
@@ -160,7 +199,7 @@ class ThreadPhases(CudaPhases):
                 # All lanes of a warp have particles of the same environment.
                 total = self.sum_of_warp(share)
                 if w % WARP == 0:
-                    ti.atomic_add(self.particle_part[e, 0][k], total)
+                    self.add_measure(e, ti.static(len(self.node_terms) + k), total)
         if ti.static(len(self.distance_terms) > 0):
             if counts:
                 self.note_distances(e, particle, x)
@@ -170,7 +209,8 @@ class ThreadPhases(CudaPhases):
         """Terms of node q of the active blocks by thread w; leaves mass and the loss's slope there."""
         shared = ti.simt.block.SharedArray(WARP_BLOCK * NODE_STRIDE, self.real)
         e, block, r = self.node_of(q)
-        mass = self.take_nodes(self.momentum, shared, w, e, block, r)[3]
+        unit = self.momentum_scale(-1)
+        mass = self.take_nodes(self.momentum, shared, w, e, block, r, unit)[3]
         part, slope = self.node_measures(e, self.node_of_block(block, r), mass)
         self.put_nodes(
             self.velocity, shared, w, e, block, r, ti.Vector([mass, 0.0 * mass, 0.0 * mass, slope])
@@ -183,7 +223,7 @@ class ThreadPhases(CudaPhases):
             part[c] = self.sum_of_warp(part[c])
         if w % WARP == 0:
             for c in ti.static(range(len(self.node_terms))):
-                ti.atomic_add(self.node_part[e, 0][c], part[c])
+                self.add_measure(e, c, part[c])
             # Most are below a peak seen already.
             if part[last] > self.node_part[e, 0][last]:
                 ti.atomic_max(self.node_part[e, 0][last], part[last])
@@ -208,7 +248,7 @@ class ThreadPhases(CudaPhases):
                     for i in ti.static(range(8)):
                         total = self.sum_of_warp(ti.select(counts, pose_bar[i], 0.0))
                         if q % WARP == 0:
-                            ti.atomic_add(self.pose_bar[e, m][i], total)
+                            self.add_up(self.pose_sums, (e * self.manipulators + m) * 8 + i, total)
 
     @ti.func
     def gather_thread(self, state: ti.template(), before, after, q, time):

@@ -8,6 +8,7 @@ belongs together meets in shared memory.
 
 import taichi as ti
 
+from plab.sim.cuda_sums import SumPhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import BLOCK_BITS
@@ -54,7 +55,7 @@ def packed(a, b):
     return low | (ti.cast(ti.bit_cast(b, ti.i32), ti.i64) << 32)
 
 
-class WarpPhases(TermPhases, GridPhases, ParticlePhases):
+class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     """Scatter by runs, and access to the grid by warps.
 
     Grids that particles gather from (velocity and the momentum's adjoint) hold float32 in pairs, each read at
@@ -132,20 +133,23 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         return self.linear(self.node_of_block(block, r))
 
     @ti.func
-    def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r):
+    def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
         """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
-        of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32."""
+        of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32.
+        ``unit`` has the units of the components, see :meth:`add_to_node`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for turn in ti.static(range(4)):
             near = turn * 8 + lane // 4
             node = e * self.nodes + self.linear_in_block(block, r - lane + near)
-            shared[corner + near * NODE_STRIDE + lane % 4] = grid[node][lane % 4]
-            grid[node][lane % 4] = 0.0
+            shared[corner + near * NODE_STRIDE + lane % 4] = ti.cast(grid[node][lane % 4], self.real)
+            grid[node][lane % 4] = 0
         self.wait_for_warp()
         out = ti.Vector.zero(self.real, 4)
         for c in ti.static(range(4)):
             out[c] = shared[corner + lane * NODE_STRIDE + c]
+        if ti.static(self.deterministic):
+            out *= unit
         self.wait_for_warp()
         return out
 
@@ -263,6 +267,7 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         q,
         w: ti.template(),
         field: ti.template(),
+        scale: ti.template(),
         run,
         first,
         rank,
@@ -275,7 +280,8 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
         The first lane of each run, see :meth:`run_of`, sums the run's shares in registers. Then the lanes add
         the sums of all runs to the grid together, neighbours to neighbouring numbers: the device takes up to
         8 of them at once. ``sums`` is shared memory of the block for ``WARP_BLOCK * PLANE_STRIDE`` numbers,
-        ``heads`` for the base node of each run, filled by :meth:`share_heads`.
+        ``heads`` for the base node of each run, filled by :meth:`share_heads`; ``scale`` is that of
+        :meth:`add_to_node`.
         """
         lane = q % WARP
         corner = q % WARP_BLOCK - lane
@@ -313,10 +319,9 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
                     owner = number // plane
                     part = number - owner * plane
                     row = heads[corner + owner] + (i * self.axis + part // (3 * width)) * self.axis
-                    ti.atomic_add(
-                        grid[row + part % (3 * width) // width][part % width],
-                        sums[(corner + owner) * PLANE_STRIDE + part],
-                    )
+                    node = row + part % (3 * width) // width
+                    share = sums[(corner + owner) * PLANE_STRIDE + part]
+                    self.add_to_node(grid, node, part % width, share, scale)
             self.wait_for_warp()
 
     @ti.func
@@ -330,6 +335,7 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
     def scatter_mass_run(self, e, base, fx, run, first, doublings):
         """Add every lane's mass to its 27 nodes as :meth:`scatter_mass` does, run by run."""
         w = spline(fx)
+        scale = self.momentum_scale(1)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
                 wij = self.mass * w[i][0] * w[j][1]
@@ -343,4 +349,4 @@ class WarpPhases(TermPhases, GridPhases, ParticlePhases):
                 if first:
                     for c in ti.static(range(3)):
                         node = e * self.nodes + self.linear(self.folded_node(base, i, j, c))
-                        ti.atomic_add(self.momentum[node][3], row[c])
+                        self.add_to_node(self.momentum, node, 3, row[c], scale)

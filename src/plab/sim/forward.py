@@ -48,6 +48,7 @@ class ForwardSimulator:
         threads: int | None = None,
         particles: Sequence[np.ndarray] | None = None,
         full_gradient: bool = False,
+        deterministic: bool = False,
         skips: Skips = Skips(),  # noqa: B008 - frozen
     ) -> None:
         """Build the simulator and put all environments into their initial states.
@@ -64,6 +65,8 @@ class ForwardSimulator:
             particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
             full_gradient: Whether a rollout's gradient includes those with respect to the initial state
                 (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
+            deterministic: Whether CUDA gives the same bits in every run and batch, see
+                :mod:`plab.sim.cuda_sums`; the CPU does in any case.
             skips: What is not computed where it is not needed; for measuring what that saves.
 
         Raises:
@@ -76,7 +79,7 @@ class ForwardSimulator:
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
         self._skips = skips
-        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient)
+        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient, deterministic)
         self._engine.attach(terms)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64

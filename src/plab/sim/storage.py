@@ -94,11 +94,18 @@ class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
     def __init__(
-        self, scenes: Sequence[Scene], runtime: Runtime, skips: Skips, full_gradient: bool = False
+        self,
+        scenes: Sequence[Scene],
+        runtime: Runtime,
+        skips: Skips,
+        full_gradient: bool = False,
+        deterministic: bool = False,
     ) -> None:
         """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
-        data; gradients include those by initial state and material if ``full_gradient``."""
+        data; gradients include those by initial state and material if ``full_gradient``. The CPU is
+        ``deterministic`` in any case."""
         self.full_gradient = full_gradient
+        self.deterministic = deterministic
         first = scenes[0]
         self.skips = skips
         self.device = runtime.device
@@ -177,7 +184,7 @@ class Storage:
             # Each particle's mu, lambda and yield strain, and the number of its body.
             self.place_material = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 3)
             self.place_body = ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles)
-        self.momentum = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
+        self.momentum = self.scattered_grid(b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
         # Material per environment: mu, lambda, yield strain (of its first body), floor friction, gravity (3).
         self.material = ti.Vector.field(7, real, shape=b)
@@ -207,6 +214,10 @@ class Storage:
         self.touched = ti.field(ti.i32, shape=b)
         self.untouched_step = ti.field(ti.i32, shape=b)
 
+    def scattered_grid(self, nodes: int) -> ti.Field:
+        """Allocate a grid of 4-vectors that particles scatter to."""
+        return ti.Vector.field(4, self.real, shape=nodes)
+
     def gathered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors that particles gather from."""
         return ti.Vector.field(4, self.real, shape=nodes)
@@ -215,8 +226,8 @@ class Storage:
         """Allocate what only gradients need, once."""
         if hasattr(self, "velocity_bar"):
             return
-        real, b = self.real, self.batch
-        self.velocity_bar = ti.Vector.field(4, real, shape=b * self.chunks * self.nodes)
+        b = self.batch
+        self.velocity_bar = self.scattered_grid(b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, max(1, self.manipulators)))
         # Adjoints of mu, lambda and yield strain, material by material.

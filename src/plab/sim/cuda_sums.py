@@ -1,0 +1,136 @@
+"""Sums that many threads of a CUDA device add to, in whatever order it runs them.
+
+Floating-point numbers round, so that a sum's last bits follow the order of its additions, which timing
+decides. Integers do not. A *deterministic* simulator therefore adds in fixed point: what particles scatter to
+a node is an integer of 64 bits, in units fine enough for float32; sums in float64 are several integers of
+different units each, which together hold any number to some 1e-29.
+"""
+
+import math
+
+import taichi as ti
+
+from plab.sim.storage import Storage
+
+__all__ = ["SumPhases"]
+
+MOMENTUM_BITS, MASS_BITS = 36, 42
+"""Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""
+
+LARGEST_MOMENTUM = 2.0**13
+"""Momentum [particle mass x domain units / s] up to which a particle's share can be added to a node, with
+2^13 others; no state that is not broken has more."""
+
+ADJOINT_BITS = 46
+"""Bits of a share of a node's adjoint below the environment's largest: 2^15 largest ones can be added."""
+
+WORD_UNITS = (2.0**30, 2.0**-12, 2.0**-54, 2.0**-96)
+"""Units of the integers that make up a sum; one more says that it is not finite."""
+
+LARGEST_TERM = 2.0**72
+"""From here on a term of a sum counts as infinite."""
+
+NOT_FINITE = 0x7F800000
+"""Bits of a float32 from which on it is infinite or NaN, its sign left out."""
+
+LEAST_EXPONENT = -80
+"""Adjoints below 2^-80 have the units of that."""
+
+
+class SumPhases(Storage):
+    """Sums by atomic additions; of integers where the simulator is deterministic."""
+
+    def scattered_grid(self, nodes: int) -> ti.Field:
+        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_node` adds to it."""
+        return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
+
+    def sums(self, count: int) -> ti.Field:
+        """Allocate ``count`` sums in float64, all 0, for :meth:`add_up` and :meth:`take_sum`."""
+        if self.deterministic:
+            return ti.field(ti.i64, shape=count * (len(WORD_UNITS) + 1))
+        return ti.field(ti.f64, shape=count)
+
+    # -- sums in float64 ----------------------------------------------------------------------------
+
+    @ti.func
+    def add_up(self, sums: ti.template(), at, value):
+        """Add a float64 to a sum."""
+        if ti.static(self.deterministic):
+            first = at * ti.static(len(WORD_UNITS) + 1)
+            if ti.abs(value) < LARGEST_TERM:
+                rest = value
+                for k in ti.static(range(len(WORD_UNITS))):
+                    # Units are powers of two, and what is left is exact.
+                    part = ti.cast(rest * ti.static(1.0 / WORD_UNITS[k]), ti.i64)
+                    rest -= ti.cast(part, ti.f64) * ti.static(WORD_UNITS[k])
+                    if part != 0:
+                        ti.atomic_add(sums[first + k], part)
+            else:
+                ti.atomic_max(sums[first + ti.static(len(WORD_UNITS))], ti.cast(1, ti.i64))
+        else:
+            ti.atomic_add(sums[at], value)
+
+    @ti.func
+    def take_sum(self, sums: ti.template(), at):
+        """Return a sum, and set it to 0."""
+        out = ti.cast(0.0, ti.f64)
+        if ti.static(self.deterministic):
+            first = at * ti.static(len(WORD_UNITS) + 1)
+            for k in ti.static(range(len(WORD_UNITS))):
+                out += ti.cast(sums[first + k], ti.f64) * ti.static(WORD_UNITS[k])
+                sums[first + k] = 0
+            if sums[first + ti.static(len(WORD_UNITS))] != 0:
+                out = out / 0.0
+                sums[first + ti.static(len(WORD_UNITS))] = 0
+        else:
+            out = sums[at]
+            sums[at] = 0.0
+        return out
+
+    # -- grids --------------------------------------------------------------------------------------
+
+    @ti.func
+    def add_to_node(self, grid: ti.template(), node, component, value, scale: ti.template()):
+        """Add to a component of a grid that is scattered to; ``scale`` is a 4-vector of how many of the
+        components' units make 1, as :meth:`momentum_scale` and :meth:`adjoint_scale` return them."""
+        if ti.static(self.deterministic):
+            share = value * ti.select(component == 3, scale[3], scale[0])
+            ti.atomic_add(grid[node][component], ti.cast(share, ti.i64))
+        else:
+            ti.atomic_add(grid[node][component], value)
+
+    @ti.func
+    def momentum_scale(self, power: ti.template()):
+        """Units of momentum (3) and mass that make 1, or for ``power`` -1 the inverse, 4-vector."""
+        exponent = ti.static(-math.floor(math.log2(self.mass)))
+        momentum = ti.cast(ti.static(2.0 ** (power * (MOMENTUM_BITS + exponent))), self.real)
+        mass = ti.cast(ti.static(2.0 ** (power * (MASS_BITS + exponent))), self.real)
+        return ti.Vector([momentum, momentum, momentum, mass])
+
+    @ti.func
+    def adjoint_scale(self, e, power: ti.template()):
+        """Units of a node's adjoint that make 1 in an environment, or for ``power`` -1 the inverse, 4-vector
+        of one number; the inverse is not finite where an adjoint is not."""
+        number = ti.cast(1.0, ti.f32)
+        if ti.static(self.deterministic):
+            bits = self.adjoint_bound[e]
+            exponent = ti.min(ti.max((bits >> 23) - 127, LEAST_EXPONENT), 127)
+            number = ti.bit_cast((127 + power * (ADJOINT_BITS - exponent)) << 23, ti.f32)
+            if ti.static(power < 0):
+                if bits >= NOT_FINITE:
+                    number = ti.bit_cast(bits, ti.f32)
+        one = ti.cast(number, self.real)
+        return ti.Vector([one, one, one, one])
+
+    @ti.func
+    def largest_share(self, field: ti.template()):
+        """What no share of an affine field's first three components exceeds; the field is given as
+        :func:`plab.sim.transfer.scatter` takes it. Not finite where one of these is not."""
+        total = ti.abs(field[0]) + 2.0 * (ti.abs(field[1]) + ti.abs(field[2]) + ti.abs(field[3]))
+        return total[0] + total[1] + total[2]
+
+    @ti.func
+    def bits_of(self, bound):
+        """A number that is not negative as the bits of a float32, which are in the order of the numbers, with
+        infinity and NaN above all."""
+        return ti.bit_cast(ti.cast(bound, ti.f32), ti.i32) & 0x7FFFFFFF
