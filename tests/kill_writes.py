@@ -98,9 +98,9 @@ def contents(folder: Path) -> dict[str, bytes]:
         name = str(path.relative_to(folder))
         if path.suffix == ".h5":
             result = read(path)
-            rows = result.iterations.assign(seconds=0.0)
+            columns = result.columns | {"seconds": np.zeros(result.rows)}
             config = result.config | {"results_dir": ""}
-            plain = dataclasses.replace(result, config=config, iterations=rows, provenance={}, wall_time={})
+            plain = dataclasses.replace(result, config=config, columns=columns, provenance={}, wall_time={})
             found[name] = encode(plain, compress=True)
         elif path.suffix == ".npz":
             # The archive has the time at which it was packed.

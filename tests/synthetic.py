@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,11 @@ def run(folder: Path, **which: Any) -> RunResult:
     """Return the result of a finished run."""
     score = which.pop("score", None)
     return synthetic_run(config(folder, **which), rows=ROWS, score=score)
+
+
+def cut(result: RunResult, rows: int) -> RunResult:
+    """Return a result with no more than the first of its iterations."""
+    return replace(result, columns={name: values[:rows] for name, values in result.columns.items()})
 
 
 def save(result: RunResult) -> Path:

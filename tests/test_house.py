@@ -49,6 +49,30 @@ def test_starting_imports_nothing_heavy(code, tmp_path):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+def test_a_run_does_without_tables(tmp_path):
+    code = """
+import sys
+import plab.cli.next_steps
+import plab.runners.trajectory
+from plab.config import load_config
+from plab.results import RunFile
+cfg = load_config(["task=Move"])
+run = RunFile(cfg)
+run.record({"iteration": 0, "loss": 1.0, "score": 0.5}, {}, keep=True)
+run.finish({"score": 0.5}, {})
+assert RunFile(cfg).result.score == 0.5
+"""
+    heavy = HEAVY - {"taichi"}
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nprint(sorted({heavy} & set(sys.modules)))"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 def test_tables_are_made_without_what_draws_or_simulates(tmp_path):
     heavy = HEAVY - {"pandas"} | {"scipy.stats"}
     code = "import sys; from plab.cli.report import main"

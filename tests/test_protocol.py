@@ -255,9 +255,9 @@ def test_the_score_is_of_the_best_iteration_or_of_the_last(tmp_path: Path) -> No
 def test_the_last_score_of_a_policy_is_that_of_its_training(tmp_path: Path) -> None:
     run = synthetic.run(tmp_path, method="ppo")
     run.config["protocol"]["score"] = "last"
-    run.iterations["train_score"] = np.linspace(0.1, 0.3, len(run.iterations))
-    for trained, want in ((0.25, 0.25), (np.nan, run.iterations["score"].iloc[-1])):
-        run.iterations.loc[run.iterations.index[-1], "train_score"] = trained
+    run.columns["train_score"] = np.linspace(0.1, 0.3, run.rows)
+    for trained, want in ((0.25, 0.25), (np.nan, run.columns["score"][-1])):
+        run.columns["train_score"][-1] = trained
         (row,) = load(synthetic.save(run)).to_dict("records")
         assert run.score == row["score"] == want != row["score_best"]
 

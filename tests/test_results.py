@@ -166,7 +166,7 @@ def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, com
         message="iteration 4: loss is nan",
         provenance={"taichi": "1.7.4", "git_dirty": True, "seed": 3},
         wall_time={"build": 0.25, "compile": 2.5},
-        iterations=pd.DataFrame([make_row(k) for k in range(4)]),
+        columns={name: np.array([make_row(k)[name] for k in range(4)]) for name in make_row(0)},
         best_actions=rng.random((5, 3)),
         best_iteration=2,
         best_loss=0.1 + 0.2,

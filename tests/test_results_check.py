@@ -31,9 +31,8 @@ def test_good_files_pass(tmp_path: Path, method: str) -> None:
 
 
 def _table(run: RunResult, name: str, row: int, value: float) -> RunResult:
-    table = run.iterations.copy()
-    table.loc[row, name] = value
-    return dataclasses.replace(run, iterations=table)
+    run.columns[name][row] = value
+    return run
 
 
 def _evaluation(run: RunResult, **values: float) -> RunResult:
@@ -44,7 +43,7 @@ BROKEN = {
     "status 'done' is none of": lambda r: dataclasses.replace(r, status="done"),
     "config_hash is not that of config": lambda r: dataclasses.replace(r, config_hash="0" * 64),
     "iterations lack reward": lambda r: dataclasses.replace(
-        r, iterations=r.iterations.drop(columns="reward")
+        r, columns={name: values for name, values in r.columns.items() if name != "reward"}
     ),
     "iterations are not finite: loss_sdf": lambda r: _table(r, "loss_sdf", 1, np.nan),
     "iterations are not numbered": lambda r: _table(r, "iteration", 1, 5),
@@ -62,12 +61,8 @@ BROKEN = {
     "wall_time has seconds": lambda r: dataclasses.replace(r, wall_time={"build": -1.0}),
     "mass final has shape": lambda r: dataclasses.replace(r, masses={"final": np.ones((2, 2, 2))}),
     "mass final is negative": lambda r: dataclasses.replace(r, masses={"final": -np.ones((64, 64, 64))}),
-    "finished after 3 of 4": lambda r: dataclasses.replace(
-        r, iterations=r.iterations.iloc[:3], best_iteration=0
-    ),
-    "it has no iterations": lambda r: dataclasses.replace(
-        r, iterations=r.iterations.iloc[:0], best_actions=None
-    ),
+    "finished after 3 of 4": lambda r: dataclasses.replace(synthetic.cut(r, 3), best_iteration=0),
+    "it has no iterations": lambda r: dataclasses.replace(synthetic.cut(r, 0), best_actions=None),
 }
 
 

@@ -419,7 +419,7 @@ def test_iterations_of_a_changed_file_are_read_again(folder: Path) -> None:
     path = Path(load(folder)["path"].iloc[0])
     read_curves(folder, [path])
     made = synthetic.run(folder, seed=0)
-    made.iterations["score"] = 0.125
+    made.columns["score"] = np.full(made.rows, 0.125)
     synthetic.save(made)
     (curves,) = read_curves(folder, [path])
     assert np.unique(curves["score"]).tolist() == [0.125]

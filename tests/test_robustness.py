@@ -367,8 +367,7 @@ def test_what_is_written_is_read(tmp_path, rows, resume, message, compress):
     result = synthetic.run(tmp_path)
     result.message, result.resume = message, resume
     columns = {name: [row[k] for row in rows] for k, name in enumerate(("loss", "reward"))}
-    result.iterations = result.iterations.iloc[:0].assign(**{name: [] for name in columns})
-    result.iterations = type(result.iterations)(columns, dtype=float)
+    result.columns = {name: np.array(values, float) for name, values in columns.items()}
     path = tmp_path / "any.h5"
     write(result, path, compress=compress)
     again = read(path)

@@ -159,8 +159,8 @@ class Problem:
         # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
         kinds = _kinds(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
-        self.scenes = build_scenes(cfgs)
-        self.simulator = simulator or build_simulator(self.scenes, cfgs[0])
+        self.simulator = simulator or build_simulator(build_scenes(cfgs), cfgs[0])
+        self.scenes = self.simulator.scenes
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)
         self.weights = np.array([weights[name] for name in self.term_names])

@@ -9,5 +9,5 @@ __all__ = ["main"]
 
 if __name__ == "__main__":
     # Libraries and traced kernels are many objects and no garbage: Python's 700 has them searched 800 times.
-    gc.set_threshold(10_000)
+    gc.set_threshold(100_000)
     sys.exit(main())

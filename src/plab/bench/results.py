@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
@@ -69,15 +68,15 @@ def synthetic_run(
         np.arange(rows) if "iterations" in method else np.linspace(0, method["episodes"], rows).astype(int)
     )
     curve = score * (1.0 - np.exp(-3.0 * np.arange(rows) / max(rows - 1, 1)))
-    columns = (*COLUMNS, *loss_columns(config), *family(method["family"]).columns)
-    table = pd.DataFrame({name: rng.uniform(0.0, 1.0, rows) for name in columns})
-    table["iteration"], table["episodes"], table["steps"] = np.arange(rows), episodes, episodes * horizon
-    table["steps_forward"], table["steps_gradient"] = 0, (episodes + 1) * horizon
-    table["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)
-    table["reward"] = 40.0 * table["score"]
-    table["loss"] = 100.0 - table["reward"]
-    table["seconds"] = rng.uniform(0.9, 1.1, rows)
-    best = int(table["loss"].idxmin()) if rows else -1
+    names = (*COLUMNS, *loss_columns(config), *family(method["family"]).columns)
+    columns: dict[str, np.ndarray] = {name: rng.uniform(0.0, 1.0, rows) for name in names}
+    columns |= {"iteration": np.arange(rows), "episodes": episodes, "steps": episodes * horizon}
+    columns |= {"steps_forward": np.zeros(rows, int), "steps_gradient": (episodes + 1) * horizon}
+    columns["score"] = np.clip(curve + rng.normal(0.0, 0.02, rows), 0.0, 1.0)
+    columns["reward"] = 40.0 * columns["score"]
+    columns["loss"] = 100.0 - columns["reward"]
+    columns["seconds"] = rng.uniform(0.9, 1.1, rows)
+    best = int(columns["loss"].argmin()) if rows else -1
     judged = scores_from_iou(0.1, 0.1 + 0.3 * score, 0.4)
     evaluation = dict.fromkeys(loss_columns(config), 2.0) | {
         "loss": 50.0,
@@ -93,11 +92,16 @@ def synthetic_run(
         config_hash(config),
         status="finished" if finished else "running",
         provenance=_provenance(config),
-        wall_time={"build": 1.0, "compile": 5.0, "optimise": float(table["seconds"].sum()), "evaluate": 0.5},
-        iterations=table,
+        wall_time={
+            "build": 1.0,
+            "compile": 5.0,
+            "optimise": float(columns["seconds"].sum()),
+            "evaluate": 0.5,
+        },
+        columns=columns,
         best_actions=rng.uniform(-1.0, 1.0, (horizon, 6)) if rows else None,
         best_iteration=best,
-        best_loss=float(table["loss"].min()) if rows else float("nan"),
+        best_loss=float(columns["loss"].min()) if rows else float("nan"),
         evaluation=evaluation if finished else {},
     )
 

@@ -112,7 +112,7 @@ def _job(tally: Tally, config_dir: str | None) -> TaskFunction:
 
 def _run(composed: DictConfig, cache: SimulatorCache, config_dir: str | None) -> float:
     """Check one composed configuration and run it; raise :class:`Refusal` for what is no bug."""
-    # Imported here: pandas, torch and taichi take seconds, which no mistake and no --help should wait for.
+    # Imported here: torch and taichi take seconds, which no mistake and no --help should wait for.
     try:
         _require_sweep(HydraConfig.get())
         cfg = finish(composed, HydraConfig.get().overrides.task)

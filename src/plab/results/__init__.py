@@ -8,14 +8,11 @@ database (``database.py``), for the next time and for SQL. This package imports 
 that reading results is quick.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from plab.config.selection import lookup
-from plab.results.archive import pack, unpack
-from plab.results.checking import Problem, check
-from plab.results.curves import read_curves
-from plab.results.database import Row
 from plab.results.files import read, read_iterations, write
-from plab.results.loading import load, rows
-from plab.results.query import connect
 from plab.results.running import RunFile
 from plab.results.schema import (
     BUDGETS,
@@ -30,6 +27,14 @@ from plab.results.schema import (
     result_path,
     row_count,
 )
+
+if TYPE_CHECKING:
+    from plab.results.archive import pack, unpack
+    from plab.results.checking import Problem, check
+    from plab.results.curves import read_curves
+    from plab.results.database import Row
+    from plab.results.loading import load, rows
+    from plab.results.query import connect
 
 __all__ = [
     "BUDGETS",
@@ -58,3 +63,13 @@ __all__ = [
     "unpack",
     "write",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is for many results when it is asked for: a run does without it, and without pandas."""
+    parts = ("database", "loading", "archive", "checking", "curves", "query")
+    for part in parts if name in __all__ else ():
+        module = import_module(f"{__name__}.{part}")
+        if name in module.__all__:
+            return getattr(module, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -111,8 +111,10 @@ def _rounded(run: RunResult, digits: int) -> RunResult:
         mantissa, exponent = np.frexp(values)
         return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits)
 
-    measured = run.iterations.select_dtypes("floating").apply(nearest)
-    return replace(run, iterations=run.iterations.assign(**measured), best_loss=float(nearest(run.best_loss)))
+    columns = {
+        name: nearest(values) if values.dtype.kind == "f" else values for name, values in run.columns.items()
+    }
+    return replace(run, columns=columns, best_loss=float(nearest(run.best_loss)))
 
 
 def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:

@@ -14,11 +14,10 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-import pandas as pd
 
 from plab.config.selection import lookup
 from plab.reading import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
@@ -35,6 +34,9 @@ from plab.results.schema import (
     stored_config,
     stored_hash,
 )
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "cause",
@@ -159,7 +161,7 @@ def read(path: str | Path) -> RunResult:
             message=take(own, "message", str),
             provenance=_scalars(attributes(file, "provenance")),
             wall_time=numbers(attributes(file, "wall_time")),
-            iterations=pd.DataFrame(columns(file, "iterations")),
+            columns=columns(file, "iterations"),
             best_actions=array(file, "best", "actions"),
             best_iteration=take(best, "iteration", int),
             best_loss=take(best, "loss", float),
@@ -184,6 +186,9 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
     Raises:
         ResultsError: As for :func:`read`.
     """
+    # Imported here, as for RunResult.iterations.
+    import pandas as pd
+
     path = Path(path)
     with opened(path) as file:
         config = stored_config(take(attributes(file, names=("config",)), "config", str))
@@ -213,9 +218,9 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
         for name in ("provenance", "wall_time", "evaluation", "labels"):
             file.create_group(name).attrs.update(getattr(result, name))
         table = file.create_group("iterations")
-        table.attrs["columns"] = list(result.iterations.columns)
-        for column in result.iterations.columns:
-            table.create_dataset(column, data=result.iterations[column].to_numpy(), **options)
+        table.attrs["columns"] = list(result.columns)
+        for column, values in result.columns.items():
+            table.create_dataset(column, data=values, **options)
         best = file.create_group("best")
         best.attrs["iteration"] = result.best_iteration
         best.attrs["loss"] = result.best_loss

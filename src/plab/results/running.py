@@ -10,13 +10,12 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from plab.locks import NO_LOCKS, Lock, acquire, lock_path
 from plab.provenance import provenance, version_changes
@@ -62,7 +61,7 @@ class RunFile:
         config = config_dict(cfg)
         self.path = result_path(config)
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
-        # Rows not yet in the table, the last one first: ``(row, (row before, ...))``. One object with
+        # Rows not yet in the columns, the last one first: ``(row, (row before, ...))``. One object with
         # the result: an interrupt may arrive between any two assignments.
         known = RunResult(config, config_hash(config), provenance=provenance(config))
         self._state: tuple[RunResult, tuple[Any, ...]] = known, ()
@@ -109,7 +108,7 @@ class RunFile:
             self.release()
             return
         self._found = set(self._files())
-        self._known = len(self._state[0].iterations)
+        self._known = self._state[0].rows
 
     def _clear_up(self) -> None:
         """Remove what a process left that was killed just after it had finished the run."""
@@ -164,8 +163,7 @@ class RunFile:
             row, pending = pending
             rows.insert(0, row)
         if rows:
-            table = pd.concat([known.iterations, pd.DataFrame(rows)], ignore_index=True)
-            self._state = dataclasses.replace(known, iterations=table), ()
+            self._state = dataclasses.replace(known, columns=_extended(known.columns, rows)), ()
         return self._state[0]
 
     @property
@@ -176,7 +174,7 @@ class RunFile:
     @property
     def advanced(self) -> bool:
         """Whether this process has computed an iteration of the run."""
-        return len(self.result.iterations) > self._known
+        return self.result.rows > self._known
 
     def release(self) -> None:
         """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
@@ -267,6 +265,22 @@ class RunFile:
             first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
             known = dataclasses.replace(earlier, status="running", message="", provenance=first, path=None)
             self._state = known, ()
+
+
+def _extended(
+    columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, float]]
+) -> dict[str, np.ndarray]:
+    """Return columns, shape [iteration] each, with some rows more; what either lacks is NaN."""
+    known = len(next(iter(columns.values()), ()))
+
+    def column(name: str) -> np.ndarray:
+        new = [row.get(name, math.nan) for row in rows]
+        # Counts stay integers, all else is float64, whatever type of number a method gives.
+        counts = all(isinstance(number, int | np.integer) for number in new)
+        added = np.array(new, np.int64 if counts else np.float64)
+        return np.concatenate([columns.get(name, np.full(known, math.nan)), added]) if known else added
+
+    return {name: column(name) for name in dict.fromkeys((*columns, *rows[0]))}
 
 
 def _move_aside(path: Path, reason: ResultsError) -> None:

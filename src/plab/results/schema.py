@@ -8,15 +8,17 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from plab.bodies import MATERIAL_KEYS
 from plab.config.selection import lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "ARCHIVE_SUFFIX",
@@ -127,7 +129,8 @@ class RunResult:
         message: Why the run failed or stopped, one line; empty otherwise.
         provenance: Versions, platform, commit, device, precision, seed, start time: flat scalars.
         wall_time: Seconds spent in each phase, summed over resumptions.
-        iterations: One row per iteration, or per evaluation; the columns are listed in docs/results.md.
+        columns: Columns of the iterations, or of the evaluations, shape [iteration] each; they are listed in
+            docs/results.md.
         best_actions: Best actions found, in [-1, 1], shape [T, A]; None before the first iteration.
         best_iteration: Iteration that ran them, -1 if none has.
         best_loss: Their trajectory loss in the contact model of the rollouts.
@@ -144,7 +147,7 @@ class RunResult:
     message: str = ""
     provenance: dict[str, Any] = dataclasses.field(default_factory=dict)
     wall_time: dict[str, float] = dataclasses.field(default_factory=dict)
-    iterations: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    columns: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     best_actions: np.ndarray | None = None
     best_iteration: int = -1
     best_loss: float = float("nan")
@@ -153,6 +156,19 @@ class RunResult:
     masses: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     resume: dict[str, Any] | None = None
     path: Path | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of iterations, or evaluations."""
+        return len(next(iter(self.columns.values()), ()))
+
+    @property
+    def iterations(self) -> pd.DataFrame:
+        """The columns as a table, a row per iteration, or per evaluation; to change it changes no column."""
+        # Imported here: a run that records its rows need not wait for pandas.
+        import pandas as pd
+
+        return pd.DataFrame(self.columns)
 
     @property
     def score(self) -> float:
@@ -164,7 +180,7 @@ class RunResult:
         planners, and those outside plab always have that of the final one.
         """
         if counts_last(self.config):
-            return last_score({name: column.to_numpy() for name, column in self.iterations.items()})
+            return last_score(self.columns)
         return self.evaluation["score"]
 
 
@@ -305,16 +321,16 @@ def row_count(method: Mapping[str, Any]) -> int | None:
 
 def resume_fault(run: RunResult) -> str:
     """Return why a run cannot go on from what its file holds, empty if nothing speaks against it."""
-    table, actions = run.iterations, run.best_actions
-    if run.resume is None or table.empty:
+    columns, actions = run.columns, run.best_actions
+    if run.resume is None or not run.rows:
         return ""
     if actions is None or actions.ndim != 2:
         return "it has iterations, but no best actions"
-    if not 0 <= run.best_iteration < len(table):
+    if not 0 <= run.best_iteration < run.rows:
         return f"there is no iteration {run.best_iteration}, which is to be the best"
-    if missing := [name for name in ("loss", "score") if name not in table]:
+    if missing := [name for name in ("loss", "score") if name not in columns]:
         return f"iterations lack {missing[0]}"
-    if endless := [name for name in BUDGETS if name in table and not np.isfinite(table[name]).all()]:
+    if endless := [name for name in BUDGETS if name in columns and not np.isfinite(columns[name]).all()]:
         return f"iterations are not finite: {endless[0]}"
     if run.config["method"]["family"] == "trajectory":
         state = run.resume.get("actions")

@@ -64,14 +64,14 @@ class Job:
         with the best actions, or of the last one where that counts, if it does."""
         result = self.run.result
         text = f"score {result.score:.4f}"
-        if counts_last(result.config) and "train_score" in result.iterations:
-            shown = float(result.iterations["score"].iloc[-1])
+        if counts_last(result.config) and "train_score" in result.columns:
+            shown = float(result.columns["score"][-1])
             if shown != result.score:
                 return f"{text} in its last training episodes ({shown:.4f} without exploration)"
         # Runners that do everything themselves may have rows without a score.
-        if counts_last(result.config) or self.contact == "hard" or "score" not in result.iterations:
+        if counts_last(result.config) or self.contact == "hard" or "score" not in result.columns:
             return text
-        shown = float(result.iterations["score"].iloc[result.best_iteration])
+        shown = float(result.columns["score"][result.best_iteration])
         if f"{shown:.4f}" == f"{result.score:.4f}":
             return text
         return f"{text} in the hard contact model ({shown:.4f} in the {self.contact} one of its iterations)"
@@ -91,7 +91,7 @@ class Job:
             # Of a ResultsError the file itself is what failed: nothing more can be written to it.
             self.run.withdraw()
             return
-        if isinstance(error, USER_ERRORS) and not len(self.run.result.iterations):
+        if isinstance(error, USER_ERRORS) and not self.run.result.rows:
             # Nothing has been computed that a file could keep.
             return
         try:

@@ -115,10 +115,10 @@ class RlRunner(PolicyRunner):
 
     def _train(self, trainer: Trainer, track: Track) -> None:
         self.enter("optimise")
-        rows = track.job.run.result.iterations
-        due = int(rows["episodes"].iloc[-1]) + self.method.evaluate_every
+        columns = track.job.run.result.columns
+        due = int(columns["episodes"][-1]) + self.method.evaluate_every
         self._watch = self._watch or _Watch(trainer, self.report)
-        self._watch.score = float(rows["score"].iloc[-1])
+        self._watch.score = float(columns["score"][-1])
         while trainer.episodes < due and trainer.steps < trainer.total_steps:
             trainer.advance(self._watch)
 

@@ -82,15 +82,15 @@ class Track:
         self.job, self.number = job, number
         self.log = RunLog(job.cfg, job.run)
         result = job.run.result
-        rows = result.iterations
-        self.iteration, self.best_loss = len(rows), result.best_loss
+        columns, rows = result.columns, result.rows
+        self.iteration, self.best_loss = rows, result.best_loss
         self.best_actions = result.best_actions
         self._by_score = family(job.cfg.method.family).ranking == "score"
-        known = self._by_score and len(rows) > 0
-        self._best_score = float(rows["score"].iloc[result.best_iteration]) if known else -np.inf
+        known = self._by_score and rows > 0
+        self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
         # Files that were begun before there were budgets go on without.
-        self._budget = {name: 0 for name in BUDGETS if name in rows or not len(rows)}
-        self._budget |= {name: int(rows[name].iloc[-1]) for name in self._budget if len(rows)}
+        self._budget = {name: 0 for name in BUDGETS if name in columns or not rows}
+        self._budget |= {name: int(columns[name][-1]) for name in self._budget if rows}
 
     @property
     def solved(self) -> bool:
@@ -400,7 +400,7 @@ class Runner:
         judged = measures(episodes, number)
         try:
             # After the last row, whose steps are those before it.
-            steps = int(track.job.run.result.iterations["steps"].iloc[-1]) + track.cfg.sim.horizon
+            steps = int(track.job.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
             track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
             track.job.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
         except ResultsError as error:

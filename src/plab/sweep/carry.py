@@ -96,7 +96,7 @@ def look_up(cfg: Config) -> Outcome:
         return outcome(cfg, "lost", message="no result, and no process computes it now")
     if left.status == "failed":
         return outcome(cfg, "failed", message=left.message)
-    return outcome(cfg, "lost", message=f"{len(left.iterations)} iterations, and no process computes it now")
+    return outcome(cfg, "lost", message=f"{left.rows} iterations, and no process computes it now")
 
 
 def _finished_before(cfg: Config) -> Outcome | None:

@@ -103,8 +103,8 @@ class PopulationRunner(PolicyRunner):
         # The first episode, of the untrained policies, compiles the kernels.
         if least > 0:
             self.enter("optimise", members)
-            rows = members[0].job.run.result.iterations
-            population.train(int(rows["episodes"].iloc[-1]) + self.method.evaluate_every)
+            columns = members[0].job.run.result.columns
+            population.train(int(columns["episodes"][-1]) + self.method.evaluate_every)
             failures = population.take_failures()
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
