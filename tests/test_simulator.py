@@ -172,6 +172,11 @@ def test_broken_states_and_inputs_are_named(sim: Simulator) -> None:
     with pytest.raises(SimulationError, match="environment 1, environment step 1, substep 1"):
         sim.step(np.zeros((3, 6)))
     sim.reset()
+    sim.step(np.zeros((3, 6)))
+    sim._particles.current.from_numpy(sim._particles.pack(state))
+    with pytest.raises(SimulationError, match="environment 1, environment step 2, substep 1"):
+        sim.step(np.zeros((3, 6)))
+    sim.reset()
     start = sim.state()
     state.v[1, 7, 0] = math.nan
     sim.set_initial_state(state)

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 __all__ = ["broken_gradients", "broken_states", "broken_terms", "require_none"]
 
 
-def broken_states(faults: np.ndarray | torch.Tensor, substeps: int) -> dict[int, str]:
+def broken_states(faults: np.ndarray | torch.Tensor, substeps: int, first: int = 1) -> dict[int, str]:
     """Environments whose state is broken, and since when, by the numbers, shape [batch], of the substeps in
-    which they broke, from 1 on, or 0; a CUDA tensor is fetched only if there is one."""
+    which they broke, from 1 on in environment step ``first``, or 0; a CUDA tensor is fetched only if there is
+    one."""
     if not faults.any():
         return {}
     if on_device(faults):
@@ -27,7 +28,7 @@ def broken_states(faults: np.ndarray | torch.Tensor, substeps: int) -> dict[int,
     failures = {}
     for e in np.flatnonzero(faults):
         step, substep = divmod(int(faults[e]) - 1, substeps)
-        failures[int(e)] = f"environment step {step + 1}, substep {substep + 1}: {what} in one substep"
+        failures[int(e)] = f"environment step {step + first}, substep {substep + 1}: {what} in one substep"
     return failures
 
 

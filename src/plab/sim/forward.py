@@ -264,6 +264,7 @@ class ForwardSimulator:
         self._particles.order.reset()
         self._place(self._initial_poses)
         self._engine.fault.fill(0)
+        self._taken = 0
         self._checked = True
         self._engine.touched.fill(0)
 
@@ -282,9 +283,10 @@ class ForwardSimulator:
         self._version += 1
         array = step_actions(actions, self.batch, self.action_dim, self.device)
         self._particles.step(self._pose, array)
+        self._taken += 1
         self._checked = check
         if check:
-            require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
+            require_none(broken_states(self._engine.fault.to_numpy(), self.substeps, self._taken))
 
     def measure(self, like: torch.Tensor | None = None) -> Measures:
         """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type.
@@ -302,7 +304,7 @@ class ForwardSimulator:
             values = self._scratch_terms.to_numpy().reshape(self.batch, -1)
         checked, self._checked = self._checked, True
         if not checked:
-            require_none(broken_states(values[:, -1], self.substeps))
+            require_none(broken_states(values[:, -1], self.substeps, self._taken))
         return self._judged(values)
 
     def losses(self) -> np.ndarray:
@@ -386,6 +388,7 @@ class ForwardSimulator:
         self._particles.order.reset()
         self._place(np.asarray(state.poses, np.float64))
         self._engine.fault.fill(0)
+        self._taken = 0
 
     def set_initial_state(self, state: State) -> None:
         """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
