@@ -19,11 +19,13 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from rich.console import Console
 
+import plab.sweep.plan as planning
 from plab import progress
 from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.results import read, result_path
 from plab.runners import run_batch
+from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
 
 pytestmark = pytest.mark.physics
@@ -98,6 +100,34 @@ def test_each_gpu_has_a_process_and_all_are_shown_together(tmp_path: Path, monke
     # Without batch_size each process has its share.
     assert any(" Rope, 2 runs " in line for line in lines) and any(" Rope-v1 adam " in line for line in lines)
     assert {read(path).provenance["batch"] for path in files(tmp_path)} == {1, 2}
+
+
+def test_processes_that_share_gpus_are_told_apart(tmp_path: Path) -> None:
+    sweep = [one for one in command("batch_gpus", "seed=0,1,2", "method.iterations=2") if "=false" not in one]
+    sweep.remove("hydra.launcher.batch_size=2")
+    # The first GPU has its second process only after each has one.
+    done = subprocess.run(
+        [*sweep, "hydra.launcher.per_gpu=2"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"CUDA_VISIBLE_DEVICES": "3,5"},
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    for name in ("3, 1", "5, 1", "3, 2"):
+        shown = [line for line in lines if line.startswith(f"GPU {name} [0/3 runs] ")]
+        assert shown and " 2/2, 0:00:00 left, " in shown[-1]
+    assert lines[-1] == "3 runs: 3 finished, 0 finished before"
+
+
+def test_agents_share_the_memory_of_a_device_that_processes_share(monkeypatch) -> None:
+    monkeypatch.setattr(planning, "most_environments", lambda *_: 40)
+    cfgs = [load_config(["method=sac", "method.num_envs=5", f"seed={seed}"]) for seed in range(8)]
+    assert [len(batch) for batch in plan(cfgs)] == [8]
+    assert [len(batch) for batch in plan(cfgs, sharing=2)] == [4, 4]
+    assert [len(batch) for batch in plan(cfgs, sharing=20)] == [1] * 8
 
 
 def test_without_gpus_there_is_nobody_to_compute(tmp_path: Path, monkeypatch, capsys) -> None:

@@ -92,16 +92,16 @@ class BatchLauncher(Launcher):
     Hydra gives a launcher no other way to tell the command line.
     """
 
-    def __init__(self, batch_size: int | None, inner: DictConfig | None, on_gpus: bool) -> None:
+    def __init__(self, batch_size: int | None, inner: DictConfig | None, per_gpu: int) -> None:
         """Keep the settings.
 
         Args:
             batch_size: Runs of a batch, at most; as many as fit ``sim.memory_mb`` if None.
             inner: Configuration of the launcher that carries out the batches, as jobs of its own; this
                 process does if None.
-            on_gpus: Whether a process for each GPU does.
+            per_gpu: Processes for each GPU that do; none if 0.
         """
-        self._size, self._inner, self._on_gpus = batch_size, inner, on_gpus
+        self._size, self._inner, self._per_gpu = batch_size, inner, per_gpu
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Take what Hydra gives to launchers."""
@@ -119,8 +119,8 @@ class BatchLauncher(Launcher):
 
         if self._size is not None and (type(self._size) is not int or self._size < 1):
             raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")
-        if not isinstance(self._on_gpus, bool):
-            raise ConfigError(f"hydra.launcher.on_gpus must be true or false, not {self._on_gpus}")
+        if type(self._per_gpu) is not int or self._per_gpu < 0:
+            raise ConfigError(f"hydra.launcher.per_gpu must be at least 0, not {self._per_gpu}")
         if self._inner is not None and (
             not isinstance(self._inner, DictConfig) or "_target_" not in self._inner
         ):
@@ -144,14 +144,14 @@ class BatchLauncher(Launcher):
             for cfg in cfgs.values():
                 check_device(cfg)
                 check_packages(cfg)
-        if self._on_gpus:
+        if self._per_gpu:
             names = gpus()
-            carry, processes = carry_on(names), len(names)
+            carry, processes = carry_on(names, self._per_gpu), len(names) * self._per_gpu
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]
         scores: dict[str, float] = {}
-        for one in run_sweep(list(cfgs.values()), carry, self._size, processes):
+        for one in run_sweep(list(cfgs.values()), carry, self._size, processes, max(1, self._per_gpu)):
             tally.outcomes.append(one)
             scores[one.path] = one.score
         values = [scores[paths[n]] if n in paths else math.nan for n in range(len(entries))]

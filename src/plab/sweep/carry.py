@@ -24,11 +24,12 @@ Carrier = Callable[[list[list["Config"]], Callable[[], str]], Iterator[Outcome]]
 
 
 def run_sweep(
-    cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1
+    cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1, sharing: int = 1
 ) -> Iterator[Outcome]:
     """Carry out the runs of a sweep that are not finished, in batches of at most ``size``, or as many as
-    fit the memory, ``processes`` at a time, and yield how each ended. Runs that another process computes
-    are left to it. Should it end before they do, they are taken up here."""
+    fit the memory, ``processes`` at a time, of which ``sharing`` use one device, and yield how each
+    ended. Runs that another process computes are left to it. Should it end before they do, they are taken up
+    here."""
     # The same run given twice is one run.
     wanted = {result_path(cfg): cfg for cfg in cfgs}
     ended: dict[str, Outcome] = {}
@@ -48,7 +49,7 @@ def run_sweep(
 
     while todo:
         away = []
-        for one in carry(plan(todo, size, processes), progress):
+        for one in carry(plan(todo, size, processes, sharing), progress):
             if one.status == "elsewhere":
                 away.append(one)
             else:

@@ -1,4 +1,4 @@
-"""A sweep on all GPUs of this computer: a process each, which is given a batch whenever it is free."""
+"""A sweep on all GPUs of this computer: processes of which each is given a batch whenever it is free."""
 
 from __future__ import annotations
 
@@ -38,15 +38,22 @@ def gpus() -> list[str]:
     return names
 
 
-def carry_on(names: Sequence[str]) -> Carrier:
-    """Return what carries out batches on some GPUs, named as ``CUDA_VISIBLE_DEVICES`` names them."""
+def carry_on(names: Sequence[str], per_gpu: int = 1) -> Carrier:
+    """Return what carries out batches on some GPUs, named as ``CUDA_VISIBLE_DEVICES`` names them, by some
+    processes each."""
+    # One process for each GPU before any has its second.
+    places = [
+        (name, f"GPU {name}" if per_gpu == 1 else f"GPU {name}, {k + 1}")
+        for k in range(per_gpu)
+        for name in names
+    ]
 
     def carry(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
         waiting = list(reversed(batches))
-        workers = [_Worker(name) for name in names[: len(batches)]]
+        workers = [_Worker(*place) for place in places[: len(batches)]]
         shown = any(cfg.progress for batch in batches for cfg in batch)
         try:
-            with show_several([f"GPU {worker.name}" for worker in workers], enabled=shown) as report:
+            with show_several([worker.label for worker in workers], enabled=shown) as report:
                 while waiting or any(worker.batch for worker in workers):
                     for worker in workers:
                         if waiting and not worker.batch:
@@ -56,7 +63,7 @@ def carry_on(names: Sequence[str]) -> Carrier:
                             if kind == "ended":
                                 yield from _told(*content)
                             else:
-                                report(f"GPU {worker.name}", kind, *content)
+                                report(worker.label, kind, *content)
         finally:
             for worker in workers:
                 worker.end()
@@ -69,11 +76,12 @@ class _Worker:
 
     Attributes:
         name: The GPU.
+        label: What stands before its progress.
         batch: What it is carrying out, empty if nothing.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, label: str) -> None:
+        self.name, self.label = name, label
         self.batch: list[Config] = []
         self._start()
 

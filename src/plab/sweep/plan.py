@@ -19,7 +19,9 @@ from plab.sizes import most_environments
 __all__ = ["plan"]
 
 
-def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) -> list[list[Config]]:
+def plan(
+    cfgs: Sequence[Config], size: int | None = None, processes: int = 1, sharing: int = 1
+) -> list[list[Config]]:
     """Put configurations into batches.
 
     Together go runs of one task by methods that differ in optimiser and contact model only, or that learn
@@ -31,6 +33,7 @@ def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) ->
         size: Runs of a batch, at most; if None as many as fit: trajectories and planners ``sim.memory_mb``,
             agents half of the device's memory.
         processes: How many carry out batches at a time: each is to have one, if there are runs enough.
+        sharing: How many of these share a device, and its memory.
 
     Returns:
         Batches, each as evenly filled as the others of its kind.
@@ -42,7 +45,7 @@ def plan(cfgs: Sequence[Config], size: int | None = None, processes: int = 1) ->
     first = {id(cfg): scene for cfg, scene in zip(cfgs, scenes, strict=True)}
     batches = []
     for group in groups.values():
-        limit = _limit(group[0], first[id(group[0])], size)
+        limit = _limit(group[0], first[id(group[0])], size, sharing)
         batches += _split(group, max(-(-len(group) // limit), -(-processes // len(groups))))
     return batches
 
@@ -61,7 +64,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     return [*kind, alike, scene.particle_count, scene.material_count, [m.shape for m in scene.manipulators]]
 
 
-def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
+def _limit(cfg: Config, scene: Scene, size: int | None, sharing: int) -> int:
     own = family(cfg.method.family)
     if not (own.batching or own.joins_populations(cfg.method)):
         return 1
@@ -70,9 +73,8 @@ def _limit(cfg: Config, scene: Scene, size: int | None) -> int:
     if own.batching:
         return batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
     # Agents need no gradient, so sim.memory_mb, the budget of one, is none of theirs.
-    return max(
-        1, most_environments(scene, cfg.sim.precision, cfg.sim.device) // cfg.method_as(RlConfig).num_envs
-    )
+    room = most_environments(scene, cfg.sim.precision, cfg.sim.device) // sharing
+    return max(1, room // cfg.method_as(RlConfig).num_envs)
 
 
 def _split(group: Sequence[Config], count: int) -> list[list[Config]]:
