@@ -38,7 +38,13 @@ LEAST_EXPONENT = -80
 
 
 class SumPhases(Storage):
-    """Sums by atomic additions; of integers where the simulator is deterministic."""
+    """Sums by atomic additions; of integers where the simulator is deterministic.
+
+    Attributes:
+        adjoint_bound: Of each environment, what no share of a node's adjoint exceeds, see :meth:`bits_of`.
+    """
+
+    adjoint_bound: ti.Field
 
     def scattered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_node` adds to it."""
