@@ -92,7 +92,7 @@ def test_a_mistake_in_a_fresh_process(tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
         "plab: unknown key 'sim.precison'; did you mean precision? choose from: "
-        "precision, device, memory_mb, grid_size, dt, substeps, horizon, particles_scale\n"
+        "precision, device, memory_mb, deterministic, grid_size, dt, substeps, horizon, particles_scale\n"
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -139,6 +139,8 @@ class Threads(ThreadPhases):
     def gather_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
         for q in range(self.batch * self.tiles * self.lanes):
             self.gather_thread_adjoint(state, bar, 0, 1, q)
+        for row in range(self.batch * self.materials):
+            self.take_material(row)
 
     @ti.kernel
     def advance_all(self, poses: ti.types.ndarray(ndim=1), actions: ti.types.ndarray(ndim=1)):
@@ -298,7 +300,7 @@ def test_poses(pair: tuple[Tiles, Threads]) -> None:
                 tiles.frame_bar.from_numpy(private.reshape(tiles.frame_bar.shape))
                 tiles.retreat_all(actions, actions_bar, s)
         else:
-            threads.frame_part.from_numpy(frames.swapaxes(0, 1).reshape(threads.frame_part.shape))
+            threads.frame_sums.from_numpy(frames.swapaxes(0, 1).ravel())
             threads.retreat_all(actions, actions_bar)
         names = ("centre", "rotation", "velocity", "spin", "gap")
         out = {name: getattr(phases, f"frame_{name}").to_numpy() for name in names}
