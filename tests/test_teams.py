@@ -9,8 +9,12 @@ import pytest
 from plab.sim import teams
 from plab.sim.teams import PROBE, PROBE_FIRST, RECENT, TeamChoice
 
-FIRST = 1 + 2 * RECENT
-"""Launches before the choice is made: one that compiles, and as many of each of two teams."""
+FIRST = 1 + RECENT + 1
+"""Launches before the choice is made: one that compiles, some of the larger team, and one of the other, which
+is clearly slower."""
+
+LONGEST = 1 + 2 * RECENT
+"""The same where it is not: as many of each."""
 
 
 class Machine:
@@ -50,7 +54,7 @@ def test_the_faster_team_does_nearly_all_launches(machine: Machine) -> None:
 def test_a_choice_made_in_a_bad_moment_is_soon_corrected(machine: Machine) -> None:
     choice = TeamChoice((2, 1))
     machine.cost = lambda size: {1: 1.0, 2: 5.0}[size]
-    run(choice, machine, FIRST)
+    run(choice, machine, LONGEST)
     machine.cost = lambda size: 1.0 / size
     sizes = run(choice, machine, 3 * PROBE_FIRST)
     assert set(sizes[:PROBE_FIRST]) == {1} and sizes[PROBE_FIRST:].count(1) <= 2
@@ -84,6 +88,15 @@ def test_a_busy_machine_changes_the_choice_and_a_quiet_one_changes_it_back(machi
     machine.cost = lambda size: 1.0 / size
     assert run(choice, machine, 2 * PROBE).count(2) >= PROBE
     assert set(run(choice, machine, 10)) == {2}
+
+
+def test_a_team_that_is_clearly_slower_is_tried_once_at_the_start(machine: Machine) -> None:
+    assert run(TeamChoice((2, 1)), machine, 10) == [2, 2, 1, *[2] * 7]
+
+
+def test_teams_that_are_alike_are_tried_alike(machine: Machine) -> None:
+    machine.cost = lambda size: {1: 1.4, 2: 1.0}[size]
+    assert run(TeamChoice((2, 1)), machine, LONGEST) == [2, *[2, 1] * RECENT]
 
 
 def test_one_size_is_no_choice(machine: Machine) -> None:

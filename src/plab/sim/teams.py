@@ -15,6 +15,9 @@ PROBE = 100
 RECENT = 3
 """A team is as fast as the fastest of so many of its launches: one that was interrupted says little."""
 
+CLEARLY = 1.5
+"""A team that takes so many times as long as the fastest at the start need not be tried again there."""
+
 
 class TeamChoice:
     """Chooses between teams of threads for a kernel's launches, by what they take.
@@ -45,8 +48,9 @@ class TeamChoice:
     def _next(self) -> int:
         # As many launches of each at first: the first ones of a process are often interrupted.
         tried = {size: len(self._seconds.get(size, ())) for size in self._sizes}
-        if min(tried.values()) < RECENT:
-            return min(self._sizes, key=lambda size: tried[size])
+        wanted = [size for size in self._sizes if tried[size] < RECENT and not self._out_of_question(size)]
+        if wanted:
+            return min(wanted, key=lambda size: tried[size])
         best = min(self._sizes, key=lambda size: min(self._seconds[size]))
         if best != self._best:
             # What led to the choice may have been a moment's disturbance.
@@ -57,3 +61,8 @@ class TeamChoice:
             self._probe_at = self._launches + self._interval
             return next((size for size in self._sizes if size != best), best)
         return best
+
+    def _out_of_question(self, size: int) -> bool:
+        """Whether a team is clearly slower than the first one, which may not be so from one launch."""
+        first, own = (self._seconds.get(team, ()) for team in (self._sizes[0], size))
+        return size != self._sizes[0] and bool(own) and min(own) > CLEARLY * min(first)
