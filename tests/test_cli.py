@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 
 from plab.cli.run import main
 from plab.config import GROUPS, Config, choices
@@ -85,6 +86,24 @@ def test_a_results_folder_that_cannot_be_written(capsys, flags):
     assert main(["results_dir=file/results", *flags]) == 2
     (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("plab: "))
     assert "cannot write" in line and "file" in line
+
+
+def test_a_single_run_is_composed_once(seen, monkeypatch):
+    composed = []
+    load = ConfigLoaderImpl.load_configuration
+    monkeypatch.setattr(
+        ConfigLoaderImpl,
+        "load_configuration",
+        lambda *args, **kwargs: composed.append(1) or load(*args, **kwargs),
+    )
+    assert main(["seed=3"]) == 0
+    assert [cfg.seed for cfg in seen] == [3] and len(composed) == 1
+
+
+@pytest.mark.parametrize("words", [["hydra.mode=MULTIRUN"], ["-m"], ["++hydra.mode=MULTIRUN"]])
+def test_ways_to_ask_for_a_sweep(seen, words):
+    assert main(["seed=0,1", *words]) == 0
+    assert [cfg.seed for cfg in seen] == [0, 1]
 
 
 def test_a_mistake_in_a_fresh_process(tmp_path):
