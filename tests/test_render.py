@@ -16,9 +16,11 @@ import reference_mpm
 from plab import results
 from plab.cli.render import main
 from plab.config import build_scene, choices, load_config
+from plab.examples import example_archive
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.camera import VIEWS, Camera, View, fit_camera, scene_camera
+from plab.render.recording import stored
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, target_field
@@ -355,6 +357,17 @@ def recording():
 
 
 @drawing
+@pytest.mark.parametrize("name", ["example", "release", "targets", "authors"])
+def test_runs_of_earlier_versions_can_be_replayed(name: str) -> None:
+    """Those that come with plab, one of each task: their configurations lack keys that came later."""
+    runs = results.load(example_archive(name)).drop_duplicates("task")
+    assert len(runs) == 10
+    for run in runs.itertuples():
+        cfg, actions = stored(Path(run.path))
+        assert cfg.task.name == run.task and not cfg.sim.deterministic
+        assert actions.shape[0] == cfg.sim.horizon
+
+
 def test_a_recording_holds_the_start_and_every_step(recording):
     assert recording.x.shape == (4, recording.scene.particle_count, 3)
     assert recording.poses.shape == (4, 3, 8)

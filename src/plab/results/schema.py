@@ -218,6 +218,7 @@ def stored_config(text: str) -> dict[str, Any]:
     _check_tables(config)
     usual = "last" if config["protocol"]["name"] == "release" else "best"
     config["protocol"] = {"score": usual} | config["protocol"]
+    config["sim"] = {"deterministic": False} | config["sim"]
     return config
 
 
