@@ -45,7 +45,7 @@ def make_config(folder: Path, **changes) -> dict:
             "score": "best",
             "contact": "nearest",
         },
-        "sim": {"device": "cpu", "precision": "float64"},
+        "sim": {"device": "cpu", "precision": "float64", "deterministic": False},
         "seed": 3,
         "seed_particles": 0,
         "results_dir": str(folder),
@@ -91,9 +91,17 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
-def test_runs_from_before_protocols_are_of_plabs_own_and_of_the_first_draw(tmp_path: Path) -> None:
+def test_runs_from_before_a_key_have_what_was_then(tmp_path: Path) -> None:
+    """Of plab's own protocol, of the first draw, not deterministic; their hashes stay the same."""
     config = make_config(tmp_path)
-    run = RunFile({key: value for key, value in config.items() if key not in ("protocol", "seed_particles")})
+    before = {key: value for key, value in config.items() if key not in ("protocol", "seed_particles")}
+    before["sim"] = {key: value for key, value in config["sim"].items() if key != "deterministic"}
+    assert config_hash(before) == config_hash(config)
+    for device, same in (("cpu", True), ("cuda", False)):
+        sim = config["sim"] | {"device": device}
+        now = config_hash(config | {"sim": sim | {"deterministic": True}})
+        assert (now == config_hash(config | {"sim": sim})) == same
+    run = RunFile(before)
     run.finish({}, {})
     assert read(run.path).config == config
     (row,), _ = rows(tmp_path)
