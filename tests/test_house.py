@@ -21,6 +21,15 @@ MODULES = sorted((ROOT / "src").rglob("*.py"))
 HEAVY = {"matplotlib", "pandas", "pyvista", "scipy.ndimage", "stable_baselines3", "taichi", "torch", "vtk"}
 
 
+def imported(code: str, heavy: set[str], folder: Path) -> str:
+    """Which of some modules a new process has imported after a piece of code, as a list in one line."""
+    code = f"import sys\n{code}\nprint(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True
+    )
+    return done.stdout.splitlines()[-1]
+
+
 def names(requirements: str) -> set[str]:
     """Distributions that a list of requirements in TOML names."""
     return {name.lower() for name in re.findall(r'^ +"([A-Za-z0-9_.-]+)', requirements, re.MULTILINE)}
@@ -42,16 +51,11 @@ def test_imports_point_one_way(monkeypatch):
     ],
 )
 def test_starting_imports_nothing_heavy(code, tmp_path):
-    code = f"import sys; {code}; print(sorted({HEAVY} & set(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert imported(code, HEAVY, tmp_path) == "[]"
 
 
 def test_a_run_does_without_tables(tmp_path):
     code = """
-import sys
 import plab.cli.next_steps
 import plab.runners.trajectory
 from plab.config import load_config
@@ -62,29 +66,12 @@ run.record({"iteration": 0, "loss": 1.0, "score": 0.5}, {}, keep=True)
 run.finish({"score": 0.5}, {})
 assert RunFile(cfg).result.score == 0.5
 """
-    heavy = HEAVY - {"taichi"}
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}\nprint(sorted({heavy} & set(sys.modules)))"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert imported(code, HEAVY - {"taichi"}, tmp_path) == "[]"
 
 
 def test_tables_are_made_without_what_draws_or_simulates(tmp_path):
-    heavy = HEAVY - {"pandas"} | {"scipy.stats"}
-    code = "import sys; from plab.cli.report import main"
-    code += "; assert main(['tables', '--results', 'example']) == 0"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}; print(sorted({heavy} & set(sys.modules)))"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.splitlines()[-1] == "[]"
+    code = "from plab.cli.report import main; assert main(['tables', '--results', 'example']) == 0"
+    assert imported(code, HEAVY - {"pandas"} | {"scipy.stats"}, tmp_path) == "[]"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT / "src")))

@@ -178,7 +178,7 @@ def _mode_by_flags(arguments: Namespace) -> Iterator[None]:
     """Have Hydra go by ``-m`` alone where nothing else can say whether this is a sweep: it would compose the
     whole configuration for its key ``hydra.mode``, which takes a tenth of a second, and then again."""
     words = [word.lstrip("+~") for word in arguments.overrides]
-    asks = any(re.match(rf"({EXPERIMENT}[=@]|hydra\.mode|hydra@)", word) for word in words)
+    asks = any(re.match(rf"({EXPERIMENT}|hydra)[=@]|hydra\.mode", word) for word in words)
     if asks or arguments.config_name or arguments.config_path:
         yield
         return

@@ -65,7 +65,10 @@ FRAME_ADJOINT = 25
 (1)."""
 
 MANIPULATOR = 18
-"""Numbers that say what a manipulator is like, see :meth:`Storage.put_manipulators`."""
+"""Numbers that say what a manipulator is like, for :meth:`Storage.put_manipulators`; its size is first."""
+
+AT_SCALE, AT_LOWER, AT_UPPER, AT_FRICTION, AT_MINIMAL_GAP = 3, 10, 13, 16, 17
+"""Where the others of these begin."""
 
 STATE_MASK = 2**27 - 1
 """Largest entry of an array of states on the CPU, all bits set; LLVM must see that eight times an entry and
@@ -273,22 +276,23 @@ class Storage:
         for e, scene in enumerate(scenes):
             for row, tool in zip(rows[e], scene.manipulators, strict=True):
                 row[: len(tool.size)] = tool.size
-                row[3 : 3 + len(tool.scale)] = tool.scale
-                row[10:] = *tool.lower_bound, *tool.upper_bound, tool.friction, tool.minimal_gap
+                row[AT_SCALE : AT_SCALE + len(tool.scale)] = tool.scale
+                row[AT_LOWER:AT_FRICTION] = *tool.lower_bound, *tool.upper_bound
+                row[AT_FRICTION], row[AT_MINIMAL_GAP] = tool.friction, tool.minimal_gap
         self.put_manipulators(rows.ravel())
 
     # One kernel: that of each field's own from_numpy takes 10 ms to come from Taichi's cache.
     @ti.kernel
     def put_manipulators(self, rows: Array):
-        """Write what manipulators are like: size (3), scale (7), lower and upper bound (3 each), friction and
-        minimal gap of each in float64."""
+        """Write what manipulators are like, float64, shape [batch * manipulator * MANIPULATOR]: size (3),
+        scale (7), lower and upper bound (3 each), friction, minimal gap."""
         for e, m in ti.ndrange(self.batch, self.manipulators):
             first = (e * self.manipulators + m) * MANIPULATOR
             for i in ti.static(range(3)):
                 self.size[e, m][i] = ti.cast(rows[first + i], self.real)
-                self.low[e, m][i] = rows[first + 10 + i]
-                self.high[e, m][i] = rows[first + 13 + i]
+                self.low[e, m][i] = rows[first + AT_LOWER + i]
+                self.high[e, m][i] = rows[first + AT_UPPER + i]
             for i in ti.static(range(7)):
-                self.scale[e, m][i] = rows[first + 3 + i]
-            self.friction[e, m] = ti.cast(rows[first + 16], self.real)
-            self.minimal_gap[e, m] = rows[first + 17]
+                self.scale[e, m][i] = rows[first + AT_SCALE + i]
+            self.friction[e, m] = ti.cast(rows[first + AT_FRICTION], self.real)
+            self.minimal_gap[e, m] = rows[first + AT_MINIMAL_GAP]
