@@ -15,7 +15,7 @@ import taichi as ti
 
 from plab.losses.term import ParticleTerm
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
-from plab.sim import State
+from plab.sim import Simulator, State
 
 if TYPE_CHECKING:
     import reference_mpm as reference
@@ -122,3 +122,10 @@ def assert_same_state(got: State, e: int, want: reference.State) -> None:
         a, b = getattr(got, name)[e], getattr(want, name).numpy()
         error = np.abs(a - b).max() / max(1.0, np.abs(b).max())
         assert error < 1e-9, f"environment {e}, {name}: {error:.2e}"
+
+
+def make_not_finite(simulator: Simulator, env: int) -> None:
+    """Give a particle of an environment a velocity that is not a number."""
+    state = simulator.state()
+    state.v[env, 5] = np.nan
+    simulator.set_state(state)

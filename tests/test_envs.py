@@ -28,6 +28,8 @@ from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, observation, total_loss
+from plab.sim import SimulationError
+from suite import make_not_finite
 
 pytestmark = pytest.mark.physics
 
@@ -301,6 +303,37 @@ def test_wrong_actions_of_a_batch_are_refused(vector: PlabVectorEnv) -> None:
         vector.step(np.zeros(6))
     with pytest.raises(ValueError, match="NaN"):
         vector.step(np.full((2, 6), np.nan))
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_what_breaks_off_rests_until_the_next_episode(vector: PlabVectorEnv, at: int) -> None:
+    """The first environment is not finite before a step; the other one goes on."""
+    batch, actions = vector.batch, random_actions()
+
+    def episode(broken_at: int | None) -> list[core.Transition]:
+        observation, info = batch.reset()
+        done = [core.Transition(observation, np.zeros(2), False, info)]
+        for t, action in enumerate(actions):
+            if t == broken_at:
+                make_not_finite(batch.problem.simulator, 0)
+            done.append(batch.step(action, strict=False))
+        return done
+
+    whole, broken = episode(None), episode(at)
+    assert [list(done.failures) for done in broken] == [[]] * (at + 1) + [[0]] * (HORIZON - at)
+    # Steps are counted from the state that was set.
+    assert broken[-1].failures[0].startswith("environment step 1, substep 1: the state is not finite")
+    for t, done in enumerate(broken):
+        for env, want in enumerate((whole[min(t, at)], whole[t])):
+            assert np.array_equal(done.observation[env], want.observation[env])
+            assert done.reward[env] == want.reward[env]
+            assert all(done.info[name][env] == want.info[name][env] for name in want.info)
+    batch.reset()
+    make_not_finite(batch.problem.simulator, 0)
+    with pytest.raises(SimulationError, match="environment 0, environment step 1, substep 1"):
+        batch.step(actions[0])
+    batch.reset()
+    assert np.array_equal(batch.step(actions[0]).observation, whole[1].observation)
 
 
 # --------------------------------------------------------------------------------------- stable-baselines3

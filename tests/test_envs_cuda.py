@@ -12,6 +12,7 @@ from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
+from suite import make_not_finite
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 
@@ -53,6 +54,32 @@ def test_tensors_stay_on_the_device(own_stream: bool) -> None:
             np.testing.assert_allclose(got.observation.cpu().numpy(), want.observation, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(got.reward.cpu().numpy(), want.reward, atol=1e-9)
             np.testing.assert_allclose(got.info["score"].cpu().numpy(), want.info["score"], atol=1e-9)
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_what_breaks_off_rests_on_the_device(at: int) -> None:
+    """The first environment is not finite before a step; the other one goes on."""
+    env = TensorEnv([load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2)
+    actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(4, 2, 6)
+    env.reset()
+    whole = [env.step(action, strict=False) for action in actions]
+    first = env.reset()
+    broken = []
+    for t, action in enumerate(actions):
+        if t == at:
+            make_not_finite(env.batch.problem.simulator, 0)
+        broken.append(env.step(action, strict=False))
+    assert [list(done.failures) for done in broken] == [[]] * at + [[0]] * (4 - at)
+    for t, (got, want) in enumerate(zip(broken, whole, strict=True)):
+        assert all(tensor.is_cuda for tensor in (got.observation, got.reward, *got.info.values()))
+        torch.testing.assert_close(got.observation[1], want.observation[1], rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(got.reward[1], want.reward[1], rtol=0, atol=1e-9)
+        if t >= at:
+            rest, reward = (
+                (broken[0].observation, broken[0].reward) if at else (first, torch.zeros_like(got.reward))
+            )
+            assert torch.equal(got.observation[0], rest[0])
+            torch.testing.assert_close(got.reward[0], reward[0], rtol=0, atol=1e-4)
 
 
 def test_gradients_of_tensors_stay_on_the_device() -> None:

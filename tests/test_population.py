@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,6 +51,7 @@ from plab.runners.rl_trainer import scaled
 from plab.sweep.plan import plan
 from plab.tally import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
+from suite import make_not_finite
 from test_rl import COARSE as SMALL_RUN
 
 
@@ -487,27 +490,52 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, method, monkey
         pd.testing.assert_series_equal(read(result_path(cfg)).iterations["loss"], want.iterations["loss"])
 
 
-@pytest.mark.physics
-@pytest.mark.parametrize("method", ["sac", "ppo"])
-def test_a_run_that_breaks_off_leaves_the_others_alone(tmp_path, lone, method, monkeypatch) -> None:
-    """NaN inside the simulator, in an environment of the second run, in training."""
-    alone = lone(method)
-    cfgs = configs(tmp_path, method)
-    intact, calls = Population._step, iter(range(10_000))
+def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None:
+    """Have both environments of the second run break off in some steps of the training."""
+    intact, calls = Population._step, itertools.count()
 
     def step(self: Population) -> None:
-        if next(calls) == 9:
-            simulator = self._training.batch.problem.simulator
-            state = simulator.state()
-            state.v[3, 5] = np.nan
-            simulator.set_state(state)
+        if next(calls) in steps:
+            for env in (2, 3):
+                make_not_finite(self._training.batch.problem.simulator, env)
         intact(self)
 
+    monkeypatch.setattr(Population, "_step", step)
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("method", ["sac", "ppo"])
+def test_episodes_that_break_off_are_counted_and_end_nothing(
+    tmp_path, lone, method, monkeypatch, caplog
+) -> None:
+    alone = lone(method)
+    cfgs = configs(tmp_path, method)
     with monkeypatch.context() as patch:
-        patch.setattr(Population, "_step", step)
+        break_steps(patch, {9})
+        assert [one.status for one in carry(cfgs)] == ["finished"] * 3
+    for k in (0, 2):
+        assert "broken_episodes" not in assert_same_numbers(cfgs[k], alone[k]).provenance
+    result = read(result_path(cfgs[1]))
+    assert result.provenance["broken_episodes"] == 2
+    assert np.isfinite(result.iterations[1:].to_numpy()).all()
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert str(result.path) in told
+    assert re.search(
+        "2 of [67] episodes of training broke off .* environment step 1, substep 1: the state", told
+    )
+
+
+@pytest.mark.physics
+def test_a_run_whose_episodes_all_break_off_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
+    alone = lone("sac")
+    cfgs = configs(tmp_path, "sac")
+    with monkeypatch.context() as patch:
+        break_steps(patch, range(12))
         ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "finished"]
-    assert ended[1].message.startswith("iteration 1: environment step ")
+    assert ended[1].message.startswith(
+        "iteration 1: all 6 episodes of training broke off, the first in environ"
+    )
     assert "the state is not finite" in ended[1].message
     for k in (0, 2):
         assert_same_numbers(cfgs[k], alone[k])
@@ -588,9 +616,12 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
     with monkeypatch.context() as patch:
         break_off(patch, 15, OSError("gone"))
         assert [one.status for one in run_batch(cfgs)] == ["failed"] * 3
-    assert [one.status for one in run_batch(cfgs)] == ["finished"] * 3
-    for cfg in cfgs:
+    with monkeypatch.context() as patch:
+        break_steps(patch, {9})
+        assert [one.status for one in run_batch(cfgs)] == ["finished"] * 3
+    for k, cfg in enumerate(cfgs):
         result = read(result_path(cfg))
+        assert result.provenance.get("broken_episodes", 0) == (2 if k == 1 else 0)
         assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
         assert np.isfinite(result.iterations[1:].to_numpy()).all()
         assert load_policy(result.path, "cuda").network.device.type == "cuda"

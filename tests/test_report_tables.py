@@ -454,6 +454,7 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
                 "all gradient": ("150", "0.97", "93 %"),
                 "PPO": ("50", "0.74", "88 %"),
                 "TD3": ("48", "0.64", "94 %"),
+                "SAC": ("40", "0.44", "90 %"),
             },
         ),
         ("targets", {"all": ("150", "0.45", "43 %")}),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -20,6 +22,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from plab.bench import rl as bench
 from plab.config import Config, ConfigError, load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.sb3 import PlabVecEnv
 from plab.families import FAMILIES
 from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
@@ -32,6 +35,7 @@ from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
 from plab.sim import SimulationError
 from same_runs import KeepsAll, assert_same_numbers
+from suite import make_not_finite
 
 pytestmark = pytest.mark.physics
 
@@ -335,6 +339,27 @@ def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, fin
         process.wait()
     subprocess.run(command, check=True)
     assert_same_numbers(read(result_path(cfg)), finished[method])
+
+
+@pytest.mark.parametrize("method", ["sac", "ppo"])
+def test_an_episode_that_breaks_off_is_counted_and_ends_nothing(
+    tmp_path, method, monkeypatch, caplog
+) -> None:
+    intact, calls = PlabVecEnv.step_wait, itertools.count()
+
+    def step_wait(self: PlabVecEnv):
+        if next(calls) == 9:
+            make_not_finite(self.batch.problem.simulator, 1)
+        return intact(self)
+
+    monkeypatch.setattr(PlabVecEnv, "step_wait", step_wait)
+    result = run(make_config(tmp_path, method))
+    assert result.provenance["broken_episodes"] == 1
+    assert np.isfinite(result.iterations[1:].to_numpy()).all()
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert re.search(
+        "1 of [67] episodes of training broke off .* environment step 1, substep 1: the state", told
+    )
 
 
 def test_a_state_that_is_not_finite_ends_the_run(tmp_path: Path, monkeypatch) -> None:

@@ -151,8 +151,8 @@ class Transition:
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         truncated: Whether the episodes are over.
         info: The entries of ``info``, each of shape [batch], in type like the rewards.
-        failures: Environments that have broken off in the episode, and when and why; their numbers mean
-            nothing. Empty unless the step was not ``strict``.
+        failures: Environments that have broken off in the episode, and when and why; their numbers are those
+            of the step before. Empty unless the step was not ``strict``.
     """
 
     observation: Array
@@ -201,10 +201,11 @@ class EpisodeBatch:
         self.observation_space, self.action_space = spaces(scenes)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
+        self._failures: dict[int, str] = {}
         self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
-        self._initial_info = self._info()
-        self._initial_loss = Constants(self._initial_info["loss"])
-        self._initial_observation = self._observe()
+        # Where environments rest that break off: observations, loss terms and IoU.
+        self._initial = self._last = self._seen()
+        self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
 
     @property
     def problem(self) -> Problem:
@@ -234,11 +235,11 @@ class EpisodeBatch:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         self._simulator.reset()
-        self._step = 0
-        if on_device(like):
-            return self._observe(like), self._info(like)
+        self._step, self._failures = 0, {}
+        self._last = self._seen(like) if on_device(like) else self._initial
         # Copies: a caller may keep and change what it is given.
-        return self._initial_observation.copy(), {name: v.copy() for name, v in self._initial_info.items()}
+        observation, terms, iou = _copies(self._last)
+        return observation, self._info(terms, iou)
 
     def step(self, actions: Array, *, strict: bool = True) -> Transition:
         """Advance all sub-environments by one step.
@@ -246,8 +247,9 @@ class EpisodeBatch:
         Args:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes back
                 are tensors on the same device, and no array crosses to the host.
-            strict: Whether a sub-environment that breaks off is an error, instead of an entry in
-                ``failures``; the others go on, and it is whole again after :meth:`reset`.
+            strict: Whether a sub-environment that breaks off is an error. Otherwise, the same for all steps
+                of an episode, it is an entry in ``failures`` and rests: what it is seen by stays what it was
+                before, while the others go on, and it is whole again after :meth:`reset`.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -260,16 +262,23 @@ class EpisodeBatch:
         simulator.step(actions, check=False)
         # Queued before the wait for the measures.
         observation = self._observe(actions)
-        failures: Mapping[int, str] = {}
         try:
-            info = self._info(actions)
+            measures = simulator.measure(actions)
         except SimulationError as error:
             if strict:
                 raise
             # Told once a step: asked again, the measures are those of the others.
-            failures, info = error.failures, self._info(actions)
+            self._failures, measures = error.failures | self._failures, simulator.measure(actions)
+        seen = observation, measures.terms, measures.iou
+        if self._failures:
+            for table, before in zip(seen, self._last, strict=True):
+                _restore_rows(table, before, list(self._failures))
+        if not strict:
+            self._last = _copies(seen)
         self._step = now + 1
+        info = self._info(*seen[1:])
         reward = self._initial_loss.like(actions) - info["loss"]
+        failures = dict(self._failures)
         return Transition(observation, reward, self._step == self.horizon, info, failures)
 
     def closed_loop(
@@ -377,9 +386,12 @@ class EpisodeBatch:
             return torch.cat(rows, dim=1)
         return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
 
-    def _info(self, like: Array = None) -> dict[str, Array]:
+    def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
+        """Return what the current states are seen by: observations, loss terms and IoU."""
         measures = self._simulator.measure(like)
-        terms, iou = measures.terms, measures.iou
+        return self._observe(like), measures.terms, measures.iou
+
+    def _info(self, terms: Array, iou: Array) -> dict[str, Array]:
         score, printed = self.problem.scores_of(iou)
         return {
             "loss": self.problem.loss_of(terms),
@@ -388,6 +400,18 @@ class EpisodeBatch:
             "score": score,
             "score_printed": printed,
         }
+
+
+def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
+    """Replace some rows of a table by those of one before, both arrays or CUDA tensors."""
+    kept = before[rows]
+    if on_device(table):
+        kept = kept.to(table) if on_device(kept) else table.new_tensor(kept)
+    table[rows] = kept
+
+
+def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(table.clone() if on_device(table) else table.copy() for table in tables)
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:

@@ -72,9 +72,12 @@ class PlabVecEnv(VecEnv):
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if there is one.
         truncates: Whether infos say that it is a limit of time which ends the episodes.
+        strict: Whether a sub-environment that breaks off is an error; otherwise it rests until its episode
+            ends, see :meth:`plab.envs.core.EpisodeBatch.step`, and its infos say why under ``broken``.
     """
 
     truncates = True
+    strict = True
 
     def __init__(
         self, batch: EpisodeBatch, *, render_mode: str | None = None, spec: EnvSpec | None = None
@@ -123,10 +126,12 @@ class PlabVecEnv(VecEnv):
 
         Raises:
             ValueError: If an action is not finite.
-            plab.sim.SimulationError: If a state stops being finite.
+            plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
-        result = self.batch.step(self._actions)
+        result = self.batch.step(self._actions, strict=self.strict)
         observation, infos = result.observation, self._split(result.info)
+        for number, text in result.failures.items():
+            infos[number]["broken"] = text
         for number, info in enumerate(infos):
             info["TimeLimit.truncated"] = result.truncated and self.truncates
             if result.truncated:

@@ -4,6 +4,7 @@ settings."""
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
@@ -16,7 +17,7 @@ from plab.config import Config, MethodConfig
 from plab.envs.core import EpisodeBatch
 from plab.reuse import SimulatorCache
 from plab.runners.common import LAST, episode_columns
-from plab.runners.runner import Runner
+from plab.runners.runner import Runner, Track
 
 __all__ = [
     "PolicyEpisode",
@@ -26,6 +27,8 @@ __all__ = [
     "shared_batches",
     "torch_settings",
 ]
+
+_log = logging.getLogger(__name__)
 
 
 class PolicyRunner(Runner):
@@ -41,6 +44,33 @@ class PolicyRunner(Runner):
     def context(self) -> AbstractContextManager[Any]:
         """Give torch its threads."""
         return torch_settings(self.method.torch_threads)
+
+    def note_broken(self, track: Track, broken: Sequence[str], episodes: int) -> str:
+        """Warn of episodes of training that broke off, whose environments rested until their end, and count
+        them in the result's provenance.
+
+        Args:
+            track: The run.
+            broken: When and why each of them broke off.
+            episodes: Episodes of training that they are among.
+
+        Returns:
+            Why the run cannot go on, if all did; otherwise an empty text.
+        """
+        if not broken:
+            return ""
+        if len(broken) >= episodes:
+            return f"all {episodes} episodes of training broke off, the first in {broken[0]}"
+        result = track.job.run.result
+        result.provenance["broken_episodes"] = result.provenance.get("broken_episodes", 0) + len(broken)
+        _log.warning(
+            "%s: %d of %d episodes of training broke off and rested until their end, the first in %s",
+            track.job.run.path,
+            len(broken),
+            episodes,
+            broken[0],
+        )
+        return ""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from plab.config import ConfigError, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.environments import PolicyEpisode, PolicyRunner, policy_episode, shared_batches
+from plab.runners.jobs import RunError
 from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
 from plab.runners.policy import save_policy
@@ -66,10 +67,12 @@ class RlRunner(PolicyRunner):
     def step(self, track: Track) -> Step:
         """Train until the next evaluation is due, except before the first, and run the policy once."""
         trainer = cast(Trainer, self._trainer)
-        before = trainer.steps
+        before, episodes = trainer.steps, trainer.episodes
         # The first episode, of the untrained policy, compiles the kernels.
         if track.iteration > 0:
             self._train(trainer, track)
+            if why := self.note_broken(track, trainer.take_broken(), trainer.episodes - episodes):
+                raise RunError(f"iteration {track.iteration}: {why}")
             self.enter("evaluate")
         done = self.episode(trainer)
         measured = done.measures | trainer.take_statistics()

@@ -67,7 +67,9 @@ class Trainer:
         self._episode_actions: list[np.ndarray] = []
         self._rewards: list[float] = []
         self._scores: list[float] = []
+        self._broken: list[str] = []
         envs = PlabVecEnv(batch)
+        envs.strict = False
         envs.truncates = not isinstance(method, PpoConfig) or method.bootstrap
         self._monitor = VecMonitor(envs)
         self._statistics = scaled(cfg, self._monitor)
@@ -114,6 +116,7 @@ class Trainer:
         self.last_reward = float(np.mean(rewards))
         self._rewards += rewards
         self._scores += [info["score"] for info in infos]
+        self._broken += [info["broken"] for info in infos if "broken" in info]
         return True
 
     def take_statistics(self) -> dict[str, float]:
@@ -122,6 +125,11 @@ class Trainer:
         self._rewards, self._scores = [], []
         means = {"train_reward": rewards, "train_score": scores}
         return {name: float(np.mean(values)) if values else math.nan for name, values in means.items()}
+
+    def take_broken(self) -> list[str]:
+        """Return when and why the episodes broke off that did so since the last call."""
+        broken, self._broken = self._broken, []
+        return broken
 
     def state(self) -> dict[str, Any]:
         """Return everything that further training depends on, except the replay buffer's content."""

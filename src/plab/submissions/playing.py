@@ -84,14 +84,12 @@ def _batches(cfgs: Sequence[Config], precision: str) -> Iterator[tuple[int, Epis
 
 def _play(batch: EpisodeBatch, choose: Callable[[int, np.ndarray], np.ndarray]) -> list[Played]:
     """Play an episode of each sub-environment, with the actions chosen for a step and its observations."""
-    failures: dict[int, str] = {}
-    observations, info = batch.reset()
+    observations, _ = batch.reset()
     for t in range(batch.horizon):
         step = batch.step(choose(t, observations), strict=False)
-        observations, info = step.observation, step.info
-        failures |= step.failures
+        observations = step.observation
     batch.close()
     return [
-        Played(float("nan"), failures[number]) if number in failures else Played(float(score))
-        for number, score in enumerate(info["score"])
+        Played(float("nan"), step.failures[number]) if number in step.failures else Played(float(score))
+        for number, score in enumerate(step.info["score"])
     ]

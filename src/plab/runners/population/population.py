@@ -80,8 +80,8 @@ class Population:
         spaces = Spaces(batch.observation_space, batch.action_space)
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
         self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
-        self._broken = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
-        self._failures: dict[int, str] = {}
+        self._lost = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
+        self._broken: dict[int, list[str]] = {}
         self._episode_actions: list[Tensor] = []
         self._ended: list[Tensor] = []
         self._start(states)
@@ -149,14 +149,15 @@ class Population:
         """Return each agent's mean losses over the updates since the last call, if they are kept."""
         return [losses for stack in self.stacks for losses in stack.take_losses()]
 
-    def take_failures(self) -> dict[int, str]:
-        """Return why agents broke off in training since the last call, by their numbers."""
-        numbers = self._numbers.tolist()
-        failures = {number: text for number, text in self._failures.items() if number in numbers}
-        for place in torch.nonzero(self._broken).flatten().tolist():
-            failures.setdefault(numbers[place], NOT_FINITE)
-        self._failures = {}
-        return failures
+    def lost(self) -> dict[int, str]:
+        """Return why agents cannot go on, by their numbers: their networks are not finite."""
+        return {self._numbers[place].item(): NOT_FINITE for place in torch.nonzero(self._lost).flatten()}
+
+    def take_broken(self) -> dict[int, list[str]]:
+        """Return when and why the episodes of training broke off that did so since the last call, by the
+        agents' numbers."""
+        broken, self._broken = self._broken, {}
+        return broken
 
     def states(self) -> list[dict[str, Any]]:
         """Return each agent's state: all that further training depends on, except a replay buffer."""
@@ -195,13 +196,13 @@ class Population:
     def _advance_training(self, actions: Tensor) -> Transition:
         """Advance the environments of the training, and note what an episode adds up to."""
         done = self._advance(self._training, actions)
-        for env, text in done.failures.items():
-            self._failures.setdefault(env // self._envs, text)
         self._reward += self._own(done.reward, self._envs).squeeze(2)
         self._episode_actions.append(actions)
         if done.truncated:
             # Networks that are not finite stay so: once an episode is soon enough.
-            self._broken |= ~actions.isfinite().all(2).all(1)
+            self._lost |= ~actions.isfinite().all(2).all(1)
+            for env, text in done.failures.items():
+                self._broken.setdefault(env // self._envs, []).append(text)
             score = self._own(done.info["score"], self._envs).squeeze(2)
             self._ended.append(torch.stack([self._reward, score]))
             self._reward.zero_()

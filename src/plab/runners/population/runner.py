@@ -98,22 +98,22 @@ class PopulationRunner(PolicyRunner):
         least = min(track.iteration for track in tracks)
         members = [track for track in tracks if track.iteration == least]
         population = self._population_of(members)
-        failures: dict[int, str] = {}
-        before = population.steps
+        before, episodes = population.steps, population.episodes
         # The first episode, of the untrained policies, compiles the kernels.
         if least > 0:
             self.enter("optimise", members)
             columns = members[0].job.run.result.columns
             population.train(int(columns["episodes"][-1]) + self.method.evaluate_every)
-            failures = population.take_failures()
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
         losses, states = population.take_losses(), population.states()
+        lost, broken = population.lost(), population.take_broken()
         share = (time.perf_counter() - start) / len(members)
         self._rate = (population.steps - before) / share
         for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
             start = time.perf_counter()
-            if failure := failures.get(track.number) or done.failure:
+            unusable = self.note_broken(track, broken.get(track.number, ()), population.episodes - episodes)
+            if failure := lost.get(track.number) or done.failure or unusable:
                 track.fail(failure)
                 continue
             try:
