@@ -14,6 +14,7 @@ import torch
 import reference_mpm as reference
 import synthetic
 from plab.config import ConfigError, build_scene, choices, load_config
+from plab.envs.core import EpisodeBatch
 from plab.losses import make_terms
 from plab.objective import spread_mass
 from plab.problem import Problem
@@ -348,6 +349,21 @@ def test_loss_and_gradient_of_torus_are_known(protocol: str, loss: float, norm: 
 
 
 # --------------------------------------------------------------------------------------------------- results
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize(("floor", "breaks_off"), [("release", True), ("plab", False)])
+def test_on_the_releases_floor_a_sphere_can_throw_particles_away(floor: str, breaks_off: bool) -> None:
+    """It is pressed against the floor and pushed into the block: some nodes there have masses close to 0."""
+    cfg = load_config(["task=Assembly", "protocol=release", f"protocol.floor={floor}"])
+    batch = EpisodeBatch([cfg])
+    batch.reset()
+    actions = np.zeros((30, 1, 6))
+    actions[:, 0, :3] = 1.0, -1.0, -1.0
+    actions[16:, 0, 2] = 1.0
+    for action in actions:
+        done = batch.step(action, strict=False)
+    assert bool(done.failures) == breaks_off
 
 
 @pytest.mark.physics

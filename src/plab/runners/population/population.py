@@ -151,7 +151,8 @@ class Population:
 
     def lost(self) -> dict[int, str]:
         """Return why agents cannot go on, by their numbers: their networks are not finite."""
-        return {self._numbers[place].item(): NOT_FINITE for place in torch.nonzero(self._lost).flatten()}
+        numbers = self._numbers.tolist()
+        return {numbers[place]: NOT_FINITE for place in torch.nonzero(self._lost).flatten().tolist()}
 
     def take_broken(self) -> dict[int, list[str]]:
         """Return when and why the episodes of training broke off that did so since the last call, by the
