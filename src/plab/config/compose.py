@@ -8,6 +8,7 @@ OmegaConf.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -114,6 +115,12 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         ConfigError: If an override or a file does not fit.
     """
     overrides = quote_folders(word_list(overrides))
+    # Several configurations may share a list of overrides.
+    return finish(_composed(overrides, config_dir), overrides, alone=False)
+
+
+def _composed(overrides: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
+    """Return what Hydra makes of overrides, as :func:`load_config` takes them."""
     surrounding, searched = GlobalHydra.instance().hydra, list[str]()
     try:
         check_overrides(overrides, config_dir)
@@ -123,7 +130,7 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         # Composing must work inside a Hydra application, too, and leave it as it was.
         GlobalHydra.instance().clear()
         with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            composed = compose("config", overrides=[*overrides, *searched])
+            return compose("config", overrides=[*overrides, *searched])
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
     except ConfigError:
@@ -134,8 +141,6 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
         raise ConfigError(reason) from error
     finally:
         GlobalHydra.instance().hydra = surrounding
-    # Several configurations may share a list of overrides.
-    return finish(composed, overrides, alone=False)
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
@@ -156,8 +161,14 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
             f"scenes of task {name} are drawn as its file has it: leave out what changes the task, or draw "
             "none"
         )
-    drawn = (load_config([f"task={name}", "variant=random", f"seed_scene={seed}"]) for seed in seeds)
-    return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
+    words = [f"task={name}", "variant=random"]
+    composed, drawn = _composed(words), []
+    for seed in seeds:
+        whole = copy.deepcopy(composed)
+        whole.seed_scene = int(seed)
+        one = finish(whole, words, alone=False)
+        drawn.append(replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene))
+    return drawn
 
 
 def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> None:
