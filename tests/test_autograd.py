@@ -38,9 +38,9 @@ COARSE = [
 
 @pytest.fixture(scope="module")
 def episodes() -> EpisodeBatch:
-    """Two environments of which the second has a softer rope."""
-    first = load_config([*COARSE, "sim=reference"])
-    second = load_config([*COARSE, "sim=reference", "task.yield_stress=20"])
+    """Two environments of which the second has a softer rope; they see their targets."""
+    first = load_config([*COARSE, "sim=reference", "observe_target=true"])
+    second = load_config([*COARSE, "sim=reference", "observe_target=true", "task.yield_stress=20"])
     return EpisodeBatch([first, second], contact="soft")
 
 

@@ -27,7 +27,7 @@ from plab.config import ConfigError, choices, conf_folder
 from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
-from plab.objective import OBSERVED_PARTICLES, observation, total_loss
+from plab.objective import OBSERVED_PARTICLES, mass_change, observation, total_loss
 from plab.sim import SimulationError
 from suite import make_not_finite
 
@@ -303,6 +303,24 @@ def test_wrong_actions_of_a_batch_are_refused(vector: PlabVectorEnv) -> None:
         vector.step(np.zeros(6))
     with pytest.raises(ValueError, match="NaN"):
         vector.step(np.full((2, 6), np.nan))
+
+
+def test_observations_may_tell_the_target() -> None:
+    words = [*OVERRIDES, "observe_target=true"]
+    env = gymnasium.make_vec(
+        "plab/Move-v1", num_envs=2, overrides=words, overrides_per_env=[[], ["variant=2"]]
+    )
+    plain = core.spaces(env.batch.problem.scenes)[0]
+    problem, (first, _) = env.batch.problem, env.reset()
+    seen = [mass_change(problem.initial_mass[k], problem.target_mass[k]) for k in range(2)]
+    assert not np.allclose(seen[0], seen[1], atol=0.01)
+    for table in (first, env.step(random_actions()[0])[0]):
+        assert np.array_equal(table[:, plain.shape[0] :], np.float32(seen))
+        assert env.observation_space.contains(table)
+    env.close()
+    cfgs = core.compose_configs("Move", "1", num_envs=2, overrides=COARSE, overrides_per_env=[[], words[-1:]])
+    with pytest.raises(ValueError, match="observe_target differs between sub-environments"):
+        core.EpisodeBatch(cfgs)
 
 
 @pytest.mark.parametrize("at", [0, 1])

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from plab.objective import (
+    MASS_CHANGES,
     batch_scores,
+    change_of_mass,
+    mass_change,
     observation,
     rewards,
     score_scale,
@@ -149,6 +152,38 @@ def test_scores_where_nothing_can_be_gained():
     stayed, left = scores(target, target, target), scores(target, moved, target)
     assert (stayed.score, stayed.score_printed) == (1.0, 1.0)
     assert (left.score, left.score_printed) == (0.0, 0.0)
+
+
+def box_of_mass(low, high, n=32):
+    mass = np.zeros((n, n, n))
+    mass[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = 1.0
+    return mass
+
+
+def test_mass_change_of_what_moves_as_a_whole():
+    """Of boxes that do not touch all mass has to go, and their centroids and deviations are seen."""
+    start, target = box_of_mass((4, 6, 8), (8, 12, 16)), 3.0 * box_of_mass((20, 8, 18), (26, 12, 22))
+    seen = mass_change(start, target)
+    assert seen.shape == (MASS_CHANGES,)
+    for (share, *numbers), low, high in zip(
+        seen.reshape(2, 7), ((4, 6, 8), (20, 8, 18)), ((8, 12, 16), (26, 12, 22)), strict=True
+    ):
+        low, width = np.array(low), np.subtract(high, low)
+        assert share == pytest.approx(1.0, abs=1e-9)
+        np.testing.assert_allclose(numbers[:3], (low + (width - 1) / 2) / 32, atol=1e-9)
+        # Of uniform nodes, and of the Gaussian, cut off at four deviations.
+        np.testing.assert_allclose(numbers[3:], np.sqrt((width**2 - 1) / 12 + 1.0) / 32, rtol=1e-3)
+
+
+def test_mass_change_leaves_out_what_may_stay():
+    """Half of a box has to go to its other side."""
+    start, target = box_of_mass((8, 8, 8), (16, 16, 16)), box_of_mass((12, 8, 8), (20, 16, 16))
+    go, come = mass_change(start, target).reshape(2, 7)
+    assert go[0] == come[0] == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose((go[1] * 32, come[1] * 32), (9.5, 17.5), atol=0.3)
+    np.testing.assert_allclose((go[2:4], come[2:4]), 11.5 / 32, atol=1e-9)
+    assert change_of_mass(start, target)[17, 11, 11] > 0 > change_of_mass(start, target)[9, 11, 11]
+    assert not mass_change(start, start).any()
 
 
 def test_total_loss_and_rewards(rng):

@@ -48,6 +48,7 @@ def make_config(folder: Path, **changes) -> dict:
         "sim": {"device": "cpu", "precision": "float64", "deterministic": False},
         "seed": 3,
         "seed_particles": 0,
+        "observe_target": False,
         "results_dir": str(folder),
         "force": False,
         "progress": False,
@@ -64,7 +65,8 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
     assert config_hash(config | {"sim": config["sim"] | {"memory_mb": 7.0}}) == hash_
     assert config_hash(config | {"sim": config["sim"] | {"precision": "float32"}}) != hash_
     assert config_hash(config | {"seed": 4}) != hash_
-    assert config_hash(config | {"seed_particles": 3}) != config_hash(config | {"seed_particles": 0}) == hash_
+    for key, usual, other in (("seed_particles", 0, 3), ("observe_target", False, True)):
+        assert config_hash(config | {key: other}) != config_hash(config | {key: usual}) == hash_
 
 
 def test_hash_of_protocols(tmp_path: Path) -> None:
@@ -91,10 +93,13 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
+_SINCE = ("protocol", "seed_particles", "observe_target")
+
+
 def test_runs_from_before_a_key_have_what_was_then(tmp_path: Path) -> None:
     """Of plab's own protocol, of the first draw, not deterministic; their hashes stay the same."""
     config = make_config(tmp_path)
-    before = {key: value for key, value in config.items() if key not in ("protocol", "seed_particles")}
+    before = {key: value for key, value in config.items() if key not in _SINCE}
     before["sim"] = {key: value for key, value in config["sim"].items() if key != "deterministic"}
     assert config_hash(before) == config_hash(config)
     for device, same in (("cpu", True), ("cuda", False)):

@@ -16,10 +16,13 @@ from numpy.typing import ArrayLike
 from plab.errors import ArgumentError
 
 __all__ = [
+    "MASS_CHANGES",
     "OBSERVED_PARTICLES",
     "TARGET_MASS",
     "Scores",
     "batch_scores",
+    "change_of_mass",
+    "mass_change",
     "observation",
     "rewards",
     "score_scale",
@@ -33,6 +36,15 @@ __all__ = [
 
 OBSERVED_PARTICLES = 200
 """Particles in an observation, at least: every (particle count // this)-th is taken."""
+
+MASS_CHANGES = 14
+"""Numbers that :func:`mass_change` gives."""
+
+SMOOTHING = 1 / 32
+"""Standard deviation of the Gaussian by which :func:`change_of_mass` smooths [domain units]."""
+
+TINY = 1e-12
+"""Share of the mass below which nothing has to move."""
 
 TARGET_MASS = 1e-4
 """Mass above which a grid node belongs to the target."""
@@ -225,6 +237,39 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
     start, way, least, nothing_to_gain = scale
     score, printed = (end - start) / way + (end >= least) * nothing_to_gain
     return score.clip(0.0, 1.0), printed
+
+
+def change_of_mass(start: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return where mass has to come (above 0) and to go (below), by node, shape [n, n, n], as shares of all
+    mass; both mass tensors, of whatever mass, smoothed by a Gaussian, as they are of random particles."""
+    # Imported here: SciPy's start-up would be paid by every `--help`.
+    from scipy.ndimage import gaussian_filter
+
+    change = target / target.sum() - start / start.sum()
+    return gaussian_filter(change, SMOOTHING * len(target), mode="constant")
+
+
+def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """What a policy sees of the target: where mass has to go, and where it has to come.
+
+    Args:
+        start: Mass tensor of the initial state, shape [n, n, n].
+        target: That of the target.
+
+    Returns:
+        Of the mass that has to go, then of that which has to come: its share of all mass, centroid (3) and
+        standard deviation along each axis (3) [domain units]; shape [14], float64.
+    """
+    change = change_of_mass(start, target)
+    node = np.indices(change.shape).reshape(3, -1) / len(change)
+    numbers: list[float] = []
+    for part in (-change, change):
+        mass = part.clip(0.0).reshape(-1)
+        share = mass / max(mass.sum(), TINY)
+        centroid = node @ share
+        spread = np.sqrt(((node - centroid[:, None]) ** 2) @ share)
+        numbers += [mass.sum(), *centroid, *spread]
+    return np.array(numbers)
 
 
 def total_loss(terms: Any, weights: Any) -> Any:

@@ -27,14 +27,11 @@ from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import IDLE, require_effect
-from plab.objective import target_sdf
+from plab.objective import change_of_mass, target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator
 
 __all__ = ["main", "moments"]
-
-SMOOTHING = 1 / 32
-"""Standard deviation of the Gaussian that hides where single particles were drawn [domain units]."""
 
 
 @command_line
@@ -76,7 +73,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         {"task": task, "variant": variant}
         | _moments(mass / scene.particle_mass)
         | {
-            "moved": _moved(first, mass),
+            "moved": 0.5 * float(np.abs(change_of_mass(first, mass)).sum()),
             "distance": float((first / first.sum() * target_sdf(mass)).sum()),
             "seconds": seconds,
         }
@@ -93,15 +90,6 @@ def _moments(mass: np.ndarray) -> dict[str, float]:
     spread = np.sqrt(((node - centroid[:, None]) ** 2) @ share)
     named = zip(("x", "y", "z", "std_x", "std_y", "std_z"), (*centroid, *spread), strict=True)
     return {"mass": float(mass.sum()), "peak": float(mass.max())} | {k: float(v) for k, v in named}
-
-
-def _moved(start: np.ndarray, mass: np.ndarray) -> float:
-    """Share of the mass that has to move, of a target of any mass; both [n, n, n], smoothed."""
-    # Imported here: SciPy's start-up would be paid by every `--help`.
-    from scipy.ndimage import gaussian_filter
-
-    change = mass / mass.sum() - start / start.sum()
-    return 0.5 * float(np.abs(gaussian_filter(change, SMOOTHING * len(mass), mode="constant")).sum())
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:

@@ -114,6 +114,8 @@ class Config:
         variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
         seed_scene: Which random variant was drawn; None of other variants.
         seed_particles: Which draw of the particles the start is. Simulated targets are made from draw 0.
+        observe_target: Whether observations of environments end with
+            :func:`plab.objective.mass_change`, for policies that are to serve several targets.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
@@ -130,6 +132,7 @@ class Config:
     variant: str
     seed_scene: int | None
     seed_particles: int
+    observe_target: bool
     seed: int
     results_dir: str
     force: bool

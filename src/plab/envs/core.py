@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from plab.config import Config, load_config
 from plab.config.words import word_list
 from plab.errors import ArgumentError
-from plab.objective import OBSERVED_PARTICLES
+from plab.objective import MASS_CHANGES, OBSERVED_PARTICLES, mass_change
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
@@ -192,13 +192,16 @@ class EpisodeBatch:
         if contact not in CONTACT_MODELS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
         self._problem: Problem | None = Problem(cfgs)
+        if len({cfg.observe_target for cfg in cfgs}) > 1:
+            raise ArgumentError("observe_target differs between sub-environments: they share one space")
         self.configs, self.contact = tuple(cfgs), contact
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
-        scenes = self.problem.scenes
+        scenes, seen = self.problem.scenes, cfgs[0].observe_target
         self._stride = _stride(scenes[0])
         self._pose_entries = _pose_entries(scenes[0])
-        self.observation_space, self.action_space = spaces(scenes)
+        self._target = Constants(_mass_changes(self.problem) if seen else np.empty((self.size, 0)))
+        self.observation_space, self.action_space = spaces(scenes, observe_target=seen)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
         self._failures: dict[int, str] = {}
@@ -315,7 +318,7 @@ class EpisodeBatch:
         """
         now = self._now(steps)
         entries = self._pose_entries
-        observed = (self.observation_space.shape[0] - len(entries)) // 6
+        observed = _observed(self.problem.scenes[0])
         shape = self.size, len(self.problem.scenes[0].manipulators), 8
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
@@ -325,7 +328,8 @@ class EpisodeBatch:
             bar = react(t, actions_bar)
             if bar is None:
                 return None
-            moved, posed = bar[:, : 6 * observed], bar[:, 6 * observed :]
+            # What comes behind the poses is constant.
+            moved, posed = bar[:, : 6 * observed], bar[:, 6 * observed : 6 * observed + len(entries)]
             whole = (
                 bar.new_zeros(self.size, shape[1] * 8)
                 if on_device(bar)
@@ -376,9 +380,10 @@ class EpisodeBatch:
         return joined.float() if on_device(joined) else joined
 
     def _joined(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
-        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses, shape
-        [batch, manipulator, 8]; ``dtype`` is that of an array."""
-        rows = particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]
+        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], all poses, shape
+        [batch, manipulator, 8], and the target if it is seen; ``dtype`` is that of an array."""
+        rows = [particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]]
+        rows.append(self._target.like(rows[0]))
         if on_device(particles):
             # Whoever gave a tensor has imported torch.
             import torch
@@ -426,16 +431,36 @@ def _stride(scene: Scene) -> int:
     return max(scene.particle_count // OBSERVED_PARTICLES, 1)
 
 
-def spaces(scenes: Sequence[Scene]) -> tuple[Box, Box]:
-    """Return the spaces that hold the observations and the actions of all scenes."""
-    observed = len(range(0, scenes[0].particle_count, _stride(scenes[0])))
+def _observed(scene: Scene) -> int:
+    return len(range(0, scene.particle_count, _stride(scene)))
+
+
+def _mass_changes(problem: Problem) -> np.ndarray:
+    """Return what is seen of each environment's target, shape [batch, 14]."""
+    found: dict[bytes, np.ndarray] = {}
+    rows = []
+    for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
+        # A batch may have each target many times.
+        key = b"".join(mass.tobytes() for mass in masses)
+        if key not in found:
+            found[key] = mass_change(*masses)
+        rows.append(found[key])
+    return np.array(rows)
+
+
+def spaces(scenes: Sequence[Scene], *, observe_target: bool = False) -> tuple[Box, Box]:
+    """Return the spaces that hold the observations, with those of the target or without, and the actions of
+    all scenes."""
+    observed = _observed(scenes[0])
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
+    # Shares, centroids and deviations are within the unit cube.
+    seen = MASS_CHANGES if observe_target else 0
     observation = Box(
-        np.concatenate([low * observed, bounds[:, 0].min(axis=0)]).astype(np.float32),
-        np.concatenate([high * observed, bounds[:, 1].max(axis=0)]).astype(np.float32),
+        np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
+        np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),
         dtype=np.float32,
     )
     return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)

@@ -84,6 +84,7 @@ _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds"
 _BEFORE: dict[str, Any] = {
     "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"},
     "seed_particles": 0,
+    "observe_target": False,
 }
 """What the configurations of runs would say that are older than these choices."""
 
@@ -99,6 +100,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "sim.device": str,
     "seed": int,
     "seed_particles": int,
+    "observe_target": bool,
 }
 """What every configuration says, and the types of it."""
 
@@ -211,7 +213,7 @@ def stored_config(text: str) -> dict[str, Any]:
     if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
         raise ValueError(f"config has no section {strange[0]}")
     for key, kind in _NEEDED.items():
-        if not isinstance(value := lookup(config, key), kind) or isinstance(value, bool):
+        if not isinstance(value := lookup(config, key), kind) or isinstance(value, bool) != (kind is bool):
             raise ValueError(f"{key} in config is {value!r:.80}")
         if isinstance(value, str) and not _NAME.fullmatch(value):
             raise ValueError(f"{key} in config is no name: {value!r:.80}")
@@ -265,9 +267,11 @@ def config_hash(cfg: Any) -> str:
     chosen = {key: protocol[key] for key in protocol if key not in ("name", "score", "contact")}
     if any(choice != "plab" for choice in chosen.values()):
         plain["protocol"] = chosen
-    # Runs of the first draw keep the hashes that they had before there was another.
-    if not plain.get("seed_particles"):
-        plain.pop("seed_particles", None)
+    # Runs of the first draw and with the paper's observations keep the hashes that they had before there were
+    # others.
+    for key in ("seed_particles", "observe_target"):
+        if not plain.get(key):
+            plain.pop(key, None)
     # Always empty.
     for key in ("contact_by_task", "max_gradient_norm_by_numbers"):
         plain["method"].pop(key, None)
