@@ -27,7 +27,7 @@ from plab.config import ConfigError, choices, conf_folder
 from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
-from plab.objective import OBSERVED_PARTICLES, mass_change, observation, total_loss
+from plab.objective import OBSERVED_PARTICLES, observation, target_observation, total_loss
 from plab.sim import SimulationError
 from suite import make_not_finite
 
@@ -312,7 +312,7 @@ def test_observations_may_tell_the_target() -> None:
     )
     plain = core.spaces(env.batch.problem.scenes)[0]
     problem, (first, _) = env.batch.problem, env.reset()
-    seen = [mass_change(problem.initial_mass[k], problem.target_mass[k]) for k in range(2)]
+    seen = [target_observation(problem.initial_mass[k], problem.target_mass[k]) for k in range(2)]
     assert not np.allclose(seen[0], seen[1], atol=0.01)
     for table in (first, env.step(random_actions()[0])[0]):
         assert np.array_equal(table[:, plain.shape[0] :], np.float32(seen))

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from plab.objective import (
-    MASS_CHANGES,
+    TARGET_ENTRIES,
     batch_scores,
-    change_of_mass,
     mass_change,
     observation,
     rewards,
@@ -23,6 +22,7 @@ from plab.objective import (
     scores_from_iou,
     soft_iou,
     spread_mass,
+    target_observation,
     target_sdf,
     total_loss,
 )
@@ -160,11 +160,11 @@ def box_of_mass(low, high, n=32):
     return mass
 
 
-def test_mass_change_of_what_moves_as_a_whole():
+def test_target_observation_of_what_moves_as_a_whole():
     """Of boxes that do not touch all mass has to go, and their centroids and deviations are seen."""
     start, target = box_of_mass((4, 6, 8), (8, 12, 16)), 3.0 * box_of_mass((20, 8, 18), (26, 12, 22))
-    seen = mass_change(start, target)
-    assert seen.shape == (MASS_CHANGES,)
+    seen = target_observation(start, target)
+    assert seen.shape == (TARGET_ENTRIES,)
     for (share, *numbers), low, high in zip(
         seen.reshape(2, 7), ((4, 6, 8), (20, 8, 18)), ((8, 12, 16), (26, 12, 22)), strict=True
     ):
@@ -175,15 +175,15 @@ def test_mass_change_of_what_moves_as_a_whole():
         np.testing.assert_allclose(numbers[3:], np.sqrt((width**2 - 1) / 12 + 1.0) / 32, rtol=1e-3)
 
 
-def test_mass_change_leaves_out_what_may_stay():
+def test_target_observation_leaves_out_what_may_stay():
     """Half of a box has to go to its other side."""
     start, target = box_of_mass((8, 8, 8), (16, 16, 16)), box_of_mass((12, 8, 8), (20, 16, 16))
-    go, come = mass_change(start, target).reshape(2, 7)
+    go, come = target_observation(start, target).reshape(2, 7)
     assert go[0] == come[0] == pytest.approx(0.5, abs=0.01)
     np.testing.assert_allclose((go[1] * 32, come[1] * 32), (9.5, 17.5), atol=0.3)
     np.testing.assert_allclose((go[2:4], come[2:4]), 11.5 / 32, atol=1e-9)
-    assert change_of_mass(start, target)[17, 11, 11] > 0 > change_of_mass(start, target)[9, 11, 11]
-    assert not mass_change(start, start).any()
+    assert mass_change(start, target)[17, 11, 11] > 0 > mass_change(start, target)[9, 11, 11]
+    assert not target_observation(start, start).any()
 
 
 def test_total_loss_and_rewards(rng):

@@ -16,12 +16,11 @@ from numpy.typing import ArrayLike
 from plab.errors import ArgumentError
 
 __all__ = [
-    "MASS_CHANGES",
     "OBSERVED_PARTICLES",
+    "TARGET_ENTRIES",
     "TARGET_MASS",
     "Scores",
     "batch_scores",
-    "change_of_mass",
     "mass_change",
     "observation",
     "rewards",
@@ -30,6 +29,7 @@ __all__ = [
     "scores_from_iou",
     "soft_iou",
     "spread_mass",
+    "target_observation",
     "target_sdf",
     "total_loss",
 ]
@@ -37,11 +37,11 @@ __all__ = [
 OBSERVED_PARTICLES = 200
 """Particles in an observation, at least: every (particle count // this)-th is taken."""
 
-MASS_CHANGES = 14
-"""Numbers that :func:`mass_change` gives."""
+TARGET_ENTRIES = 14
+"""Numbers that :func:`target_observation` gives."""
 
 SMOOTHING = 1 / 32
-"""Standard deviation of the Gaussian by which :func:`change_of_mass` smooths [domain units]."""
+"""Standard deviation of the Gaussian by which :func:`mass_change` smooths [domain units]."""
 
 TINY = 1e-12
 """Share of the mass below which nothing has to move."""
@@ -239,9 +239,9 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
     return score.clip(0.0, 1.0), printed
 
 
-def change_of_mass(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return where mass has to come (above 0) and to go (below), by node, shape [n, n, n], as shares of all
-    mass; both mass tensors, of whatever mass, smoothed by a Gaussian, as they are of random particles."""
+def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return where mass has to arrive (above 0) and to leave (below), by node, as shares of all mass, shape
+    [n, n, n]; both mass tensors, of whatever mass, are smoothed, being of particles drawn at random."""
     # Imported here: SciPy's start-up would be paid by every `--help`.
     from scipy.ndimage import gaussian_filter
 
@@ -249,18 +249,18 @@ def change_of_mass(start: np.ndarray, target: np.ndarray) -> np.ndarray:
     return gaussian_filter(change, SMOOTHING * len(target), mode="constant")
 
 
-def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """What a policy sees of the target: where mass has to go, and where it has to come.
+def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """What is observed of a target: where mass has to leave, and where it has to arrive.
 
     Args:
         start: Mass tensor of the initial state, shape [n, n, n].
         target: That of the target.
 
     Returns:
-        Of the mass that has to go, then of that which has to come: its share of all mass, centroid (3) and
-        standard deviation along each axis (3) [domain units]; shape [14], float64.
+        Of the mass that has to leave, then of that which has to arrive: its share of all mass, centroid (3)
+        and standard deviation along each axis (3) [domain units]; shape [14], float64.
     """
-    change = change_of_mass(start, target)
+    change = mass_change(start, target)
     node = np.indices(change.shape).reshape(3, -1) / len(change)
     numbers: list[float] = []
     for part in (-change, change):

@@ -27,7 +27,7 @@ from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import IDLE, require_effect
-from plab.objective import change_of_mass, target_sdf
+from plab.objective import mass_change, target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator
 
@@ -73,7 +73,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         {"task": task, "variant": variant}
         | _moments(mass / scene.particle_mass)
         | {
-            "moved": 0.5 * float(np.abs(change_of_mass(first, mass)).sum()),
+            "moved": 0.5 * float(np.abs(mass_change(first, mass)).sum()),
             "distance": float((first / first.sum() * target_sdf(mass)).sum()),
             "seconds": seconds,
         }

@@ -115,7 +115,7 @@ class Config:
         seed_scene: Which random variant was drawn; None of other variants.
         seed_particles: Which draw of the particles the start is. Simulated targets are made from draw 0.
         observe_target: Whether observations of environments end with
-            :func:`plab.objective.mass_change`, for policies that are to serve several targets.
+            :func:`plab.objective.target_observation`, for policies that are to serve several targets.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.

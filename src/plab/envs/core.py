@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from plab.config import Config, load_config
 from plab.config.words import word_list
 from plab.errors import ArgumentError
-from plab.objective import MASS_CHANGES, OBSERVED_PARTICLES, mass_change
+from plab.objective import OBSERVED_PARTICLES, TARGET_ENTRIES, target_observation
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
@@ -200,7 +200,7 @@ class EpisodeBatch:
         scenes, seen = self.problem.scenes, cfgs[0].observe_target
         self._stride = _stride(scenes[0])
         self._pose_entries = _pose_entries(scenes[0])
-        self._target = Constants(_mass_changes(self.problem) if seen else np.empty((self.size, 0)))
+        self._target = Constants(_target_observations(self.problem) if seen else np.empty((self.size, 0)))
         self.observation_space, self.action_space = spaces(scenes, observe_target=seen)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
@@ -435,7 +435,7 @@ def _observed(scene: Scene) -> int:
     return len(range(0, scene.particle_count, _stride(scene)))
 
 
-def _mass_changes(problem: Problem) -> np.ndarray:
+def _target_observations(problem: Problem) -> np.ndarray:
     """Return what is seen of each environment's target, shape [batch, 14]."""
     found: dict[bytes, np.ndarray] = {}
     rows = []
@@ -443,7 +443,7 @@ def _mass_changes(problem: Problem) -> np.ndarray:
         # A batch may have each target many times.
         key = b"".join(mass.tobytes() for mass in masses)
         if key not in found:
-            found[key] = mass_change(*masses)
+            found[key] = target_observation(*masses)
         rows.append(found[key])
     return np.array(rows)
 
@@ -457,7 +457,7 @@ def spaces(scenes: Sequence[Scene], *, observe_target: bool = False) -> tuple[Bo
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
     # Shares, centroids and deviations are within the unit cube.
-    seen = MASS_CHANGES if observe_target else 0
+    seen = TARGET_ENTRIES if observe_target else 0
     observation = Box(
         np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
         np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),
