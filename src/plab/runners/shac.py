@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.torch_layers import create_mlp
 
 from plab.autograd import Stretch, policy_gradient
 from plab.config import Config, ConfigError, RlConfig, ShacConfig, drawn_configs
@@ -317,8 +316,14 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
 
 
 def _network(spaces: Spaces, outputs: int, method: ShacConfig) -> torch.nn.Sequential:
+    """Return a network as the paper's code has it, each hidden layer followed by ELU and LayerNorm: without
+    that, actions come to the ends of the hyperbolic tangent, where nothing is learned any more."""
     (entries,) = spaces.observation_space.shape
-    return torch.nn.Sequential(*create_mlp(entries, outputs, list(method.hidden), torch.nn.ELU))
+    layers: list[torch.nn.Module] = []
+    for width in method.hidden:
+        layers += [torch.nn.Linear(entries, width), torch.nn.ELU(), torch.nn.LayerNorm(width)]
+        entries = width
+    return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
