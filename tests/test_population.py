@@ -521,7 +521,7 @@ def test_episodes_that_break_off_are_counted_and_end_nothing(
     (told,) = (record.getMessage() for record in caplog.records)
     assert str(result.path) in told
     assert re.search(
-        "2 of [67] episodes of training broke off .* environment step 1, substep 1: the state", told
+        "2 of [68] episodes of training broke off .* environment step 1, substep 1: the state", told
     )
 
 

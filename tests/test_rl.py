@@ -358,7 +358,7 @@ def test_an_episode_that_breaks_off_is_counted_and_ends_nothing(
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
     (told,) = (record.getMessage() for record in caplog.records)
     assert re.search(
-        "1 of [67] episodes of training broke off .* environment step 1, substep 1: the state", told
+        "1 of [68] episodes of training broke off .* environment step 1, substep 1: the state", told
     )
 
 

@@ -52,7 +52,7 @@ class PolicyRunner(Runner):
         Args:
             track: The run.
             broken: When and why each of them broke off.
-            episodes: Episodes of training that they are among.
+            episodes: Episodes of training that ended meanwhile.
 
         Returns:
             Why the run cannot go on, if all did; otherwise an empty text.

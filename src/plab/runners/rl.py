@@ -67,11 +67,11 @@ class RlRunner(PolicyRunner):
     def step(self, track: Track) -> Step:
         """Train until the next evaluation is due, except before the first, and run the policy once."""
         trainer = cast(Trainer, self._trainer)
-        before, episodes = trainer.steps, trainer.episodes
+        before = trainer.steps
         # The first episode, of the untrained policy, compiles the kernels.
         if track.iteration > 0:
             self._train(trainer, track)
-            if why := self.note_broken(track, trainer.take_broken(), trainer.episodes - episodes):
+            if why := self.note_broken(track, *trainer.take_broken()):
                 raise RunError(f"iteration {track.iteration}: {why}")
             self.enter("evaluate")
         done = self.episode(trainer)

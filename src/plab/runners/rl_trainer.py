@@ -126,10 +126,11 @@ class Trainer:
         means = {"train_reward": rewards, "train_score": scores}
         return {name: float(np.mean(values)) if values else math.nan for name, values in means.items()}
 
-    def take_broken(self) -> list[str]:
-        """Return when and why the episodes broke off that did so since the last call."""
+    def take_broken(self) -> tuple[list[str], int]:
+        """Return when and why episodes broke off that ended since the last :meth:`take_statistics`, and how
+        many ended."""
         broken, self._broken = self._broken, []
-        return broken
+        return broken, len(self._rewards)
 
     def state(self) -> dict[str, Any]:
         """Return everything that further training depends on, except the replay buffer's content."""

@@ -82,6 +82,7 @@ class Population:
         self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
         self._lost = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
         self._broken: dict[int, list[str]] = {}
+        self._ended_since = 0
         self._episode_actions: list[Tensor] = []
         self._ended: list[Tensor] = []
         self._start(states)
@@ -154,11 +155,12 @@ class Population:
         numbers = self._numbers.tolist()
         return {numbers[place]: NOT_FINITE for place in torch.nonzero(self._lost).flatten().tolist()}
 
-    def take_broken(self) -> dict[int, list[str]]:
-        """Return when and why the episodes of training broke off that did so since the last call, by the
-        agents' numbers."""
-        broken, self._broken = self._broken, {}
-        return broken
+    def take_broken(self) -> tuple[dict[int, list[str]], int]:
+        """Return when and why episodes of training broke off that ended since the last call, by the agents'
+        numbers, and how many of each agent ended."""
+        taken = self._broken, self._ended_since
+        self._broken, self._ended_since = {}, 0
+        return taken
 
     def states(self) -> list[dict[str, Any]]:
         """Return each agent's state: all that further training depends on, except a replay buffer."""
@@ -202,6 +204,7 @@ class Population:
         if done.truncated:
             # Networks that are not finite stay so: once an episode is soon enough.
             self._lost |= ~actions.isfinite().all(2).all(1)
+            self._ended_since += self._envs
             for env, text in done.failures.items():
                 self._broken.setdefault(env // self._envs, []).append(text)
             score = self._own(done.info["score"], self._envs).squeeze(2)

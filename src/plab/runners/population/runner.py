@@ -98,7 +98,7 @@ class PopulationRunner(PolicyRunner):
         least = min(track.iteration for track in tracks)
         members = [track for track in tracks if track.iteration == least]
         population = self._population_of(members)
-        before, episodes = population.steps, population.episodes
+        before = population.steps
         # The first episode, of the untrained policies, compiles the kernels.
         if least > 0:
             self.enter("optimise", members)
@@ -107,12 +107,12 @@ class PopulationRunner(PolicyRunner):
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
         losses, states = population.take_losses(), population.states()
-        lost, broken = population.lost(), population.take_broken()
+        lost, (broken, ended) = population.lost(), population.take_broken()
         share = (time.perf_counter() - start) / len(members)
         self._rate = (population.steps - before) / share
         for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
             start = time.perf_counter()
-            unusable = self.note_broken(track, broken.get(track.number, ()), population.episodes - episodes)
+            unusable = self.note_broken(track, broken.get(track.number, ()), ended)
             if failure := lost.get(track.number) or done.failure or unusable:
                 track.fail(failure)
                 continue
