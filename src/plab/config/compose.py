@@ -8,7 +8,6 @@ OmegaConf.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -23,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config.capacity import check_size
+from plab.config.composer import GROUPS, Composer
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.run import Config
 from plab.config.suite import conf_folder
@@ -46,9 +46,6 @@ __all__ = [
     "load_config",
     "variant_task",
 ]
-
-GROUPS = ("task", "method", "protocol", "sim")
-"""Sections of the configuration that are a choice of one file."""
 
 EXPERIMENT = "experiment"
 """Group of files that preset any keys and sweeps over them; added by ``+experiment=``."""
@@ -119,18 +116,14 @@ def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = N
     return finish(_composed(overrides, config_dir), overrides, alone=False)
 
 
-def _composed(overrides: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
+def _composed(overrides: Sequence[str], config_dir: str | Path | None) -> DictConfig:
     """Return what Hydra makes of overrides, as :func:`load_config` takes them."""
-    surrounding, searched = GlobalHydra.instance().hydra, list[str]()
     try:
         check_overrides(overrides, config_dir)
-        if config_dir is not None:
-            quoted = str(Path(config_dir).resolve()).replace("'", "\\'")
-            searched = [f"hydra.searchpath=['file://{quoted}']"]
-        # Composing must work inside a Hydra application, too, and leave it as it was.
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            return compose("config", overrides=[*overrides, *searched])
+        if config_dir is None:
+            return _OWN(parse(overrides))
+        quoted = str(Path(config_dir).resolve()).replace("'", "\\'")
+        return _by_hydra([*overrides, f"hydra.searchpath=['file://{quoted}']"])
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
     except ConfigError:
@@ -139,8 +132,21 @@ def _composed(overrides: Sequence[str], config_dir: str | Path | None = None) ->
         if (reason := unusable(error, overrides)) is None:
             raise
         raise ConfigError(reason) from error
+
+
+def _by_hydra(overrides: list[str]) -> DictConfig:
+    """Compose within a Hydra application, too, and leave it as it was."""
+    surrounding = GlobalHydra.instance().hydra
+    try:
+        GlobalHydra.instance().clear()
+        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+            return compose("config", overrides=overrides)
     finally:
         GlobalHydra.instance().hydra = surrounding
+
+
+_OWN = Composer(_by_hydra)
+"""Composes of plab's own files, which do not change."""
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
@@ -161,14 +167,8 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
             f"scenes of task {name} are drawn as its file has it: leave out what changes the task, or draw "
             "none"
         )
-    words = [f"task={name}", "variant=random"]
-    composed, drawn = _composed(words), []
-    for seed in seeds:
-        whole = copy.deepcopy(composed)
-        whole.seed_scene = int(seed)
-        one = finish(whole, words, alone=False)
-        drawn.append(replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene))
-    return drawn
+    drawn = [load_config([f"task={name}", "variant=random", f"seed_scene={int(seed)}"]) for seed in seeds]
+    return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
 
 
 def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> None:
