@@ -34,7 +34,6 @@ from plab.config import (
     choices,
     conf_folder,
     load_config,
-    variant_task,
 )
 from plab.scene import SceneError
 
@@ -279,8 +278,6 @@ def test_a_loaded_configuration_is_plain_and_holds_its_own_variant_only():
     assert cfg.task.bodies["ball"].size == [0.10759]
     assert list(cfg.task.variants) == ["3"]
     assert json.loads(json.dumps(dataclasses.asdict(cfg))) == dataclasses.asdict(cfg)
-    # Merging the variant again changes nothing.
-    assert variant_task(cfg) == cfg.task
     cfg.variant = "4"
     with pytest.raises(ConfigError, match="variant 4 of task Move does not exist; choose from: 3"):
         build_scene(cfg)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from plab.cli import targets as command
-from plab.config import ConfigError, build_scene, load_config, variant_task
+from plab.config import ConfigError, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
@@ -42,7 +42,7 @@ CUBE = {"shape": "box", "center": [0.3, 0.2, 0.5], "size": [0.2, 0.2, 0.2]}
 
 def load(*overrides: str) -> tuple[Scene, dict]:
     cfg = load_config(overrides)
-    return build_scene(cfg), variant_task(cfg).target
+    return build_scene(cfg), cfg.task.target
 
 
 def centroid(mass: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.config import Config, ConfigError, build_scene, variant_task
+from plab.config import Config, ConfigError, build_scene
 from plab.config.words import shortened
 from plab.losses import make_terms
 from plab.objective import (
@@ -289,8 +289,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
     """
     source = cfgs[0].targets.source
     if source is None:
-        targets = {id(cfg): variant_task(cfg).target for cfg in cfgs}
-        return build_targets(simulator, [targets[id(cfg)] for cfg in cfgs], rebuild=rebuild)
+        return build_targets(simulator, [cfg.task.target for cfg in cfgs], rebuild=rebuild)
     pairs = zip(simulator.scenes, cfgs, strict=True)
     return np.stack([load_release_target(source, scene, cfg.variant) for scene, cfg in pairs])
 

@@ -57,7 +57,6 @@ __all__ = [
     "drawn_configs",
     "finish",
     "load_config",
-    "variant_task",
 ]
 
 

@@ -26,7 +26,6 @@ from plab.config.composer import GROUPS, Composer
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.config.task import TaskConfig
 from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
 from plab.config.words import parse, quote_folders, require_few, shortened, unusable, word_list
 from plab.config.yaml_files import require_plain
@@ -44,7 +43,6 @@ __all__ = [
     "drawn_configs",
     "finish",
     "load_config",
-    "variant_task",
 ]
 
 EXPERIMENT = "experiment"
@@ -258,27 +256,8 @@ def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool =
     return cfg
 
 
-def variant_task(cfg: Config) -> TaskConfig:
-    """Return the task with the chosen variant merged over it.
-
-    Args:
-        cfg: A configuration.
-
-    Returns:
-        The task; its ``target`` is what :func:`plab.targets.build_target` takes.
-
-    Raises:
-        ConfigError: If the variant does not exist or does not fit the task.
-    """
-    try:
-        merged = merge_variant(OmegaConf.structured(cfg.task), cfg.variant)
-        return cast(TaskConfig, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
-        raise ConfigError(explain(error)) from None
-
-
 def build_scene(cfg: Config) -> Scene:
-    """Build the scene of a configuration, with its variant applied.
+    """Build the scene of a configuration.
 
     Args:
         cfg: A configuration.
@@ -287,10 +266,13 @@ def build_scene(cfg: Config) -> Scene:
         The validated scene.
 
     Raises:
-        ConfigError: If the variant does not exist, or this computer's memory cannot hold the configuration.
+        ConfigError: If the task is another variant's, or this computer's memory cannot hold the run.
         plab.scene.SceneError: If the scene cannot be simulated.
     """
-    task, protocol, sim = variant_task(cfg), cfg.protocol, cfg.sim
+    task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
+    if cfg.variant not in task.variants:
+        advice = pick(cfg.variant, list(task.variants))
+        raise ConfigError(f"variant {cfg.variant} of task {task.name} does not exist; {advice}")
     most = max((body.particles for body in task.bodies.values()), default=1)
     if most * sim.particles_scale < 0.5:
         least = f"use {0.5 / most:.2g} or more"

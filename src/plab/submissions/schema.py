@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from plab.config import Config, build_scene, load_config, variant_task
+from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS
 from plab.errors import pick
 from plab.results import ResultsError
@@ -197,7 +197,7 @@ class Digests:
         """
         scene = build_scene(cfg)
         if cfg.targets.source is None:
-            target = json.dumps(variant_task(cfg).target, sort_keys=True).encode()
+            target = json.dumps(cfg.task.target, sort_keys=True).encode()
         else:
             target = load_release_target(cfg.targets.source, scene, cfg.variant).astype("<f8").tobytes()
         facts = json.dumps(scene.facts(), sort_keys=True, default=attrgetter("sha256")).encode()
