@@ -134,7 +134,7 @@ def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult],
 
 def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunResult], tmp_path: Path) -> None:
     with pytest.raises(
-        ResultsError, match=r"none\.policy\.npz is not there: sac, td3, ppo and shac write it"
+        ResultsError, match=r"none\.policy\.npz is not there: sac, td3, ppo, shac and pods write it"
     ):
         load_policy(tmp_path / "none.h5")
     whole = policy_path(finished["sac"].path).read_bytes()

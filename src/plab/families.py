@@ -223,6 +223,17 @@ FAMILIES: dict[str, Family] = {
         kind=GRADIENT,
         methods={"apg": Appearance("APG", "#000000", ":")},
     ),
+    "pods": Family(
+        label="a policy that imitates its own episodes, improved by the simulator's gradient",
+        config=f"{_TYPES}:PodsConfig",
+        runner="plab.runners.pods:PodsRunner",
+        columns=("train_reward", "train_score", "plan_reward", "plan_score"),
+        may_be_nan=("train_reward", "train_score", "plan_reward", "plan_score"),
+        rules={"pods": Rule("plab.runners.pods:PODS", f"{_TYPES}:PodsConfig")},
+        contact="hard",
+        kind=GRADIENT,
+        methods={"pods": Appearance("PODS", "#999933", "--")},
+    ),
     "shac": Family(
         label="a policy, trained through the simulator's gradient and by a value function",
         config=f"{_TYPES}:ShacConfig",

@@ -13,9 +13,12 @@ from plab.losses.registry import check_terms
 __all__ = [
     "CONTACTS",
     "DEVICES",
+    "ActorConfig",
     "ApgConfig",
     "MethodConfig",
     "OffPolicyConfig",
+    "PodsConfig",
+    "PolicyConfig",
     "PpoConfig",
     "RlConfig",
     "SacConfig",
@@ -117,39 +120,48 @@ class ApgConfig(MethodConfig):
 
 
 @dataclass
-class RlConfig(MethodConfig):
-    """What the reinforcement-learning methods have in common.
+class PolicyConfig(MethodConfig):
+    """What the methods have in common whose trained policy is kept.
 
     Attributes:
-        algorithm: Learning algorithm, one of the family's: ``sac``, ``td3`` or ``ppo``.
-        profile: Which of the profiles gives the values that are not overridden; None: there are none.
+        algorithm: Learning algorithm, one of the family's.
         episodes: Episodes of training.
-        num_envs: Environments simulated together.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
         torch_device: Where the networks are, ``cpu`` or ``cuda``.
         torch_threads: CPU threads of torch.
         lr: Learning rate.
-        gamma: Discount factor.
         hidden: Widths of the hidden layers.
-        profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
     """
 
     algorithm: str
-    profile: str | None
     episodes: int = field(metadata=ranges.COUNT)
-    num_envs: int = field(metadata=ranges.COUNT)
     evaluate_every: int = field(metadata=ranges.COUNT)
     torch_device: str = field(metadata=ranges.within(ranges.one_of, DEVICES))
     torch_threads: int = field(metadata=ranges.THREADS)
     lr: float = field(metadata=ranges.POSITIVE)
-    gamma: float = field(metadata=ranges.SHARE)
     hidden: list[int] = field(metadata=ranges.WIDTHS)
-    profiles: dict[str, Any]
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
+
+
+@dataclass
+class RlConfig(PolicyConfig):
+    """What the reinforcement-learning methods have in common.
+
+    Attributes:
+        profile: Which of the profiles gives the values that are not overridden; None: there are none.
+        num_envs: Environments simulated together.
+        gamma: Discount factor.
+        profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
+    """
+
+    profile: str | None
+    num_envs: int = field(metadata=ranges.COUNT)
+    gamma: float = field(metadata=ranges.SHARE)
+    profiles: dict[str, Any]
 
 
 @dataclass
@@ -201,11 +213,40 @@ class Td3Config(OffPolicyConfig):
 
 
 @dataclass
-class ShacConfig(RlConfig):
-    """Short-horizon actor-critic.
+class ActorConfig(PolicyConfig):
+    """What the methods have in common that train a policy by the simulator's gradient, in one scene or many.
 
     Attributes:
         scenes: Scenes that the environments of the training are drawn from; 0: that of the run.
+    """
+
+    scenes: int = field(metadata=ranges.NOT_NEGATIVE)
+
+
+@dataclass
+class PodsConfig(ActorConfig):
+    """Policy optimization via differentiable simulation.
+
+    Attributes:
+        updates: Updates of the actions by their gradient in a round.
+        action_lr: Learning rate of these, in units of an action.
+        epochs: Passes of the policy over a round's actions.
+        batch_size: Actions per update of the policy.
+    """
+
+    updates: int = field(metadata=ranges.COUNT)
+    action_lr: float = field(metadata=ranges.POSITIVE)
+    epochs: int = field(metadata=ranges.COUNT)
+    batch_size: int = field(metadata=ranges.COUNT)
+
+
+@dataclass
+class ShacConfig(ActorConfig):
+    """Short-horizon actor-critic.
+
+    Attributes:
+        num_envs: Environments simulated together.
+        gamma: Discount factor.
         window: Steps through which the gradient goes.
         value_lr: Learning rate of the value function.
         lr_decay: Let the learning rates fall linearly to 0 over the run.
@@ -217,7 +258,8 @@ class ShacConfig(RlConfig):
         max_gradient_norm: Longer gradients are scaled down to this norm.
     """
 
-    scenes: int = field(metadata=ranges.NOT_NEGATIVE)
+    num_envs: int = field(metadata=ranges.COUNT)
+    gamma: float = field(metadata=ranges.SHARE)
     window: int = field(metadata=ranges.COUNT)
     value_lr: float = field(metadata=ranges.POSITIVE)
     lr_decay: bool

@@ -13,7 +13,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
-from plab.config import ConfigError, RlConfig
+from plab.config import ConfigError, PolicyConfig
 from plab.families import FAMILIES, family
 from plab.reading import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
@@ -76,7 +76,7 @@ def policy_path(result: Path) -> Path:
 
 
 def save_policy(
-    result: Path, method: RlConfig, policy: BasePolicy, moments: tuple[np.ndarray, np.ndarray] | None
+    result: Path, method: PolicyConfig, policy: BasePolicy, moments: tuple[np.ndarray, np.ndarray] | None
 ) -> None:
     """Write a policy beside the result.
 
@@ -119,7 +119,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         policy = _policy(path)
     except FileNotFoundError:
         raise ResultsError(
-            f"{path} is not there: sac, td3, ppo and shac write it when a run ends; see docs/rl.md"
+            f"{path} is not there: sac, td3, ppo, shac and pods write it when a run ends; see docs/rl.md"
         ) from None
     except ResultsError:
         raise
@@ -153,7 +153,7 @@ def _policy(path: Path) -> Policy:
     return Policy(network, *moments)
 
 
-def _method(section: Any, path: Path) -> RlConfig:
+def _method(section: Any, path: Path) -> PolicyConfig:
     """Return the section ``method`` that a policy's header holds, of the type of its family."""
     name = section["family"]
     if not isinstance(name, str):
@@ -165,15 +165,16 @@ def _method(section: Any, path: Path) -> RlConfig:
         raise ValueError("its method refers to something else")
     try:
         kind = family(name).config_type(section["algorithm"])
-        # Of files older than `logger`.
-        known = {key: value for key, value in section.items() if key != "tensorboard"}
+        # Of files older than `logger`, and of those of shac that had profiles without any in them.
+        gone = {"tensorboard", "profile", "profiles"} - {one.name for one in fields(kind)}
+        known = {key: value for key, value in section.items() if key not in gone}
         method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), known))
-        cast(RlConfig, method).check("method")
+        cast(PolicyConfig, method).check("method")
     except ConfigError as error:
         raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
         raise ValueError(f"its method is none: {(error.msg or str(error)).splitlines()[0]}") from error
-    if not isinstance(method, RlConfig):
+    if not isinstance(method, PolicyConfig):
         raise ValueError(f"policies are no part of {name}")
     return method
 
@@ -185,7 +186,7 @@ def _space(arrays: Mapping[str, np.ndarray], name: str) -> Box:
     return Box(low, high, dtype=np.float32)
 
 
-def _require_room(method: RlConfig, spaces: Spaces, parameters: Mapping[str, np.ndarray]) -> None:
+def _require_room(method: PolicyConfig, spaces: Spaces, parameters: Mapping[str, np.ndarray]) -> None:
     """See that networks of this size can be what the file holds, before they are made."""
     sizes = [space.shape[0] for space in spaces]
     widths = [sizes[0], *getattr(method, "hidden", ()), sizes[1]]

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import BasePolicy
 
-from plab.config import ConfigError, RlConfig
+from plab.config import ConfigError, PolicyConfig, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.environments import PolicyEpisode, PolicyRunner, policy_episode, shared_batches
@@ -178,7 +178,7 @@ class _Diagnostics(KVWriter):
         """Leave the log to the run."""
 
 
-def check_torch_device(method: RlConfig) -> None:
+def check_torch_device(method: PolicyConfig) -> None:
     """Raise ConfigError, before anything is built, if torch does not have the device."""
     if method.torch_device == "cuda" and not torch.cuda.is_available():
         raise ConfigError(

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import SACPolicy
 
-from plab.config import OffPolicyConfig, PpoConfig, RlConfig, SacConfig, Td3Config
+from plab.config import OffPolicyConfig, PolicyConfig, PpoConfig, RlConfig, SacConfig, Td3Config
 from plab.families import family
 
 __all__ = [
@@ -80,7 +80,7 @@ class ModelKind:
         self.begin(method, model.policy)
         return model
 
-    def policy(self, method: RlConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
+    def policy(self, method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
         """Return the policy with which a model would begin, on the CPU; random numbers stay as they are."""
         options = self.arguments(method, cast(Any, spaces))["policy_kwargs"]
         with torch.random.fork_rng(devices=[]):

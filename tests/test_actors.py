@@ -1,7 +1,8 @@
-"""Short-horizon actor-critic: runs on a coarse scene, and what they are made of."""
+"""Policies trained through the simulator's gradient: runs of shac and pods on a coarse scene, and parts."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,17 +13,16 @@ import torch
 from gymnasium.spaces import Box
 
 from plab.bench import unseen
-from plab.config import Config, ConfigError, ShacConfig, drawn_configs, load_config
+from plab.config import Config, ConfigError, PodsConfig, ShacConfig, drawn_configs, load_config
+from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
 from plab.runners import run_config
+from plab.runners.actors import DEVIATION_MIN
+from plab.runners.environments import shared_batches
+from plab.runners.pods import PodsPolicy, PodsTraining
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.shac import (
-    DEVIATION_MIN,
-    ShacPolicy,
-    ShacTraining,
-    td_lambda,
-)
+from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
 from same_runs import assert_same_numbers, stopped_at
 
 HORIZON = 5
@@ -34,21 +34,30 @@ COARSE = (
     "sim.substeps=5",
     "progress=false",
 )
-SHAC = (
-    "method=shac",
-    "method.num_envs=3",
-    "method.scenes=2",
-    "method.episodes=10",
-    "method.evaluate_every=5",
-    "method.window=2",
-    "method.hidden=[8]",
-    "method.value_epochs=2",
-)
+METHODS = {
+    "shac": (
+        "method.num_envs=3",
+        "method.scenes=2",
+        "method.episodes=10",
+        "method.evaluate_every=5",
+        "method.window=2",
+        "method.value_epochs=2",
+    ),
+    "pods": (
+        "method.scenes=2",
+        "method.episodes=18",
+        "method.evaluate_every=10",
+        "method.updates=3",
+        "method.epochs=2",
+        "method.batch_size=4",
+    ),
+}
 CACHE = SimulatorCache()
 
 
-def make_config(folder: Path, *overrides: str) -> Config:
-    return load_config([*COARSE, *SHAC, f"results_dir={folder}", *overrides])
+def make_config(folder: Path | str, name: str = "shac", *overrides: str) -> Config:
+    own = f"method={name}", "method.hidden=[8]", *METHODS[name], f"results_dir={folder}"
+    return load_config([*COARSE, *own, *overrides])
 
 
 def run(cfg: Config) -> RunResult:
@@ -56,24 +65,34 @@ def run(cfg: Config) -> RunResult:
     return read(result_path(cfg))
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+@pytest.fixture(scope="module", params=METHODS)
+def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     """An uninterrupted run."""
-    return run(make_config(tmp_path_factory.mktemp("results")))
+    return run(make_config(tmp_path_factory.mktemp("results"), request.param))
+
+
+def name_of(result: RunResult) -> str:
+    return result.config["method"]["name"]
 
 
 @pytest.mark.physics
 def test_rows_policy_and_budgets(finished: RunResult) -> None:
-    rows = finished.iterations
-    # Rounds of three episodes: 6 are as many as 5, 12 as many as 10.
-    assert rows["episodes"].tolist() == [0, 6, 12]
-    assert rows["steps"].tolist() == [0, 6 * HORIZON, 12 * HORIZON]
-    assert rows["steps_gradient"].tolist() == rows["steps"].tolist()
-    assert rows["steps_forward"].tolist() == [HORIZON, 2 * HORIZON, 3 * HORIZON]
+    rows, name = finished.iterations, name_of(finished)
+    # Rounds of three episodes: 6 are as many as 5, 12 as many as 10. Of pods' rounds, of five episodes in two
+    # scenes, three have a gradient.
+    episodes, gradient = {"shac": ([0, 6, 12], [0, 6, 12]), "pods": ([0, 10, 20], [0, 6, 12])}[name]
+    assert rows["episodes"].tolist() == episodes
+    assert rows["steps"].tolist() == [HORIZON * count for count in episodes]
+    assert rows["steps_gradient"].tolist() == [HORIZON * count for count in gradient]
+    # Each row is an episode without.
+    judged = np.arange(1, 4) * HORIZON
+    assert rows["steps_forward"].tolist() == (rows["steps"] - rows["steps_gradient"] + judged).tolist()
     assert np.isnan(rows["train_reward"]).tolist() == [True, False, False]
     assert rows["train_score"].iloc[1:].between(0, 1).all()
+    if name == "pods":
+        assert (rows["plan_reward"] > rows["train_reward"]).tolist() == [False, True, True]
     policy = load_policy(finished.path)
-    assert isinstance(policy.network, ShacPolicy)
+    assert isinstance(policy.network, {"shac": ShacPolicy, "pods": PodsPolicy}[name])
     kept = np.load(policy_path(finished.path))
     actions = policy(np.stack([kept["mean"]] * 2))
     assert actions.shape == (2, 6) and (np.abs(actions) < 1.0).all()
@@ -85,7 +104,7 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
 
 @pytest.mark.physics
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
-    cfg = make_config(tmp_path)
+    cfg = make_config(tmp_path, name_of(finished))
     # Simulators are kept from run to run, that of the drawn scenes included.
     monkeypatch.setattr("plab.runners.environments.EpisodeBatch", None)
     for written in (1, 2):
@@ -108,7 +127,7 @@ def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
     observed = Box(-1.0, 1.0, state["statistics"]["mean"].shape, np.float32)
     batch = SimpleNamespace(size=3, observation_space=observed, action_space=Box(-1.0, 1.0, (6,), np.float32))
     ShacTraining(cfg.method_as(ShacConfig), batch, 0).restore(state)
-    other = make_config(tmp_path, "method.hidden=[9]").method_as(ShacConfig)
+    other = make_config(tmp_path, "shac", "method.hidden=[9]").method_as(ShacConfig)
     with pytest.raises(ValueError, match=r"mean.0.weight has shape \[8, "):
         ShacTraining(other, batch, 0).restore(state)
 
@@ -130,7 +149,7 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     [
         (["task=Move"], "name the result file of a run that has trained a policy"),
         (["a.h5", "--scenes", "1"], "--scenes has to be at least 2"),
-        (["a.h5"], "a.policy.npz is not there: sac, td3, ppo and shac write it when a run ends"),
+        (["a.h5"], "a.policy.npz is not there: sac, td3, ppo, shac and pods write it when a run ends"),
     ],
     ids=str,
 )
@@ -162,7 +181,7 @@ def test_targets_look_ahead_as_far_as_lambda_says() -> None:
 
 @pytest.mark.parametrize("own", [["variant=2"], ["variant=random", "seed_scene=9000"]])
 def test_the_scenes_of_a_training_are_drawn(own: list[str]) -> None:
-    cfg = load_config([*COARSE, *SHAC, *own, "sim.particles_scale=0.05"])
+    cfg = make_config("results", "shac", *own, "sim.particles_scale=0.05")
     scenes = drawn_configs(cfg, (1000, 1001))
     assert [one.seed_scene for one in scenes] == [1000, 1001]
     assert scenes[0].task != scenes[1].task != cfg.task
@@ -170,14 +189,71 @@ def test_the_scenes_of_a_training_are_drawn(own: list[str]) -> None:
 
 
 def test_scenes_are_not_drawn_of_a_task_that_was_changed() -> None:
-    cfg = load_config([*COARSE, *SHAC, "task.yield_stress=77"])
+    cfg = make_config("results", "shac", "task.yield_stress=77")
     with pytest.raises(ConfigError, match="leave out what changes the task, or draw none"):
         drawn_configs(cfg, (0,))
 
 
 def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("plab.runners.shac.check_torch_device", lambda method: None)
-    cfg = make_config(tmp_path, "method.torch_device=cuda")
+    monkeypatch.setattr("plab.runners.actors.check_torch_device", lambda method: None)
+    cfg = make_config(tmp_path, "pods", "method.torch_device=cuda")
     with pytest.raises(ConfigError, match=r"set method.torch_device=cpu, as sim.device"):
         run_config(cfg, CACHE)
     assert not list(tmp_path.rglob("*.h5"))
+
+
+@pytest.fixture
+def training() -> PodsTraining:
+    """One of pods, in two environments."""
+    cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01")
+    (batch,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
+    return PodsTraining(cfg.method_as(PodsConfig), batch, 0)
+
+
+@pytest.mark.physics
+def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monkeypatch) -> None:
+    plans, tried = [], []
+    improve, try_out = training._improved, training._batch.problem.try_out
+    monkeypatch.setattr(training, "_improved", lambda *args: plans.append(improve(*args)) or plans[-1])
+    monkeypatch.setattr(
+        training._batch.problem,
+        "try_out",
+        lambda actions, gradient: tried.append(actions) or try_out(actions, gradient=gradient),
+    )
+    training.train()
+    # Begun as the policy's own, and each update of the method's rate at most.
+    assert len(tried) == 3
+    np.testing.assert_allclose(tried[1], tried[0], atol=0.05 + 1e-6)
+    assert (tried[1] != tried[0]).any()
+    own = training.take_statistics(["train_reward", "plan_reward"])
+    assert own["plan_reward"] > own["train_reward"]
+    # The policy does now what the plan was, far from what it did before.
+    _, actions = training._episode(None, "train")
+    distance = (actions - plans[0]).abs().mean()
+    assert distance < 0.2 * np.abs(tried[0] - plans[0].numpy()).mean()
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("broken", [[1], [0, 1]])
+def test_environments_that_break_off_teach_nothing(
+    training: PodsTraining, broken: list[int], monkeypatch
+) -> None:
+    before = [parameter.clone() for parameter in training.policy.parameters()]
+    batch, learned = training._batch, []
+    try_out, imitate = batch.problem.try_out, training._imitate
+
+    def breaking(actions: np.ndarray, gradient: bool) -> Trials:
+        trials = try_out(actions, gradient=gradient)
+        trials.gradient[broken] = np.nan
+        return replace(trials, failures={e: f"environment {e}: broke off" for e in broken})
+
+    monkeypatch.setattr(batch.problem, "try_out", breaking)
+    monkeypatch.setattr(training, "_imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
+    training.train()
+    # Each of the three episodes with gradient.
+    assert len(training.broken) == 3 * len(broken)
+    assert learned == ([HORIZON] if len(broken) == 1 else [])
+    after = list(training.policy.parameters())
+    assert all(parameter.isfinite().all() for parameter in after)
+    assert all(map(torch.equal, before, after)) == (len(broken) == 2)
+    assert training.episodes == 10

@@ -1,0 +1,262 @@
+"""What the methods share that train a policy through the simulator's gradient: networks, the scenes to train
+in, and the runner, whose rows judge the deterministic policy in the hard contact model."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+
+from plab.config import ActorConfig, Config, ConfigError, PolicyConfig, drawn_configs
+from plab.envs.core import EpisodeBatch
+from plab.runners.environments import PolicyRunner, policy_episode, shared_batches
+from plab.runners.jobs import RunError
+from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
+from plab.runners.policy import Policy, save_policy
+from plab.runners.rl import check_torch_device
+from plab.runners.rl_models import CLIP, ModelKind, Spaces
+from plab.runners.runner import Step, Track
+
+__all__ = ["DEVIATION_MIN", "ActorKind", "ActorRunner", "ActorTraining", "actor_network", "set_rate"]
+
+DEVIATION_MIN = 0.01
+"""Least deviation by which observations are scaled [domain units, and those per unit of time]: blown up, what
+hardly changes would rule the gradient through the policy's reaction."""
+
+FIRST_SCENE = 1000
+"""``seed_scene`` of the first of the scenes that ``method.scenes`` asks for."""
+
+
+def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.nn.Sequential:
+    """Return a network, each hidden layer followed by ELU and LayerNorm: without that, actions come to the
+    ends of the hyperbolic tangent, where nothing is learned any more."""
+    (entries,) = spaces.observation_space.shape
+    layers: list[torch.nn.Module] = []
+    for width in hidden:
+        layers += [torch.nn.Linear(entries, width), torch.nn.ELU(), torch.nn.LayerNorm(width)]
+        entries = width
+    return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
+
+
+def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate of all parameters."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+def _no_arguments(*_: Any) -> dict[str, Any]:
+    raise ConfigError("this is no algorithm of Stable-Baselines3")
+
+
+@dataclass(frozen=True)
+class ActorKind(ModelKind):
+    """How a configuration becomes a policy.
+
+    Attributes:
+        network: Makes the policy from its spaces and the section ``method``.
+    """
+
+    model: Any = None
+    arguments: Any = _no_arguments
+    network: Callable[[Spaces, Any], BasePolicy] = field(kw_only=True)
+
+    def policy(self, method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
+        """Return the policy that training begins with, on the CPU; random numbers stay as they are."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return self.network(spaces, method)
+
+
+class ActorTraining(ABC):
+    """A policy, its optimiser, and the episodes from which it learns.
+
+    Attributes:
+        actor: How the policy is made.
+        policy: The policy.
+        statistics: Moments of the observations, by which they are scaled.
+        episodes: Episodes of training so far.
+        total_episodes: Episodes of the whole training, whole rounds of all environments.
+        round_episodes: Episodes of each environment in a round, and those of them with gradient.
+        broken: When and why episodes broke off since they were last asked for.
+    """
+
+    actor: ClassVar[ActorKind]
+    round_episodes = 1, 1
+
+    def __init__(self, method: Any, batch: EpisodeBatch, seed: int) -> None:
+        """Begin; the seed is that of the initial weights and of what is drawn later."""
+        self._method, self._batch = method, batch
+        self._device = torch.device(method.torch_device)
+        self._spaces = Spaces(batch.observation_space, batch.action_space)
+        self.policy: Any = self.actor.policy(method, self._spaces, seed).to(self._device)
+        self._optimizer = torch.optim.Adam(self.policy.parameters(), lr=method.lr)
+        self._generator = torch.Generator(self._device).manual_seed(seed)
+        self.statistics = RunningMeanStd(shape=batch.observation_space.shape)
+        self.episodes = 0
+        whole = self.round_episodes[0] * batch.size
+        self.total_episodes = math.ceil(method.episodes / whole) * whole
+        self.broken: list[str] = []
+        self._measured: dict[str, list[float]] = {}
+
+    @abstractmethod
+    def train(self) -> None:
+        """Run a round of episodes of all environments, and learn from them."""
+
+    def _note(self, **values: torch.Tensor | np.ndarray) -> None:
+        """Keep values of a round's episodes, shape [env], until :meth:`take_statistics`."""
+        for name, entries in values.items():
+            self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
+
+    def _rate_left(self) -> float:
+        """Return how much of the learning rates is left, which fall linearly to 0 over the run."""
+        return 1.0 - self.episodes / self.total_episodes
+
+    def predictor(self) -> Policy:
+        """Return the deterministic policy for observations as the environments give them."""
+        return Policy(self.policy, *self.moments())
+
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return means and variances by which observations are scaled, shape [entry] each."""
+        return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
+
+    def _hold_moments(self) -> None:
+        """Scale observations by the moments as they are now."""
+        mean, variance = (torch.as_tensor(part, dtype=torch.float32) for part in self.moments())
+        self._mean, self._deviation = mean.to(self._device), variance.sqrt().to(self._device)
+
+    def _scaled(self, observations: torch.Tensor) -> torch.Tensor:
+        return ((observations - self._mean) / self._deviation).clamp(-CLIP, CLIP)
+
+    def take_statistics(self, names: Sequence[str]) -> dict[str, float]:
+        """Return means of what was noted of the training episodes since the last time; NaN without any."""
+        known, self._measured = self._measured, {}
+        return {name: float(np.mean(known[name])) if name in known else math.nan for name in names}
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next episodes depend on, as arrays and numbers."""
+        moments = {"mean": self.statistics.mean, "var": self.statistics.var, "count": self.statistics.count}
+        return {
+            "episodes": self.episodes,
+            "generator": self._generator.get_state().cpu().numpy(),
+            "statistics": {name: np.array(values) for name, values in moments.items()},
+            **{name: module_arrays(module) for name, module in self._modules().items()},
+            **{name: optimizer_arrays(one) for name, one in self._optimizers().items()},
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`; ValueError if it is that of other networks."""
+        for name, module in self._modules().items():
+            restore_module(module, state[name])
+        for name, one in self._optimizers().items():
+            restore_optimizer(one, state[name])
+        known = state["statistics"]
+        if known["mean"].shape != self.statistics.mean.shape or known["var"].shape != known["mean"].shape:
+            raise ValueError(f"its statistics have shape {list(known['mean'].shape)}")
+        self.statistics.mean, self.statistics.var = known["mean"].copy(), known["var"].copy()
+        self.statistics.count = float(known["count"])
+        self._generator.set_state(torch.from_numpy(np.array(state["generator"], np.uint8)))
+        self.episodes = int(state["episodes"])
+
+    def _modules(self) -> dict[str, torch.nn.Module]:
+        return {"policy": self.policy}
+
+    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
+        return {"policy_optimizer": self._optimizer}
+
+
+class ActorRunner(PolicyRunner):
+    """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy.
+
+    Attributes:
+        training: What learns, from the section ``method``, the environments and a seed.
+        columns: What rows hold of it.
+    """
+
+    training: ClassVar[type[ActorTraining]]
+    columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
+
+    def environments(self, method: Any) -> int:
+        """Return how many environments are trained in together."""
+        return int(method.num_envs)
+
+    def build(self) -> None:
+        """Make the environments of the training, and the one in the hard contact model that judges."""
+        cfg, method = self.tracks[0].cfg, self.method
+        check_torch_device(method)
+        if method.torch_device != cfg.sim.device:
+            raise ConfigError(
+                f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
+                f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
+            )
+        count = self.environments(method)
+        kinds = (_scenes(cfg, method, count), count, method.contact), ([cfg], 1, "hard")
+        self._training_batch, self._evaluation = shared_batches(self.cache, *kinds)
+        self.problem = self._evaluation.problem
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make the networks, or take those of the file."""
+        self._training = self.training(self.method, self._training_batch, track.cfg.seed)
+        if state is not None:
+            self._training.restore(state)
+
+    def has_more(self, track: Track) -> bool:
+        """Whether there are episodes to train for, or the untrained policy has not been looked at."""
+        return track.iteration == 0 or self._training.episodes < self._training.total_episodes
+
+    def step(self, track: Track) -> Step:
+        """Train until the next evaluation is due, except before the first, and run the policy once."""
+        training, horizon = self._training, track.cfg.sim.horizon
+        before = training.episodes
+        if track.iteration > 0:
+            self.enter("optimise")
+            due = before + self.method.evaluate_every
+            while training.episodes < due and training.episodes < training.total_episodes:
+                training.train()
+            broken, training.broken = training.broken, []
+            if why := self.note_broken(track, broken, training.episodes - before):
+                raise RunError(f"iteration {track.iteration}: {why}")
+            self.enter("evaluate")
+        done = policy_episode(self._evaluation, training.predictor())
+        trained = (training.episodes - before) * horizon
+        every, differentiated = training.round_episodes
+        with_gradient = trained // every * differentiated
+        return Step(
+            done.measures | training.take_statistics(self.columns),
+            done.actions,
+            training.state(),
+            episodes=training.episodes,
+            steps=training.episodes * horizon,
+            steps_forward=horizon + trained - with_gradient,
+            steps_gradient=with_gradient,
+            keep=True,
+        )
+
+    def extent(self) -> tuple[int, int, int]:
+        """Return how many episodes of training there are, and after how many there is an evaluation."""
+        return self._training.episodes, self._training.total_episodes, self.method.evaluate_every
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report how it goes after an evaluation."""
+        row = rows[0]
+        text = (
+            f"reward {row['train_reward']:.4g} in training, {row['reward']:.4g} hard score {row['score']:.3f}"
+        )
+        self.report(self._training.episodes, text)
+
+    def conclude(self, track: Track) -> None:
+        """Keep the policy."""
+        save_policy(track.job.run.path, self.method, self._training.policy, self._training.moments())
+
+
+def _scenes(cfg: Config, method: ActorConfig, count: int) -> Sequence[Config]:
+    """Return what a training's environments, so many, are made of, in turn."""
+    if not method.scenes:
+        return [cfg]
+    return drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + min(method.scenes, count)))

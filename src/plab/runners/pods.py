@@ -1,0 +1,140 @@
+"""Policy optimization via differentiable simulation: ``pods``, a policy that imitates its own episodes, once
+the simulator's gradient has improved them.
+
+After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates of Adam
+in place of a step of gradient descent or of second order. In a round the policy acts, in each scene; the
+actions that it took are improved by some updates along the gradient of the trajectory's loss; they are run
+again, and the policy learns to take them where they lead. What the gradient improves is a sequence of
+actions, which is much easier than a network; what keeps the sequences of different scenes alike is that all
+of them begin as the policy's. To reproduce a result:
+
+    python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true method=pods seed=0 \
+        sim.device=cuda
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from stable_baselines3.common.policies import BasePolicy
+
+from plab.config import PodsConfig
+from plab.envs.core import EpisodeBatch
+from plab.runners.actors import ActorKind, ActorRunner, ActorTraining, actor_network, set_rate
+from plab.runners.rl_models import Spaces
+
+__all__ = ["PODS", "PodsPolicy", "PodsRunner", "PodsTraining"]
+
+
+class PodsPolicy(BasePolicy):
+    """Actions in (-1, 1), the hyperbolic tangent of a network's output."""
+
+    def __init__(self, spaces: Spaces, method: PodsConfig) -> None:
+        """Make the network, with torch's own initial weights."""
+        super().__init__(*spaces, squash_output=True)
+        self.mean = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return actions, shape [env, A], for scaled observations, shape [env, entry]."""
+        return torch.tanh(self.mean(observations))
+
+    def _predict(
+        self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = False
+    ) -> torch.Tensor:
+        return self(observation)
+
+
+PODS = ActorKind(network=PodsPolicy)
+"""What reads a policy's file; the name that ``method.algorithm`` gives it is in :mod:`plab.families`."""
+
+
+class PodsTraining(ActorTraining):
+    """A policy and the rounds of episodes from which it learns."""
+
+    actor = PODS
+
+    def __init__(self, method: PodsConfig, batch: EpisodeBatch, seed: int) -> None:
+        """Begin; the seed is that of the initial weights and of the minibatches."""
+        # The policy's own, those with gradient, and those of what they led to.
+        self.round_episodes = method.updates + 2, method.updates
+        super().__init__(method, batch, seed)
+
+    def train(self) -> None:
+        """Run a round: act, improve the actions, and imitate them."""
+        method, left, self._failed = self._method, self._rate_left(), set[int]()
+        self._hold_moments()
+        _, actions = self._episode(None, "train")
+        improved = self._improved(actions, method.action_lr * left)
+        observations, _ = self._episode(improved, "plan")
+        if whole := [e for e in range(self._batch.size) if e not in self._failed]:
+            seen, wanted = observations[whole].flatten(0, 1), improved[whole].flatten(0, 1)
+            self.statistics.update(seen.double().cpu().numpy())
+            self._hold_moments()
+            set_rate(self._optimizer, method.lr * left)
+            self._imitate(self._scaled(seen), wanted)
+        self.episodes += self.round_episodes[0] * self._batch.size
+
+    def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Run an episode of given actions, shape [env, T, A], or of the policy, and note reward and score
+        under a name; return observations before each step, shape [env, T, entry], and actions."""
+        batch = self._batch
+        like = torch.empty(0, device=self._device) if self._device.type == "cuda" else None
+        observed, taken, total = [], [], 0.0
+        observation, _ = batch.reset(like)
+        for t in range(batch.horizon):
+            seen = torch.as_tensor(observation, dtype=torch.float32)
+            with torch.no_grad():
+                chosen = self.policy(self._scaled(seen)) if actions is None else actions[:, t]
+            step = batch.step(chosen if like is not None else chosen.numpy(), strict=False)
+            observed.append(seen)
+            taken.append(chosen)
+            observation, total = step.observation, total + torch.as_tensor(step.reward)
+        self._note_failures(step.failures)
+        self._note(**{f"{name}_reward": total, f"{name}_score": step.info["score"]})
+        return torch.stack(observed, 1), torch.stack(taken, 1)
+
+    def _improved(self, actions: torch.Tensor, rate: float) -> torch.Tensor:
+        """Return actions, shape [env, T, A], after updates by Adam along the gradient of the trajectory's
+        loss."""
+        plan = torch.nn.Parameter(actions.clone())
+        optimizer = torch.optim.Adam([plan], lr=rate)
+        for _ in range(self._method.updates):
+            given = plan.detach()
+            tried = self._batch.problem.try_out(
+                given if given.is_cuda else given.double().numpy(), gradient=True
+            )
+            self._note_failures(tried.failures)
+            plan.grad = torch.as_tensor(tried.gradient, dtype=plan.dtype, device=plan.device)
+            # What broke off has no gradient.
+            plan.grad[list(self._failed)] = 0.0
+            optimizer.step()
+            with torch.no_grad():
+                plan.clamp_(-1.0, 1.0)
+        return plan.detach()
+
+    def _note_failures(self, failures: Mapping[int, str]) -> None:
+        self._failed |= set(failures)
+        self.broken += failures.values()
+
+    def _imitate(self, seen: torch.Tensor, wanted: torch.Tensor) -> None:
+        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry]."""
+        method = self._method
+        for _ in range(method.epochs):
+            order = torch.randperm(len(seen), generator=self._generator, device=self._device)
+            for rows in order.split(method.batch_size):
+                self._optimizer.zero_grad()
+                torch.nn.functional.mse_loss(self.policy(seen[rows]), wanted[rows]).backward()
+                self._optimizer.step()
+
+
+class PodsRunner(ActorRunner):
+    """Trains a policy; each iteration is some rounds, then one episode of the policy."""
+
+    kind = PodsConfig
+    training = PodsTraining
+    columns = ("train_reward", "train_score", "plan_reward", "plan_score")
+
+    def environments(self, method: PodsConfig) -> int:
+        """Return how many environments are trained in together, one for each scene."""
+        return max(1, method.scenes)
