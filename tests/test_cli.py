@@ -37,7 +37,7 @@ REFUSED = [
     (["task=Ropee"], "task 'Ropee' does not exist; did you mean Rope? choose from: Assembly, Chopsticks,"),
     (
         ["method=a2c"],
-        "choose from: adam, adam_h, apg, cem, cmaes, gd, hybrid, mppi, multistart, ppo, sac, shac, solve,",
+        "choose from: adam, adam_h, apg, cem, cmaes, gd, hybrid, mppi, multistart, pods, ppo, sac, shac,",
     ),
     (
         ["+experiment=yield_ablatoin"],

@@ -45,9 +45,8 @@ def _leaves(node: Any, path: str) -> Iterator[str]:
 
 def _keys() -> list[str]:
     """Keys of all kinds of methods and of some tasks, and what looks like one."""
-    composed = [
-        load_config([f"method={one}"]) for one in ("adam", "sac", "td3", "ppo", "cem", "solve", "apg", "shac")
-    ]
+    methods = "adam", "sac", "td3", "ppo", "cem", "solve", "apg", "pods", "shac"
+    composed = [load_config([f"method={one}"]) for one in methods]
     composed += [load_config([f"task={one}", "variant=3"]) for one in ("Move", "Torus")]
     known = dict.fromkeys(key for cfg in composed for key in _leaves(asdict(cfg), ""))
     groups = [

@@ -452,9 +452,9 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
             "release",
             {
                 "all gradient": ("150", "0.97", "93 %"),
-                "all RL": ("138", "0.68", "91 %"),
+                "all RL": ("140", "0.68", "91 %"),
                 "PPO": ("50", "0.74", "88 %"),
-                "TD3": ("48", "0.64", "94 %"),
+                "TD3": ("50", "0.64", "94 %"),
                 "SAC": ("40", "0.44", "90 %"),
             },
         ),
