@@ -102,6 +102,19 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
     assert rows["loss"].nunique() == 3
 
 
+@pytest.mark.gpu
+def test_on_cuda_it_begins_as_on_the_cpu_and_learns(finished: RunResult, tmp_path: Path) -> None:
+    rows, known = (
+        run(make_config(tmp_path, name_of(finished), "sim.device=cuda")).iterations,
+        finished.iterations,
+    )
+    # The untrained policy is the same, noise and minibatches are not.
+    np.testing.assert_allclose(rows["loss"][0], known["loss"][0], rtol=1e-4)
+    assert rows["steps_gradient"].tolist() == known["steps_gradient"].tolist()
+    trained = rows.filter(regex="^(train|plan)_").iloc[1:]
+    assert np.isfinite(trained.to_numpy()).all() and rows["loss"].nunique() == 3
+
+
 @pytest.mark.physics
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, name_of(finished))
