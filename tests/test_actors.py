@@ -48,6 +48,7 @@ METHODS = {
         "method.episodes=18",
         "method.evaluate_every=10",
         "method.updates=3",
+        "method.action_lr=0.05",
         "method.epochs=2",
         "method.batch_size=4",
     ),
