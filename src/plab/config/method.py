@@ -232,12 +232,14 @@ class PodsConfig(ActorConfig):
         action_lr: Learning rate of these, in units of an action.
         epochs: Passes of the policy over a round's actions.
         batch_size: Actions per update of the policy.
+        observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
     """
 
     updates: int = field(metadata=ranges.COUNT)
     action_lr: float = field(metadata=ranges.POSITIVE)
     epochs: int = field(metadata=ranges.COUNT)
     batch_size: int = field(metadata=ranges.COUNT)
+    observation_noise: float = field(metadata=ranges.FINITE)
 
 
 @dataclass

@@ -124,7 +124,11 @@ class PodsTraining(ActorTraining):
             order = torch.randperm(len(seen), generator=self._generator, device=self._device)
             for rows in order.split(method.batch_size):
                 self._optimizer.zero_grad()
-                torch.nn.functional.mse_loss(self.policy(seen[rows]), wanted[rows]).backward()
+                noise = torch.randn(
+                    seen[rows].shape, generator=self._generator, device=self._device, dtype=seen.dtype
+                )
+                acted = self.policy(seen[rows] + method.observation_noise * noise)
+                torch.nn.functional.mse_loss(acted, wanted[rows]).backward()
                 self._optimizer.step()
 
 
