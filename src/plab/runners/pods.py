@@ -4,9 +4,9 @@ the simulator's gradient has improved them.
 After Mora et al., PODS: Policy Optimization via Differentiable Simulation (ICML 2021), with updates of Adam
 in place of a step of gradient descent or of second order. In a round the policy acts, in each scene; the
 actions that it took are improved by some updates along the gradient of the trajectory's loss; they are run
-again, and the policy learns to take them where they lead. What the gradient improves is a sequence of
-actions, which is much easier than a network; what keeps the sequences of different scenes alike is that all
-of them begin as the policy's. To reproduce a result:
+again, and the policy learns to take them where they lead, and where it came without them. What the gradient
+improves is a sequence of actions, which is much easier than a network; what keeps the sequences of different
+scenes alike is that all of them begin as the policy's. To reproduce a result:
 
     python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true method=pods seed=0 \
         sim.device=cuda
@@ -64,11 +64,13 @@ class PodsTraining(ActorTraining):
         """Run a round: act, improve the actions, and imitate them."""
         method, left, self._failed = self._method, self._rate_left(), set[int]()
         self._hold_moments()
-        _, actions = self._episode(None, "train")
+        before, actions = self._episode(None, "train")
         improved = self._improved(actions, method.action_lr * left)
-        observations, _ = self._episode(improved, "plan")
+        after, _ = self._episode(improved, "plan")
         if whole := [e for e in range(self._batch.size) if e not in self._failed]:
-            seen, wanted = observations[whole].flatten(0, 1), improved[whole].flatten(0, 1)
+            # Also where it came without them: what comes off its way is led back to it.
+            seen = torch.cat([before[whole], after[whole]]).flatten(0, 1)
+            wanted = torch.cat([improved[whole]] * 2).flatten(0, 1)
             self.statistics.update(seen.double().cpu().numpy())
             self._hold_moments()
             set_rate(self._optimizer, method.lr * left)
