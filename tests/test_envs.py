@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 
 import plab.envs.core as core
 import plab.sim.runtime as runtime
-from plab.config import ConfigError, choices, conf_folder
+from plab.config import ConfigError, choices, conf_folder, load_config
 from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
@@ -310,7 +310,7 @@ def test_observations_may_tell_the_target() -> None:
     env = gymnasium.make_vec(
         "plab/Move-v1", num_envs=2, overrides=words, overrides_per_env=[[], ["variant=2"]]
     )
-    plain = core.spaces(env.batch.problem.scenes)[0]
+    plain = core.spaces(load_config(), env.batch.problem.scenes)[0]
     problem, (first, _) = env.batch.problem, env.reset()
     seen = [target_observation(problem.initial_mass[k], problem.target_mass[k]) for k in range(2)]
     assert not np.allclose(seen[0], seen[1], atol=0.01)
@@ -320,6 +320,27 @@ def test_observations_may_tell_the_target() -> None:
     env.close()
     cfgs = core.compose_configs("Move", "1", num_envs=2, overrides=COARSE, overrides_per_env=[[], words[-1:]])
     with pytest.raises(ValueError, match="observe_target differs between sub-environments"):
+        core.EpisodeBatch(cfgs)
+
+
+def test_observations_may_hold_fewer_particles() -> None:
+    few = gymnasium.make("plab/Move-v1", overrides=[*OVERRIDES, "observe_particles=3"])
+    full = gymnasium.make("plab/Move-v1", overrides=OVERRIDES)
+    count = full.unwrapped.batch.problem.scenes[0].particle_count
+    action = random_actions()[0][0]
+    for before, seen in zip(
+        full.reset()[:1] + full.step(action)[:1], few.reset()[:1] + few.step(action)[:1], strict=True
+    ):
+        poses = before[-14:]
+        particles = before[:-14].reshape(-1, 6)[:: count // 3 // max(count // 200, 1)]
+        assert np.array_equal(seen, np.concatenate([particles.ravel(), poses]))
+        assert few.observation_space.contains(seen)
+    few.close()
+    full.close()
+    cfgs = core.compose_configs(
+        "Move", "1", num_envs=2, overrides=COARSE, overrides_per_env=[[], ["observe_particles=3"]]
+    )
+    with pytest.raises(ValueError, match="observe_particles differs between sub-environments"):
         core.EpisodeBatch(cfgs)
 
 

@@ -48,6 +48,7 @@ def make_config(folder: Path, **changes) -> dict:
         "sim": {"device": "cpu", "precision": "float64", "deterministic": False},
         "seed": 3,
         "seed_particles": 0,
+        "observe_particles": 200,
         "observe_target": False,
         "results_dir": str(folder),
         "force": False,
@@ -65,7 +66,12 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
     assert config_hash(config | {"sim": config["sim"] | {"memory_mb": 7.0}}) == hash_
     assert config_hash(config | {"sim": config["sim"] | {"precision": "float32"}}) != hash_
     assert config_hash(config | {"seed": 4}) != hash_
-    for key, usual, other in (("seed_particles", 0, 3), ("observe_target", False, True)):
+    usual_and_other = {
+        "seed_particles": (0, 3),
+        "observe_particles": (200, 5),
+        "observe_target": (False, True),
+    }
+    for key, (usual, other) in usual_and_other.items():
         assert config_hash(config | {key: other}) != config_hash(config | {key: usual}) == hash_
 
 
@@ -93,7 +99,7 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
-_SINCE = ("protocol", "seed_particles", "observe_target")
+_SINCE = ("protocol", "seed_particles", "observe_particles", "observe_target")
 
 
 def test_runs_from_before_a_key_have_what_was_then(tmp_path: Path) -> None:

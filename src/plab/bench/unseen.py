@@ -61,8 +61,8 @@ def rows(
     for path in paths:
         policy, config = load_policy(path), read(Path(path)).config
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
-        seen = f"observe_target={config['observe_target']}"
-        cfg = load_config([f"task={config['task']['name']}", seen, *sim, *words])
+        seen = [f"{key}={config[key]}" for key in ("observe_particles", "observe_target")]
+        cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
         scores = scores_of(policy, drawn_configs(cfg, range(FIRST, FIRST + count)), together)
         mean, error = scores.mean(), stats.sem(scores)
         lower, upper = stats.t.interval(0.95, count - 1, mean, error) if error > 0 else (mean, mean)

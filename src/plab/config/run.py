@@ -114,6 +114,8 @@ class Config:
         variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
         seed_scene: Which random variant was drawn; None of other variants.
         seed_particles: Which draw of the particles the start is. Simulated targets are made from draw 0.
+        observe_particles: Particles that observations of environments hold, at least: every (particle
+            count // this)-th.
         observe_target: Whether observations of environments end with
             :func:`plab.objective.target_observation`, for policies that are to serve several targets.
         seed: Seed of the method's random numbers.
@@ -132,6 +134,7 @@ class Config:
     variant: str
     seed_scene: int | None
     seed_particles: int
+    observe_particles: int
     observe_target: bool
     seed: int
     results_dir: str
@@ -146,6 +149,7 @@ class Config:
             if (seed := getattr(self, key)) >= 2**32:
                 raise ConfigError(f"{key} must be below 2^32 = {2**32}, not {seed}")
             ranges.at_least(key, seed, 0)
+        ranges.at_least("observe_particles", self.observe_particles, 1)
         ranges.at_least("seed_scene", self.seed_scene or 0, 0)
         ranges.one_of("logger", self.logger, LOGGERS)
         ranges.at_least("checkpoint_seconds", self.checkpoint_seconds, 0, finite=True)

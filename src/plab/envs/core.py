@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from plab.config import Config, load_config
 from plab.config.words import word_list
 from plab.errors import ArgumentError
-from plab.objective import OBSERVED_PARTICLES, TARGET_ENTRIES, target_observation
+from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
@@ -192,16 +192,17 @@ class EpisodeBatch:
         if contact not in CONTACT_MODELS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
         self._problem: Problem | None = Problem(cfgs)
-        if len({cfg.observe_target for cfg in cfgs}) > 1:
-            raise ArgumentError("observe_target differs between sub-environments: they share one space")
+        for key in ("observe_particles", "observe_target"):
+            if len({getattr(cfg, key) for cfg in cfgs}) > 1:
+                raise ArgumentError(f"{key} differs between sub-environments: they share one space")
         self.configs, self.contact = tuple(cfgs), contact
         self.size = len(cfgs)
         self.horizon = cfgs[0].sim.horizon
         scenes, seen = self.problem.scenes, cfgs[0].observe_target
-        self._stride = _stride(scenes[0])
+        self._stride = _stride(scenes[0], cfgs[0].observe_particles)
         self._pose_entries = _pose_entries(scenes[0])
         self._target = Constants(_target_observations(self.problem) if seen else np.empty((self.size, 0)))
-        self.observation_space, self.action_space = spaces(scenes, observe_target=seen)
+        self.observation_space, self.action_space = spaces(cfgs[0], scenes)
         self._renderers: list[Renderer] = []
         self._step: int | None = None
         self._failures: dict[int, str] = {}
@@ -318,7 +319,7 @@ class EpisodeBatch:
         """
         now = self._now(steps)
         entries = self._pose_entries
-        observed = _observed(self.problem.scenes[0])
+        observed = len(range(0, self.problem.scenes[0].particle_count, self._stride))
         shape = self.size, len(self.problem.scenes[0].manipulators), 8
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
@@ -426,13 +427,9 @@ def _pose_entries(scene: Scene) -> np.ndarray:
     return np.flatnonzero(observed)
 
 
-def _stride(scene: Scene) -> int:
-    """Return the distance of the observed particles' numbers."""
-    return max(scene.particle_count // OBSERVED_PARTICLES, 1)
-
-
-def _observed(scene: Scene) -> int:
-    return len(range(0, scene.particle_count, _stride(scene)))
+def _stride(scene: Scene, least: int) -> int:
+    """Return the distance of the observed particles' numbers, of so many at least."""
+    return max(scene.particle_count // least, 1)
 
 
 def _target_observations(problem: Problem) -> np.ndarray:
@@ -448,16 +445,16 @@ def _target_observations(problem: Problem) -> np.ndarray:
     return np.array(rows)
 
 
-def spaces(scenes: Sequence[Scene], *, observe_target: bool = False) -> tuple[Box, Box]:
-    """Return the spaces that hold the observations, with those of the target or without, and the actions of
-    all scenes."""
-    observed = _observed(scenes[0])
+def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
+    """Return the spaces that hold the observations, of which a configuration says what they hold, and the
+    actions of all scenes."""
+    observed = len(range(0, scenes[0].particle_count, _stride(scenes[0], cfg.observe_particles)))
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
     # Shares, centroids and deviations are within the unit cube.
-    seen = TARGET_ENTRIES if observe_target else 0
+    seen = TARGET_ENTRIES if cfg.observe_target else 0
     observation = Box(
         np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
         np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),

@@ -84,6 +84,7 @@ _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds"
 _BEFORE: dict[str, Any] = {
     "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"},
     "seed_particles": 0,
+    "observe_particles": 200,
     "observe_target": False,
 }
 """What the configurations of runs would say that are older than these choices."""
@@ -100,6 +101,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "sim.device": str,
     "seed": int,
     "seed_particles": int,
+    "observe_particles": int,
     "observe_target": bool,
 }
 """What every configuration says, and the types of it."""
@@ -269,8 +271,8 @@ def config_hash(cfg: Any) -> str:
         plain["protocol"] = chosen
     # Runs of the first draw and with the paper's observations keep the hashes that they had before there were
     # others.
-    for key in ("seed_particles", "observe_target"):
-        if not plain.get(key):
+    for key in ("seed_particles", "observe_particles", "observe_target"):
+        if plain.get(key, _BEFORE[key]) == _BEFORE[key]:
             plain.pop(key, None)
     # Always empty.
     for key in ("contact_by_task", "max_gradient_norm_by_numbers"):

@@ -105,7 +105,8 @@ def environment_key(cfg: Config) -> str:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles, cfg.observe_target])
+    seen = cfg.observe_particles, cfg.observe_target
+    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles, seen])
 
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:

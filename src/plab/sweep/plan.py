@@ -55,7 +55,8 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    kind = [cfg.task.name, cfg.method.family, cfg.observe_target, *shared, loss]
+    seen = cfg.observe_particles, cfg.observe_target
+    kind = [cfg.task.name, cfg.method.family, seen, *shared, loss]
     own = family(cfg.method.family)
     if not (own.batching or own.joins_populations(cfg.method)):
         return [*kind, cfg.variant, asdict(cfg.task), method]

@@ -54,7 +54,7 @@ class PopulationRunner(PolicyRunner):
         check_torch_device(self.method)
         cfgs, method = [track.cfg for track in self.tracks], self.method
         kinds = (method.num_envs, method.contact), (1, "hard")
-        self._spaces = Spaces(*spaces(build_scenes(cfgs), observe_target=cfgs[0].observe_target))
+        self._spaces = Spaces(*spaces(cfgs[0], build_scenes(cfgs)))
         (observed,), (actions,) = (space.shape for space in self._spaces)
         self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
         self._total = total_steps(method, self._sizes.horizon)
