@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +45,7 @@ METHODS = {
         "method.value_epochs=2",
     ),
     "pods": (
+        "observe_particles=5",
         "method.scenes=2",
         "method.episodes=18",
         "method.evaluate_every=10",
@@ -156,6 +158,18 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", "2 drawn scenes", 3)
     assert row["lower"] <= row["score"] <= row["upper"] and 0.0 <= row["median"] <= 1.0
     assert str(finished.path) in capsys.readouterr().out
+
+
+@pytest.mark.physics
+def test_older_files_of_policies_are_read(finished: RunResult, tmp_path: Path) -> None:
+    """Those of shac had profiles, without any in them."""
+    kept = dict(np.load(policy_path(finished.path)))
+    header = json.loads(str(kept["header"]))
+    header["method"] |= {"profile": None, "profiles": {}}
+    old = tmp_path / "old.h5"
+    np.savez(policy_path(old), **kept | {"header": np.array(json.dumps(header))})
+    seen = np.stack([kept["mean"]])
+    np.testing.assert_array_equal(load_policy(old)(seen), load_policy(finished.path)(seen))
 
 
 @pytest.mark.parametrize(
