@@ -19,9 +19,9 @@ from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
 from plab.runners import run_config
-from plab.runners.actors import DEVIATION_MIN
+from plab.runners.actors import DEVIATION_MIN, ActorPolicy
 from plab.runners.environments import shared_batches
-from plab.runners.pods import PodsPolicy, PodsTraining
+from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
 from same_runs import assert_same_numbers, stopped_at
@@ -95,7 +95,7 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
     if name == "pods":
         assert (rows["plan_reward"] > rows["train_reward"]).tolist() == [False, True, True]
     policy = load_policy(finished.path)
-    assert isinstance(policy.network, {"shac": ShacPolicy, "pods": PodsPolicy}[name])
+    assert type(policy.network) is {"shac": ShacPolicy, "pods": ActorPolicy}[name]
     kept = np.load(policy_path(finished.path))
     actions = policy(np.stack([kept["mean"]] * 2))
     assert actions.shape == (2, 6) and (np.abs(actions) < 1.0).all()

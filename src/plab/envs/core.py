@@ -319,7 +319,7 @@ class EpisodeBatch:
         """
         now = self._now(steps)
         entries = self._pose_entries
-        observed = len(range(0, self.problem.scenes[0].particle_count, self._stride))
+        observed = _observed(self.problem.scenes[0], self.configs[0].observe_particles)
         shape = self.size, len(self.problem.scenes[0].manipulators), 8
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
@@ -432,6 +432,10 @@ def _stride(scene: Scene, least: int) -> int:
     return max(scene.particle_count // least, 1)
 
 
+def _observed(scene: Scene, least: int) -> int:
+    return len(range(0, scene.particle_count, _stride(scene, least)))
+
+
 def _target_observations(problem: Problem) -> np.ndarray:
     """Return what is seen of each environment's target, shape [batch, 14]."""
     found: dict[bytes, np.ndarray] = {}
@@ -448,7 +452,7 @@ def _target_observations(problem: Problem) -> np.ndarray:
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
     """Return the spaces that hold the observations, of which a configuration says what they hold, and the
     actions of all scenes."""
-    observed = len(range(0, scenes[0].particle_count, _stride(scenes[0], cfg.observe_particles)))
+    observed = _observed(scenes[0], cfg.observe_particles)
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3

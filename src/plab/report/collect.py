@@ -443,15 +443,9 @@ def _usual(method: str, protocol: str) -> dict[str, Any]:
     words = [f"method={method}"] if known else []
     words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
     config = config_dict(load_config(words))
-    sections = ("protocol", "sim", "method") if known else ("protocol", "sim")
-    return dict(
-        _leaves(
-            {
-                name: config[name]
-                for name in (*sections, "seed_particles", "observe_particles", "observe_target")
-            }
-        )
-    )
+    names = ["protocol", "sim", "seed_particles", "observe_particles", "observe_target"]
+    names += ["method"] if known else []
+    return dict(_leaves({name: config[name] for name in names}))
 
 
 def _usual_by_task(method: str, task: str, usual: Mapping[str, Any]) -> dict[str, float]:

@@ -24,7 +24,15 @@ from plab.runners.rl import check_torch_device
 from plab.runners.rl_models import CLIP, ModelKind, Spaces
 from plab.runners.runner import Step, Track
 
-__all__ = ["DEVIATION_MIN", "ActorKind", "ActorRunner", "ActorTraining", "actor_network", "set_rate"]
+__all__ = [
+    "DEVIATION_MIN",
+    "ActorKind",
+    "ActorPolicy",
+    "ActorRunner",
+    "ActorTraining",
+    "actor_network",
+    "set_rate",
+]
 
 DEVIATION_MIN = 0.01
 """Least deviation by which observations are scaled [domain units, and those per unit of time]: blown up, what
@@ -43,6 +51,24 @@ def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.
         layers += [torch.nn.Linear(entries, width), torch.nn.ELU(), torch.nn.LayerNorm(width)]
         entries = width
     return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
+
+
+class ActorPolicy(BasePolicy):
+    """Actions in (-1, 1), the hyperbolic tangent of a network's output."""
+
+    def __init__(self, spaces: Spaces, method: ActorConfig) -> None:
+        """Make the network, with torch's own initial weights."""
+        super().__init__(*spaces, squash_output=True)
+        self.mean = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return actions, shape [env, A], for scaled observations, shape [env, entry]."""
+        return torch.tanh(self.mean(observations))
+
+    def _predict(
+        self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = False
+    ) -> torch.Tensor:
+        return self(observation)
 
 
 def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:

@@ -17,35 +17,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import torch
-from stable_baselines3.common.policies import BasePolicy
 
 from plab.config import PodsConfig
 from plab.envs.core import EpisodeBatch
-from plab.runners.actors import ActorKind, ActorRunner, ActorTraining, actor_network, set_rate
-from plab.runners.rl_models import Spaces
+from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate
 
-__all__ = ["PODS", "PodsPolicy", "PodsRunner", "PodsTraining"]
-
-
-class PodsPolicy(BasePolicy):
-    """Actions in (-1, 1), the hyperbolic tangent of a network's output."""
-
-    def __init__(self, spaces: Spaces, method: PodsConfig) -> None:
-        """Make the network, with torch's own initial weights."""
-        super().__init__(*spaces, squash_output=True)
-        self.mean = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Return actions, shape [env, A], for scaled observations, shape [env, entry]."""
-        return torch.tanh(self.mean(observations))
-
-    def _predict(
-        self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = False
-    ) -> torch.Tensor:
-        return self(observation)
+__all__ = ["PODS", "PodsRunner", "PodsTraining"]
 
 
-PODS = ActorKind(network=PodsPolicy)
+PODS = ActorKind(network=ActorPolicy)
 """What reads a policy's file; the name that ``method.algorithm`` gives it is in :mod:`plab.families`."""
 
 

@@ -15,40 +15,33 @@ import copy
 import math
 
 import torch
-from stable_baselines3.common.policies import BasePolicy
 
 from plab.autograd import Stretch, policy_gradient
 from plab.config import ShacConfig
 from plab.envs.core import EpisodeBatch
-from plab.runners.actors import ActorKind, ActorRunner, ActorTraining, actor_network, set_rate
+from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, actor_network, set_rate
 from plab.runners.rl_models import Spaces
 
 __all__ = ["SHAC", "ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
 
 
-class ShacPolicy(BasePolicy):
+class ShacPolicy(ActorPolicy):
     """Actions in (-1, 1): the hyperbolic tangent of a normal variable whose mean is a network's output and
     whose standard deviation is learned, the same for all observations."""
 
     def __init__(self, spaces: Spaces, method: ShacConfig) -> None:
         """Make the network, with torch's own initial weights."""
-        super().__init__(*spaces, squash_output=True)
-        self.mean = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
+        super().__init__(spaces, method)
         self.log_std = torch.nn.Parameter(torch.full(spaces.action_space.shape, math.log(method.noise)))
 
     def forward(self, observations: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
         """Draw actions, shape [env, A], for scaled observations, shape [env, entry]; without a generator, the
         most likely ones."""
+        if generator is None:
+            return super().forward(observations)
         mean = self.mean(observations)
-        if generator is not None:
-            noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-            mean = mean + self.log_std.exp() * noise
-        return torch.tanh(mean)
-
-    def _predict(
-        self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = False
-    ) -> torch.Tensor:
-        return self(observation)
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        return torch.tanh(mean + self.log_std.exp() * noise)
 
 
 SHAC = ActorKind(network=ShacPolicy)
