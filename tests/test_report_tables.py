@@ -226,6 +226,21 @@ def test_runs_that_try_something_do_not_disturb_the_others(tmp_path: Path) -> No
     assert len(gather(tmp_path, "task.yield_stress=10").table) == 1
 
 
+@pytest.mark.parametrize("key", ["seed_particles", "observe_particles"])
+def test_settings_of_no_section_are_told_apart(tmp_path: Path, key: str) -> None:
+    # In files of their own and in an archive, whose runs share their sections.
+    for seed in range(2):
+        other = synthetic.config(tmp_path / "results", seed=seed)
+        other[key] += seed
+        other["method"]["iterations"] = 200
+        synthetic.save(synthetic.synthetic_run(other, rows=2))
+    archive = tmp_path / "both.plab.zip.xz"
+    pack(tmp_path / "results", archive)
+    for source in (tmp_path / "results", archive):
+        runs = gather(source)
+        assert (list(runs.table["seed"]), runs.set_aside, runs.unusual) == (["0"], 1, [])
+
+
 def test_changed_task_is_noted_and_not_mixed(tmp_path: Path) -> None:
     for seed, stress in enumerate((50.0, 10.0)):
         other = synthetic.config(tmp_path, seed=seed)

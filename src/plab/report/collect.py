@@ -39,6 +39,9 @@ NAMES = ("task", "variant", "method", "seed")
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that the table of runs has as columns."""
 
+_SINGLE = ("seed_particles", "observe_particles", "observe_target")
+"""What is in no section of a configuration and matters to a mean."""
+
 _HARMLESS = (
     "seed",
     "results_dir",
@@ -390,7 +393,7 @@ def _changes(found: Sequence[Row]) -> list[dict[str, Any]]:
     changes = []
     for row in found:
         sections = (id(row.config[name]) for name in ("task", "method", "protocol", "sim"))
-        which = (*sections, row.values["variant"])
+        which = (*sections, row.values["variant"], *(row.config[name] for name in _SINGLE))
         if which not in known:
             known[which] = changed_settings(row.config)
         changes.append(known[which])
@@ -443,8 +446,7 @@ def _usual(method: str, protocol: str) -> dict[str, Any]:
     words = [f"method={method}"] if known else []
     words += [f"protocol={protocol}"] if protocol in choices("protocol") else []
     config = config_dict(load_config(words))
-    names = ["protocol", "sim", "seed_particles", "observe_particles", "observe_target"]
-    names += ["method"] if known else []
+    names = ["protocol", "sim", *_SINGLE, *(["method"] if known else [])]
     return dict(_leaves({name: config[name] for name in names}))
 
 

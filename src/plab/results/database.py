@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from plab.config.selection import lookup
-from plab.results.schema import ResultsError
+from plab.results.schema import BEFORE, ResultsError
 from plab.results.store import DAMAGED, File, Store
 
 __all__ = ["COLUMNS", "Database", "Row", "quoted", "run_number", "sql_value", "tables_of", "text"]
@@ -54,7 +54,8 @@ _MORE = ("score_best", "protocol", "targets")
 _NAME = ".plab.sqlite"
 
 _LAYOUT = f"""
--- What rows say, edition 2: with protocol.score=last a policy's score is that of its training episodes.
+-- What rows say, edition 2: with protocol.score=last a policy's score is that of its training episodes;
+-- of older ones: {json.dumps(BEFORE)}.
 CREATE TABLE contents (path BLOB PRIMARY KEY, rows TEXT);
 CREATE TABLE sections (section INTEGER PRIMARY KEY, name TEXT, body TEXT);
 CREATE TABLE section_keys (section INTEGER, key TEXT, value, PRIMARY KEY (section, key)) WITHOUT ROWID;

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ARCHIVE_SUFFIX",
+    "BEFORE",
     "BUDGETS",
     "COLUMNS",
     "EVALUATION",
@@ -81,7 +82,7 @@ _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds"
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
 
-_BEFORE: dict[str, Any] = {
+BEFORE: dict[str, Any] = {
     "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"},
     "seed_particles": 0,
     "observe_particles": 200,
@@ -211,7 +212,7 @@ def stored_config(text: str) -> dict[str, Any]:
     loaded = json.loads(text)
     if not isinstance(loaded, dict):
         raise ValueError(f"config is a {type(loaded).__name__}, not sections and values")
-    config = _BEFORE | loaded
+    config = BEFORE | loaded
     if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
         raise ValueError(f"config has no section {strange[0]}")
     for key, kind in _NEEDED.items():
@@ -272,7 +273,7 @@ def config_hash(cfg: Any) -> str:
     # Runs of the first draw and with the paper's observations keep the hashes that they had before there were
     # others.
     for key in ("seed_particles", "observe_particles", "observe_target"):
-        if plain.get(key, _BEFORE[key]) == _BEFORE[key]:
+        if plain.get(key, BEFORE[key]) == BEFORE[key]:
             plain.pop(key, None)
     # Always empty.
     for key in ("contact_by_task", "max_gradient_norm_by_numbers"):
