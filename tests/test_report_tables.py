@@ -452,7 +452,8 @@ def test_times_say_how_many_runs_shared_a_simulator(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
     assert main(["tables", "--results", name, "--out", str(tmp_path)]) == 0
-    count = len(load(example_archive(name)))
+    # The runs with other yield stresses are for a figure of their own.
+    count = len(load(example_archive(name))) - 4 * (name == "release")
     tables = 16 if name == "authors" else 17  # no method of the paper: none of agreement
     assert f"{tables} tables of {count} out of" in capsys.readouterr().out
     assert f"--results {name}" in (tmp_path / "ours" / "iou_per_task.md").read_text(encoding="utf-8")
@@ -467,10 +468,10 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
             "release",
             {
                 "all gradient": ("150", "0.97", "93 %"),
-                "all RL": ("140", "0.68", "91 %"),
+                "all RL": ("150", "0.70", "91 %"),
                 "PPO": ("50", "0.74", "88 %"),
                 "TD3": ("50", "0.64", "94 %"),
-                "SAC": ("40", "0.44", "90 %"),
+                "SAC": ("50", "0.54", "92 %"),
             },
         ),
         ("targets", {"all": ("150", "0.45", "43 %")}),

@@ -282,7 +282,7 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
         what: Task and variant, for the heading.
         name: The method.
     """
-    figure, panel = single(width=4.2, height=2.8)
+    figure, panel = single(width=5.2, height=2.8)
     stresses = sorted(groups)
     finite = [stress for stress in stresses if 0 < stress < np.inf] or [1.0]
     scale = LogNorm(min(finite), max(max(finite), min(finite) * 1.0001), clip=True)
@@ -291,10 +291,10 @@ def yield_ablation(groups: Mapping[float, Sequence[Rows]], what: str, name: str)
         if drawn is not None:
             # Not to the map's end, which is too light on white.
             colour = to_hex(colormaps["viridis"](0.88 * float(scale(stress))))
-            label = f"{stress:g} ({drawn.count} runs)"
+            label = f"{stress:g}" + (f" ({drawn.count} runs)" if drawn.count > 1 else "")
             draw_band(panel, drawn, name, colour=colour, label=label)
     panel.set(title=f"{what}, {method(name).label}", ylabel="reward", xlabel=_EPISODES, ylim=(0.0, None))
-    panel.legend(title="yield stress")
+    panel.legend(title="yield stress", loc="center left", bbox_to_anchor=(1.0, 0.5))
     notes = ["Reward of an episode against episodes, by yield stress.", _SHADED, _CLAMPED]
     return [Drawing("yield_ablation", figure, notes)]
 
