@@ -4,7 +4,8 @@
     python -m plab.bench.unseen A.h5 B.h5 --scenes 20 --csv unseen.csv sim.device=cpu
 
 A row per policy: mean score in the hard contact model with its 95 % interval (Student's t), median, and the
-share of scenes with at least 0.9. The settings of the simulation are those of the training.
+share of scenes with at least 0.9. The settings of the simulation are those of the training; scenes that do
+not fit into a coarse grid's domain are left out.
 """
 
 import sys
@@ -17,10 +18,13 @@ from scipy import stats
 from plab.cli.arguments import Parser, positive, sources_and_words, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import report
-from plab.config import Config, drawn_configs, load_config
+from plab.config import Config, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
+from plab.errors import ArgumentError
 from plab.results import read
 from plab.runners.policy import Policy, load_policy
+from plab.scene import SceneError
+from plab.targets import TargetError, check_target
 
 __all__ = ["FIRST", "main", "rows", "scores_of"]
 
@@ -63,14 +67,28 @@ def rows(
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
         seen = [f"{key}={config[key]}" for key in ("observe_particles", "observe_target")]
         cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
-        scores = scores_of(policy, drawn_configs(cfg, range(FIRST, FIRST + count)), together)
+        drawn = [one for one in drawn_configs(cfg, range(FIRST, FIRST + count)) if _fits(one)]
+        if len(drawn) < 2:
+            raise ArgumentError(
+                f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"
+            )
+        scores = scores_of(policy, drawn, together)
         mean, error = scores.mean(), stats.sem(scores)
-        lower, upper = stats.t.interval(0.95, count - 1, mean, error) if error > 0 else (mean, mean)
+        lower, upper = stats.t.interval(0.95, len(drawn) - 1, mean, error) if error > 0 else (mean, mean)
         numbers = mean, lower, upper, np.median(scores), (scores >= 0.9).mean()
-        drawn = config["method"].get("scenes", 0)
-        trained_on = f"{drawn} drawn scenes" if drawn else f"variant {config['variant']}"
-        named = (path, config["task"]["name"], trained_on, count)
+        known = config["method"].get("scenes", 0)
+        trained_on = f"{known} drawn scenes" if known else f"variant {config['variant']}"
+        named = (path, config["task"]["name"], trained_on, len(drawn))
         yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
+
+
+def _fits(cfg: Config) -> bool:
+    """Whether a scene and its target can be built."""
+    try:
+        check_target(build_scene(cfg), cfg.task.target)
+    except (SceneError, TargetError):
+        return False
+    return True
 
 
 @command_line

@@ -233,6 +233,7 @@ class PodsConfig(ActorConfig):
         epochs: Passes of the policy over a round's actions.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
+        shift: All that is observed of them is moved together, along x and along z, by so much at most.
     """
 
     updates: int = field(metadata=ranges.COUNT)
@@ -240,6 +241,7 @@ class PodsConfig(ActorConfig):
     epochs: int = field(metadata=ranges.COUNT)
     batch_size: int = field(metadata=ranges.COUNT)
     observation_noise: float = field(metadata=ranges.FINITE)
+    shift: float = field(metadata=ranges.FINITE)
 
 
 @dataclass

@@ -212,6 +212,23 @@ class EpisodeBatch:
         self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
 
     @property
+    def level_entries(self) -> np.ndarray:
+        """Entries of an observation that are positions along x and along z, shape [2, position]: those of the
+        observed particles, the manipulators and, if it is seen, the target."""
+        particles = 6 * _observed(self.problem.scenes[0], self.configs[0].observe_particles)
+        numbers = np.flatnonzero(self._pose_entries % 8 < 3)
+        # What has to leave, then what has to arrive: a share, a centroid and deviations.
+        centroids = [1, 8] if self.configs[0].observe_target else []
+        first = np.concatenate(
+            [
+                np.arange(0, particles, 6),
+                particles + numbers[self._pose_entries[numbers] % 8 == 0],
+                particles + len(self._pose_entries) + np.array(centroids, int),
+            ]
+        )
+        return np.stack([first, first + 2])
+
+    @property
     def problem(self) -> Problem:
         """Scenes, targets and simulator of the sub-environments.
 

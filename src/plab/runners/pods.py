@@ -39,6 +39,7 @@ class PodsTraining(ActorTraining):
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = method.updates + 2, method.updates
         super().__init__(method, batch, seed)
+        self._level = torch.as_tensor(batch.level_entries, device=self._device)
 
     def train(self) -> None:
         """Run a round: act, improve the actions, and imitate them."""
@@ -109,7 +110,12 @@ class PodsTraining(ActorTraining):
                 noise = torch.randn(
                     seen[rows].shape, generator=self._generator, device=self._device, dtype=seen.dtype
                 )
-                acted = self.policy(seen[rows] + method.observation_noise * noise)
+                moved = seen[rows] + method.observation_noise * noise
+                if method.shift > 0.0:
+                    shift = torch.rand((2, len(rows), 1), generator=self._generator, device=self._device)
+                    for entries, along in zip(self._level, shift, strict=True):
+                        moved[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
+                acted = self.policy(moved)
                 torch.nn.functional.mse_loss(acted, wanted[rows]).backward()
                 self._optimizer.step()
 
