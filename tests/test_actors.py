@@ -14,12 +14,12 @@ import torch
 from gymnasium.spaces import Box
 
 from plab.bench import unseen
-from plab.config import Config, ConfigError, PodsConfig, ShacConfig, drawn_configs, load_config
+from plab.config import Config, ConfigError, drawn_configs, load_config
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
 from plab.runners import run_config
-from plab.runners.actors import DEVIATION_MIN, ActorPolicy
+from plab.runners.actors import DEVIATION_MIN, ActorPolicy, training_scenes
 from plab.runners.environments import shared_batches
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
@@ -46,7 +46,8 @@ METHODS = {
     ),
     "pods": (
         "observe_particles=5",
-        "method.scenes=2",
+        "method.scenes=3",
+        "method.num_envs=2",
         "method.episodes=18",
         "method.evaluate_every=10",
         "method.updates=3",
@@ -142,10 +143,10 @@ def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
     state = read(result_path(cfg).with_suffix(".partial.h5")).resume
     observed = Box(-1.0, 1.0, state["statistics"]["mean"].shape, np.float32)
     batch = SimpleNamespace(size=3, observation_space=observed, action_space=Box(-1.0, 1.0, (6,), np.float32))
-    ShacTraining(cfg.method_as(ShacConfig), batch, 0).restore(state)
-    other = make_config(tmp_path, "shac", "method.hidden=[9]").method_as(ShacConfig)
+    ShacTraining(cfg, batch).restore(state)
+    other = make_config(tmp_path, "shac", "method.hidden=[9]")
     with pytest.raises(ValueError, match=r"mean.0.weight has shape \[8, "):
-        ShacTraining(other, batch, 0).restore(state)
+        ShacTraining(other, batch).restore(state)
 
 
 @pytest.mark.physics
@@ -155,7 +156,8 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     table = tmp_path / "unseen.csv"
     assert unseen.main([str(finished.path), "--scenes", "3", "--together", "2", "--csv", str(table)]) == 0
     (row,) = pd.read_csv(table).to_dict("records")
-    assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", "2 drawn scenes", 3)
+    drawn = {"shac": "2 drawn scenes", "pods": "3 drawn scenes"}[name_of(finished)]
+    assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", drawn, 3)
     assert row["lower"] <= row["score"] <= row["upper"] and 0.0 <= row["median"] <= 1.0
     assert str(finished.path) in capsys.readouterr().out
 
@@ -230,12 +232,35 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch)
     assert not list(tmp_path.rglob("*.h5"))
 
 
+@pytest.mark.physics
+def test_rounds_take_the_drawn_scenes_in_turn(tmp_path: Path) -> None:
+    cfg = make_config(tmp_path, "pods", "method.epochs=1")
+    (batch,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
+    training, taken = PodsTraining(cfg, batch), []
+    for _ in range(3):
+        training.train()
+        taken.append([one.seed_scene for one in batch.configs])
+    assert taken == [[1000, 1001], [1002, 1000], [1001, 1002]]
+    # Whoever shares the environments next has those it asks for.
+    (again,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
+    assert again is batch and [one.variant for one in batch.configs] == ["1", "1"]
+
+
+def test_scenes_that_do_not_fit_are_left_out(tmp_path: Path, monkeypatch) -> None:
+    cfg = make_config(tmp_path, "pods", "method.scenes=4")
+    monkeypatch.setattr("plab.runners.actors.fits", lambda one: one.seed_scene % 2)
+    assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003]
+    monkeypatch.setattr("plab.runners.actors.fits", lambda one: False)
+    with pytest.raises(ConfigError, match="none of the scenes 1000 to 1003 fits into a grid of 32"):
+        training_scenes(cfg, cfg.method, 4)
+
+
 @pytest.fixture
 def training() -> PodsTraining:
     """One of pods, in two environments."""
-    cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01")
+    cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01", "method.scenes=0")
     (batch,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
-    return PodsTraining(cfg.method_as(PodsConfig), batch, 0)
+    return PodsTraining(cfg, batch)
 
 
 @pytest.mark.physics

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 
 import plab.envs.core as core
 import plab.sim.runtime as runtime
-from plab.config import ConfigError, choices, conf_folder, load_config
+from plab.config import Config, ConfigError, choices, conf_folder, load_config
 from plab.config.suite import suite_tasks
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
@@ -342,6 +342,38 @@ def test_observations_may_hold_fewer_particles() -> None:
     )
     with pytest.raises(ValueError, match="observe_particles differs between sub-environments"):
         core.EpisodeBatch(cfgs)
+
+
+def test_environments_can_be_others_of_their_kind() -> None:
+    words, actions = [*COARSE, "observe_target=true"], random_actions()
+
+    def made_of(*variants: str) -> list[Config]:
+        each = [[f"variant={one}"] for one in variants]
+        return core.compose_configs("Move", "1", num_envs=2, overrides=words, overrides_per_env=each)
+
+    def episode(batch: core.EpisodeBatch) -> list[np.ndarray]:
+        first, info = batch.reset()
+        steps = [batch.step(action) for action in actions]
+        seen = [part for step in steps for part in (step.observation, step.reward, step.info["score"])]
+        return [first, info["score"], *seen]
+
+    batch = core.EpisodeBatch(made_of("1", "2"), contact="soft")
+    before = episode(batch)
+    batch.renew(made_of("3", "1"))
+    with pytest.raises(ResetNeeded):
+        batch.step(actions[0])
+    fresh = core.EpisodeBatch(made_of("3", "1"), contact="soft")
+    for known, seen in zip(episode(fresh), episode(batch), strict=True):
+        assert np.array_equal(known, seen)
+    assert [one.variant for one in batch.configs] == ["3", "1"]
+    batch.renew(made_of("1", "2"))
+    assert all(map(np.array_equal, before, episode(batch)))
+    with pytest.raises(ValueError, match="1 configurations for 2 sub-environments"):
+        batch.renew(made_of("1", "2")[:1])
+    with pytest.raises(ValueError, match="observe_target differs"):
+        batch.renew(core.compose_configs("Move", "1", num_envs=2, overrides=COARSE))
+    for one in (batch, fresh):
+        one.close()
 
 
 @pytest.mark.parametrize("at", [0, 1])

@@ -27,16 +27,17 @@ from plab.objective import (
     target_sdf,
     total_loss,
 )
+from plab.scene import SceneError
 from plab.sim import Rollout, Simulator
 from plab.sim.tensors import Constants
-from plab.targets import TargetError, build_targets, load_release_target
+from plab.targets import TargetError, build_targets, check_target, load_release_target
 
 if TYPE_CHECKING:
     import torch
 
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem", "Trials", "build_scenes", "build_simulator", "make_targets"]
+__all__ = ["Episodes", "Problem", "Trials", "build_scenes", "build_simulator", "fits", "make_targets"]
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,15 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
     kinds = _kinds(cfgs)
     scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
     return [scenes[kind] for kind in kinds]
+
+
+def fits(cfg: Config) -> bool:
+    """Whether the grid's domain, which is smaller where nodes are far apart, holds a scene and its target."""
+    try:
+        check_target(build_scene(cfg), cfg.task.target)
+    except (SceneError, TargetError):
+        return False
+    return True
 
 
 def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:

@@ -18,13 +18,12 @@ from scipy import stats
 from plab.cli.arguments import Parser, positive, sources_and_words, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import report
-from plab.config import Config, build_scene, drawn_configs, load_config
+from plab.config import Config, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
 from plab.errors import ArgumentError
+from plab.problem import fits
 from plab.results import read
 from plab.runners.policy import Policy, load_policy
-from plab.scene import SceneError
-from plab.targets import TargetError, check_target
 
 __all__ = ["FIRST", "main", "rows", "scores_of"]
 
@@ -67,7 +66,7 @@ def rows(
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
         seen = [f"{key}={config[key]}" for key in ("observe_particles", "observe_target")]
         cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
-        drawn = [one for one in drawn_configs(cfg, range(FIRST, FIRST + count)) if _fits(one)]
+        drawn = [one for one in drawn_configs(cfg, range(FIRST, FIRST + count)) if fits(one)]
         if len(drawn) < 2:
             raise ArgumentError(
                 f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"
@@ -80,15 +79,6 @@ def rows(
         trained_on = f"{known} drawn scenes" if known else f"variant {config['variant']}"
         named = (path, config["task"]["name"], trained_on, len(drawn))
         yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
-
-
-def _fits(cfg: Config) -> bool:
-    """Whether a scene and its target can be built."""
-    try:
-        check_target(build_scene(cfg), cfg.task.target)
-    except (SceneError, TargetError):
-        return False
-    return True
 
 
 @command_line

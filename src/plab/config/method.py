@@ -228,6 +228,7 @@ class PodsConfig(ActorConfig):
     """Policy optimization via differentiable simulation.
 
     Attributes:
+        num_envs: Scenes of a round, at most; more are taken in turn, round by round.
         updates: Updates of the actions by their gradient in a round.
         action_lr: Learning rate of these, in units of an action.
         epochs: Passes of the policy over a round's actions.
@@ -236,6 +237,7 @@ class PodsConfig(ActorConfig):
         shift: All that is observed of them is moved together, along x and along z, by so much at most.
     """
 
+    num_envs: int = field(metadata=ranges.COUNT)
     updates: int = field(metadata=ranges.COUNT)
     action_lr: float = field(metadata=ranges.POSITIVE)
     epochs: int = field(metadata=ranges.COUNT)

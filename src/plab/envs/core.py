@@ -20,7 +20,7 @@ from plab.config import Config, load_config
 from plab.config.words import word_list
 from plab.errors import ArgumentError
 from plab.objective import TARGET_ENTRIES, target_observation
-from plab.problem import Problem
+from plab.problem import Problem, build_scenes
 from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
@@ -191,22 +191,50 @@ class EpisodeBatch:
         """
         if contact not in CONTACT_MODELS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
-        self._problem: Problem | None = Problem(cfgs)
-        for key in ("observe_particles", "observe_target"):
-            if len({getattr(cfg, key) for cfg in cfgs}) > 1:
-                raise ArgumentError(f"{key} differs between sub-environments: they share one space")
-        self.configs, self.contact = tuple(cfgs), contact
-        self.size = len(cfgs)
-        self.horizon = cfgs[0].sim.horizon
-        scenes, seen = self.problem.scenes, cfgs[0].observe_target
+        self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
+        self._renderers: list[Renderer] = []
+        _require_alike(cfgs)
+        self._take(cfgs, Problem(cfgs))
+        scenes = self.problem.scenes
         self._stride = _stride(scenes[0], cfgs[0].observe_particles)
         self._pose_entries = _pose_entries(scenes[0])
-        self._target = Constants(_target_observations(self.problem) if seen else np.empty((self.size, 0)))
         self.observation_space, self.action_space = spaces(cfgs[0], scenes)
-        self._renderers: list[Renderer] = []
+        self._begin()
+
+    def renew(self, cfgs: Sequence[Config]) -> None:
+        """Let the sub-environments be others of the same kind; the episodes start at :meth:`reset`.
+
+        Nothing is compiled anew.
+
+        Args:
+            cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
+
+        Raises:
+            ValueError: If they are not as many, or observations would hold other things.
+            plab.config.ConfigError: If the configurations do not fit together.
+            plab.scene.SceneError: If a scene cannot be simulated or is of another kind.
+            plab.targets.TargetError: If a target cannot be built.
+        """
+        if len(cfgs) != self.size:
+            raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
+        _require_alike([self.configs[0], *cfgs])
+        simulator = self._simulator
+        simulator.set_scenes(build_scenes(cfgs))
+        self._take(cfgs, Problem(cfgs, simulator))
+        self._begin()
+
+    def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
+        """Be made of configurations, one per sub-environment."""
+        self._problem: Problem | None = problem
+        self.configs = tuple(cfgs)
+        seen = cfgs[0].observe_target
+        self._target = Constants(_target_observations(problem) if seen else np.empty((self.size, 0)))
+        problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
+
+    def _begin(self) -> None:
+        """Look at the initial states; no episode has started."""
         self._step: int | None = None
         self._failures: dict[int, str] = {}
-        self._simulator.set_contact(contact, softness=[cfg.method.softness for cfg in cfgs])
         # Where environments rest that break off: observations, loss terms and IoU.
         self._initial = self._last = self._seen()
         self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
@@ -423,6 +451,13 @@ class EpisodeBatch:
             "score": score,
             "score_printed": printed,
         }
+
+
+def _require_alike(cfgs: Sequence[Config]) -> None:
+    """See that observations hold the same things."""
+    for key in ("observe_particles", "observe_target"):
+        if len({getattr(cfg, key) for cfg in cfgs}) > 1:
+            raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 
 
 def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:

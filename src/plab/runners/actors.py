@@ -16,6 +16,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from plab.config import ActorConfig, Config, ConfigError, PolicyConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
+from plab.problem import fits
 from plab.runners.environments import PolicyRunner, policy_episode, shared_batches
 from plab.runners.jobs import RunError
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
@@ -32,6 +33,7 @@ __all__ = [
     "ActorTraining",
     "actor_network",
     "set_rate",
+    "training_scenes",
 ]
 
 DEVIATION_MIN = 0.01
@@ -116,9 +118,11 @@ class ActorTraining(ABC):
     actor: ClassVar[ActorKind]
     round_episodes = 1, 1
 
-    def __init__(self, method: Any, batch: EpisodeBatch, seed: int) -> None:
-        """Begin; the seed is that of the initial weights and of what is drawn later."""
-        self._method, self._batch = method, batch
+    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
+        """Begin; the configuration's seed is that of the initial weights and of what is drawn later."""
+        method: Any = cfg.method
+        seed = cfg.seed
+        self._cfg, self._method, self._batch = cfg, method, batch
         self._device = torch.device(method.torch_device)
         self._spaces = Spaces(batch.observation_space, batch.action_space)
         self.policy: Any = self.actor.policy(method, self._spaces, seed).to(self._device)
@@ -201,7 +205,7 @@ class ActorRunner(PolicyRunner):
     """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy.
 
     Attributes:
-        training: What learns, from the section ``method``, the environments and a seed.
+        training: What learns, from the configuration and the environments.
         columns: What rows hold of it.
     """
 
@@ -222,13 +226,13 @@ class ActorRunner(PolicyRunner):
                 f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
             )
         count = self.environments(method)
-        kinds = (_scenes(cfg, method, count), count, method.contact), ([cfg], 1, "hard")
+        kinds = (training_scenes(cfg, method, count), count, method.contact), ([cfg], 1, "hard")
         self._training_batch, self._evaluation = shared_batches(self.cache, *kinds)
         self.problem = self._evaluation.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the networks, or take those of the file."""
-        self._training = self.training(self.method, self._training_batch, track.cfg.seed)
+        self._training = self.training(track.cfg, self._training_batch)
         if state is not None:
             self._training.restore(state)
 
@@ -281,8 +285,13 @@ class ActorRunner(PolicyRunner):
         save_policy(track.job.run.path, self.method, self._training.policy, self._training.moments())
 
 
-def _scenes(cfg: Config, method: ActorConfig, count: int) -> Sequence[Config]:
-    """Return what a training's environments, so many, are made of, in turn."""
+def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> Sequence[Config]:
+    """Return what a training's environments, so many, are made of in a turn, one after the other: the drawn
+    scenes that follow those of the turn before and fit into the grid, or the run's own."""
     if not method.scenes:
         return [cfg]
-    return drawn_configs(cfg, range(FIRST_SCENE, FIRST_SCENE + min(method.scenes, count)))
+    some = min(method.scenes, count)
+    seeds = [FIRST_SCENE + (turn * some + k) % method.scenes for k in range(some)]
+    if drawn := [one for one in drawn_configs(cfg, seeds) if fits(one)]:
+        return drawn
+    raise ConfigError(f"none of the scenes {seeds[0]} to {seeds[-1]} fits into a grid of {cfg.sim.grid_size}")

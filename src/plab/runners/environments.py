@@ -122,6 +122,10 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
 
     def start_again(batches: list[EpisodeBatch]) -> None:
         for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
+            wanted = [cfgs[k % len(cfgs)] for k in range(batch.size)]
+            # A run may have gone on to other scenes.
+            if list(map(environment_key, batch.configs)) != list(map(environment_key, wanted)):
+                batch.renew(wanted)
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
 

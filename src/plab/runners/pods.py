@@ -18,9 +18,9 @@ from collections.abc import Mapping
 
 import torch
 
-from plab.config import PodsConfig
+from plab.config import Config, PodsConfig
 from plab.envs.core import EpisodeBatch
-from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate
+from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate, training_scenes
 
 __all__ = ["PODS", "PodsRunner", "PodsTraining"]
 
@@ -34,16 +34,21 @@ class PodsTraining(ActorTraining):
 
     actor = PODS
 
-    def __init__(self, method: PodsConfig, batch: EpisodeBatch, seed: int) -> None:
+    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
+        updates = cfg.method_as(PodsConfig).updates
         # The policy's own, those with gradient, and those of what they led to.
-        self.round_episodes = method.updates + 2, method.updates
-        super().__init__(method, batch, seed)
+        self.round_episodes = updates + 2, updates
+        super().__init__(cfg, batch)
         self._level = torch.as_tensor(batch.level_entries, device=self._device)
 
     def train(self) -> None:
         """Run a round: act, improve the actions, and imitate them."""
         method, left, self._failed = self._method, self._rate_left(), set[int]()
+        if method.scenes > self._batch.size:
+            turn = self.episodes // (self.round_episodes[0] * self._batch.size)
+            scenes = training_scenes(self._cfg, method, self._batch.size, turn)
+            self._batch.renew([scenes[k % len(scenes)] for k in range(self._batch.size)])
         self._hold_moments()
         before, actions = self._episode(None, "train")
         improved = self._improved(actions, method.action_lr * left)
@@ -129,4 +134,4 @@ class PodsRunner(ActorRunner):
 
     def environments(self, method: PodsConfig) -> int:
         """Return how many environments are trained in together, one for each scene."""
-        return max(1, method.scenes)
+        return min(max(1, method.scenes), method.num_envs)

@@ -17,7 +17,7 @@ import math
 import torch
 
 from plab.autograd import Stretch, policy_gradient
-from plab.config import ShacConfig
+from plab.config import Config, ShacConfig
 from plab.envs.core import EpisodeBatch
 from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, actor_network, set_rate
 from plab.runners.rl_models import Spaces
@@ -53,11 +53,12 @@ class ShacTraining(ActorTraining):
 
     actor = SHAC
 
-    def __init__(self, method: ShacConfig, batch: EpisodeBatch, seed: int) -> None:
+    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
-        super().__init__(method, batch, seed)
+        super().__init__(cfg, batch)
+        method = cfg.method_as(ShacConfig)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed + 1)
+            torch.manual_seed(cfg.seed + 1)
             self._value = actor_network(self._spaces, 1, method.hidden).to(self._device)
         self._target = copy.deepcopy(self._value).requires_grad_(False)
         self._value_optimizer = torch.optim.Adam(self._value.parameters(), lr=method.value_lr)
