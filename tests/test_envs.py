@@ -25,6 +25,7 @@ import plab.envs.core as core
 import plab.sim.runtime as runtime
 from plab.config import Config, ConfigError, choices, conf_folder, load_config
 from plab.config.suite import suite_tasks
+from plab.envs.observations import spaces
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
 from plab.objective import OBSERVED_PARTICLES, observation, target_observation, total_loss
@@ -310,7 +311,7 @@ def test_observations_may_tell_the_target() -> None:
     env = gymnasium.make_vec(
         "plab/Move-v1", num_envs=2, overrides=words, overrides_per_env=[[], ["variant=2"]]
     )
-    plain = core.spaces(load_config(), env.batch.problem.scenes)[0]
+    plain = spaces(load_config(), env.batch.problem.scenes)[0]
     problem, (first, _) = env.batch.problem, env.reset()
     seen = [target_observation(problem.initial_mass[k], problem.target_mass[k]) for k in range(2)]
     assert not np.allclose(seen[0], seen[1], atol=0.01)

@@ -13,15 +13,19 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
 from plab.config.words import word_list
+from plab.envs.observations import (
+    observed_count,
+    pose_entries,
+    spaces,
+    stride_of,
+    target_observations,
+)
 from plab.errors import ArgumentError
-from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem, build_scenes
-from plab.scene import Scene
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
@@ -38,7 +42,6 @@ __all__ = [
     "check_render_mode",
     "compose_configs",
     "refuse_options",
-    "spaces",
 ]
 
 MOST_ENVS = 100_000
@@ -196,8 +199,8 @@ class EpisodeBatch:
         _require_alike(cfgs)
         self._take(cfgs, Problem(cfgs))
         scenes = self.problem.scenes
-        self._stride = _stride(scenes[0], cfgs[0].observe_particles)
-        self._pose_entries = _pose_entries(scenes[0])
+        self._stride = stride_of(scenes[0], cfgs[0].observe_particles)
+        self._pose_entries = pose_entries(scenes[0])
         self.observation_space, self.action_space = spaces(cfgs[0], scenes)
         self._begin()
 
@@ -228,7 +231,7 @@ class EpisodeBatch:
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
         seen = cfgs[0].observe_target
-        self._target = Constants(_target_observations(problem) if seen else np.empty((self.size, 0)))
+        self._target = Constants(target_observations(problem) if seen else np.empty((self.size, 0)))
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
@@ -238,23 +241,6 @@ class EpisodeBatch:
         # Where environments rest that break off: observations, loss terms and IoU.
         self._initial = self._last = self._seen()
         self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
-
-    @property
-    def level_entries(self) -> np.ndarray:
-        """Entries of an observation that are positions along x and along z, shape [2, position]: those of the
-        observed particles, the manipulators and, if it is seen, the target."""
-        particles = 6 * _observed(self.problem.scenes[0], self.configs[0].observe_particles)
-        numbers = np.flatnonzero(self._pose_entries % 8 < 3)
-        # What has to leave, then what has to arrive: a share, a centroid and deviations.
-        centroids = [1, 8] if self.configs[0].observe_target else []
-        first = np.concatenate(
-            [
-                np.arange(0, particles, 6),
-                particles + numbers[self._pose_entries[numbers] % 8 == 0],
-                particles + len(self._pose_entries) + np.array(centroids, int),
-            ]
-        )
-        return np.stack([first, first + 2])
 
     @property
     def problem(self) -> Problem:
@@ -364,7 +350,7 @@ class EpisodeBatch:
         """
         now = self._now(steps)
         entries = self._pose_entries
-        observed = _observed(self.problem.scenes[0], self.configs[0].observe_particles)
+        observed = observed_count(self.problem.scenes[0], self.configs[0].observe_particles)
         shape = self.size, len(self.problem.scenes[0].manipulators), 8
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
@@ -470,61 +456,3 @@ def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
 
 def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:
     return tuple(table.clone() if on_device(table) else table.copy() for table in tables)
-
-
-def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return which of the manipulators' 8 numbers each are observed: the gap only of chopsticks."""
-    observed = np.ones((len(scene.manipulators), 8), bool)
-    observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
-    return np.flatnonzero(observed)
-
-
-def _stride(scene: Scene, least: int) -> int:
-    """Return the distance of the observed particles' numbers, of so many at least."""
-    return max(scene.particle_count // least, 1)
-
-
-def _observed(scene: Scene, least: int) -> int:
-    return len(range(0, scene.particle_count, _stride(scene, least)))
-
-
-def _target_observations(problem: Problem) -> np.ndarray:
-    """Return what is seen of each environment's target, shape [batch, 14]."""
-    found: dict[bytes, np.ndarray] = {}
-    rows = []
-    for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
-        # A batch may have each target many times.
-        key = b"".join(mass.tobytes() for mass in masses)
-        if key not in found:
-            found[key] = target_observation(*masses)
-        rows.append(found[key])
-    return np.array(rows)
-
-
-def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
-    """Return the spaces that hold the observations, of which a configuration says what they hold, and the
-    actions of all scenes."""
-    observed = _observed(scenes[0], cfg.observe_particles)
-    # A particle that crosses the domain in one substep is a fault that ends the simulation.
-    speed = 1.0 / scenes[0].dt
-    low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
-    bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
-    # Shares, centroids and deviations are within the unit cube.
-    seen = TARGET_ENTRIES if cfg.observe_target else 0
-    observation = Box(
-        np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
-        np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),
-        dtype=np.float32,
-    )
-    return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
-
-
-def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
-    """Return the lowest and the highest poses of the manipulators, 8 numbers each."""
-    low, high = [], []
-    for m in scene.manipulators:
-        widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.shape == "Chopsticks" else m.gap
-        low += [*m.lower_bound, *[-1.0] * 4, min(m.gap, m.minimal_gap)]
-        # Opened all the way step by step, the gap is off by some rounding.
-        high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]
-    return low, high

@@ -20,6 +20,7 @@ import torch
 
 from plab.config import Config, PodsConfig
 from plab.envs.core import EpisodeBatch
+from plab.envs.observations import level_entries
 from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate, training_scenes
 
 __all__ = ["PODS", "PodsRunner", "PodsTraining"]
@@ -40,7 +41,7 @@ class PodsTraining(ActorTraining):
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
         super().__init__(cfg, batch)
-        self._level = torch.as_tensor(batch.level_entries, device=self._device)
+        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
 
     def train(self) -> None:
         """Run a round: act, improve the actions, and imitate them."""

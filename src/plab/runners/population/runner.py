@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from plab.config import OffPolicyConfig, RlConfig
-from plab.envs.core import spaces
+from plab.envs.observations import spaces
 from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError

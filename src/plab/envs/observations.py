@@ -1,0 +1,88 @@
+"""What an environment is seen by: the entries of an observation, and the spaces that hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from plab.config import Config
+from plab.objective import TARGET_ENTRIES, target_observation
+from plab.problem import Problem
+from plab.scene import Scene
+
+__all__ = ["level_entries", "observed_count", "pose_entries", "spaces", "stride_of", "target_observations"]
+
+
+def pose_entries(scene: Scene) -> np.ndarray:
+    """Return which of the manipulators' 8 numbers each are observed: the gap only of chopsticks."""
+    observed = np.ones((len(scene.manipulators), 8), bool)
+    observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
+    return np.flatnonzero(observed)
+
+
+def stride_of(scene: Scene, least: int) -> int:
+    """Return the distance of the observed particles' numbers, of so many at least."""
+    return max(scene.particle_count // least, 1)
+
+
+def observed_count(scene: Scene, least: int) -> int:
+    """Return how many particles are observed, of so many at least."""
+    return len(range(0, scene.particle_count, stride_of(scene, least)))
+
+
+def target_observations(problem: Problem) -> np.ndarray:
+    """Return what is seen of each environment's target, shape [batch, 14]."""
+    found: dict[bytes, np.ndarray] = {}
+    rows = []
+    for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
+        # A batch may have each target many times.
+        key = b"".join(mass.tobytes() for mass in masses)
+        if key not in found:
+            found[key] = target_observation(*masses)
+        rows.append(found[key])
+    return np.array(rows)
+
+
+def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
+    """Return the spaces that hold the observations, of which a configuration says what they hold, and the
+    actions of all scenes."""
+    observed = observed_count(scenes[0], cfg.observe_particles)
+    # A particle that crosses the domain in one substep is a fault that ends the simulation.
+    speed = 1.0 / scenes[0].dt
+    low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
+    bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, pose_entries(scenes[0])]
+    # Shares, centroids and deviations are within the unit cube.
+    seen = TARGET_ENTRIES if cfg.observe_target else 0
+    observation = Box(
+        np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
+        np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),
+        dtype=np.float32,
+    )
+    return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
+
+
+def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
+    """Return the lowest and the highest poses of the manipulators, 8 numbers each."""
+    low, high = [], []
+    for m in scene.manipulators:
+        widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.shape == "Chopsticks" else m.gap
+        low += [*m.lower_bound, *[-1.0] * 4, min(m.gap, m.minimal_gap)]
+        # Opened all the way step by step, the gap is off by some rounding.
+        high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]
+    return low, high
+
+
+def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
+    """Return which entries of an observation are positions along x and along z, shape [2, position]: those of
+    the observed particles, of the manipulators and, if it is seen, of the target."""
+    particles, poses = 6 * observed_count(scene, cfg.observe_particles), pose_entries(scene)
+    # What has to leave, then what has to arrive: a share, a centroid and deviations.
+    centroids = [1, 8] if cfg.observe_target else []
+    along_x = [
+        *range(0, particles, 6),
+        *(particles + np.flatnonzero(poses % 8 == 0)),
+        *(particles + len(poses) + entry for entry in centroids),
+    ]
+    return np.stack([along_x, np.add(along_x, 2)])
