@@ -231,7 +231,7 @@ class PodsConfig(ActorConfig):
         num_envs: Scenes of a round, at most; more are taken in turn, round by round.
         updates: Updates of the actions by their gradient in a round.
         action_lr: Learning rate of these, in units of an action.
-        epochs: Passes of the policy over a round's actions.
+        epochs: How often, after a round, the policy sees as many actions as the round has.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
         shift: All that is observed of them is moved together, along x and along z, by so much at most.

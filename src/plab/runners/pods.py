@@ -14,8 +14,11 @@ scenes alike is that all of them begin as the policy's. To reproduce a result:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
+import numpy as np
 import torch
 
 from plab.config import Config, PodsConfig
@@ -41,12 +44,14 @@ class PodsTraining(ActorTraining):
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
         super().__init__(cfg, batch)
+        self._turns = max(1, math.ceil(self._method.scenes / batch.size))
+        self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
         self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
 
     def train(self) -> None:
         """Run a round: act, improve the actions, and imitate them."""
         method, left, self._failed = self._method, self._rate_left(), set[int]()
-        if method.scenes > self._batch.size:
+        if self._turns > 1:
             turn = self.episodes // (self.round_episodes[0] * self._batch.size)
             scenes = training_scenes(self._cfg, method, self._batch.size, turn)
             self._batch.renew([scenes[k % len(scenes)] for k in range(self._batch.size)])
@@ -61,7 +66,11 @@ class PodsTraining(ActorTraining):
             self.statistics.update(seen.double().cpu().numpy())
             self._hold_moments()
             set_rate(self._optimizer, method.lr * left)
-            self._imitate(self._scaled(seen), wanted)
+            # Of each scene the last time that it was its turn.
+            self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]
+            every, given = map(torch.cat, zip(*self._rounds, strict=True))
+            count = math.ceil(method.epochs * len(seen) / method.batch_size)
+            self._imitate(self._scaled(every), given, count)
         self.episodes += self.round_episodes[0] * self._batch.size
 
     def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,24 +115,36 @@ class PodsTraining(ActorTraining):
         self._failed |= set(failures)
         self.broken += failures.values()
 
-    def _imitate(self, seen: torch.Tensor, wanted: torch.Tensor) -> None:
-        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry]."""
-        method = self._method
-        for _ in range(method.epochs):
-            order = torch.randperm(len(seen), generator=self._generator, device=self._device)
-            for rows in order.split(method.batch_size):
-                self._optimizer.zero_grad()
-                noise = torch.randn(
-                    seen[rows].shape, generator=self._generator, device=self._device, dtype=seen.dtype
-                )
-                moved = seen[rows] + method.observation_noise * noise
-                if method.shift > 0.0:
-                    shift = torch.rand((2, len(rows), 1), generator=self._generator, device=self._device)
-                    for entries, along in zip(self._level, shift, strict=True):
-                        moved[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
-                acted = self.policy(moved)
-                torch.nn.functional.mse_loss(acted, wanted[rows]).backward()
-                self._optimizer.step()
+    def _imitate(self, seen: torch.Tensor, wanted: torch.Tensor, count: int) -> None:
+        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry].
+
+        It does so by ``count`` minibatches.
+        """
+        method, drawn = self._method, dict[str, Any](generator=self._generator, device=self._device)
+        minibatches: list[torch.Tensor] = []
+        for _ in range(count):
+            minibatches = minibatches or list(torch.randperm(len(seen), **drawn).split(method.batch_size))
+            rows = minibatches.pop()
+            moved = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
+            if method.shift > 0.0:
+                for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
+                    moved[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
+            self._optimizer.zero_grad()
+            torch.nn.functional.mse_loss(self.policy(moved), wanted[rows]).backward()
+            self._optimizer.step()
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next episodes depend on, as arrays and numbers."""
+        kept = {str(k): (seen.cpu(), wanted.cpu()) for k, (seen, wanted) in enumerate(self._rounds)}
+        rounds = {k: {"seen": seen.numpy(), "wanted": wanted.numpy()} for k, (seen, wanted) in kept.items()}
+        return super().state() | {"rounds": rounds}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`; ValueError if it is that of other networks."""
+        super().restore(state)
+        kept = [state["rounds"][str(k)] for k in range(len(state["rounds"]))]
+        parts = [[torch.from_numpy(np.array(one[name])) for name in ("seen", "wanted")] for one in kept]
+        self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in parts]
 
 
 class PodsRunner(ActorRunner):
