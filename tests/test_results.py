@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 
 from plab import results
+from plab.config.selection import OBSERVED
 from plab.results import (
     ResultsError,
     RunBusyError,
@@ -50,6 +51,7 @@ def make_config(folder: Path, **changes) -> dict:
         "seed_particles": 0,
         "observe_particles": 200,
         "observe_target": False,
+        "observe_relative": False,
         "results_dir": str(folder),
         "force": False,
         "progress": False,
@@ -70,6 +72,7 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
         "seed_particles": (0, 3),
         "observe_particles": (200, 5),
         "observe_target": (False, True),
+        "observe_relative": (False, True),
     }
     for key, (usual, other) in usual_and_other.items():
         assert config_hash(config | {key: other}) != config_hash(config | {key: usual}) == hash_
@@ -99,7 +102,7 @@ def test_hash_of_runs_on_files_of_targets_knows_no_recipe(tmp_path: Path) -> Non
     assert config_hash(config | {"task": moon, "targets": {"source": "files"}}) != hashes[0]
 
 
-_SINCE = ("protocol", "seed_particles", "observe_particles", "observe_target")
+_SINCE = ("protocol", "seed_particles", *OBSERVED)
 
 
 def test_runs_from_before_a_key_have_what_was_then(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from plab.cli.arguments import Parser, positive, sources_and_words, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import report
 from plab.config import Config, drawn_configs, load_config
+from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
 from plab.errors import ArgumentError
 from plab.problem import fits
@@ -64,7 +65,7 @@ def rows(
     for path in paths:
         policy, config = load_policy(path), read(Path(path)).config
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
-        seen = [f"{key}={config[key]}" for key in ("observe_particles", "observe_target")]
+        seen = [f"{key}={config[key]}" for key in OBSERVED]
         cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
         drawn = [one for one in drawn_configs(cfg, range(FIRST, FIRST + count)) if fits(one)]
         if len(drawn) < 2:

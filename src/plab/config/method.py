@@ -234,7 +234,6 @@ class PodsConfig(ActorConfig):
         epochs: How often, after a round, the policy sees as many actions as the round has.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
-        shift: All that is observed of them is moved together, along x and along z, by so much at most.
     """
 
     num_envs: int = field(metadata=ranges.COUNT)
@@ -243,7 +242,6 @@ class PodsConfig(ActorConfig):
     epochs: int = field(metadata=ranges.COUNT)
     batch_size: int = field(metadata=ranges.COUNT)
     observation_noise: float = field(metadata=ranges.FINITE)
-    shift: float = field(metadata=ranges.FINITE)
 
 
 @dataclass

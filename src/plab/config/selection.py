@@ -17,7 +17,10 @@ from plab.errors import ConfigError, PlabError
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
 
-__all__ = ["Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
+__all__ = ["OBSERVED", "Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
+
+OBSERVED = ("observe_particles", "observe_target", "observe_relative")
+"""Keys of a configuration that say which numbers an observation holds."""
 
 
 class SelectionError(PlabError, ValueError):

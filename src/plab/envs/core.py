@@ -16,14 +16,9 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
+from plab.config.selection import OBSERVED
 from plab.config.words import word_list
-from plab.envs.observations import (
-    observed_count,
-    pose_entries,
-    spaces,
-    stride_of,
-    target_observations,
-)
+from plab.envs.observations import Observer, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
@@ -198,10 +193,7 @@ class EpisodeBatch:
         self._renderers: list[Renderer] = []
         _require_alike(cfgs)
         self._take(cfgs, Problem(cfgs))
-        scenes = self.problem.scenes
-        self._stride = stride_of(scenes[0], cfgs[0].observe_particles)
-        self._pose_entries = pose_entries(scenes[0])
-        self.observation_space, self.action_space = spaces(cfgs[0], scenes)
+        self.observation_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
         self._begin()
 
     def renew(self, cfgs: Sequence[Config]) -> None:
@@ -230,8 +222,7 @@ class EpisodeBatch:
         """Be made of configurations, one per sub-environment."""
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
-        seen = cfgs[0].observe_target
-        self._target = Constants(target_observations(problem) if seen else np.empty((self.size, 0)))
+        self._observer = Observer(problem, cfgs[0])
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
@@ -349,29 +340,18 @@ class EpisodeBatch:
             MemoryError: If the gradient does not fit the memory budget.
         """
         now = self._now(steps)
-        entries = self._pose_entries
-        observed = observed_count(self.problem.scenes[0], self.configs[0].observe_particles)
-        shape = self.size, len(self.problem.scenes[0].manipulators), 8
 
         def chosen(t: int, particles: Array, poses: Array) -> Array:
-            return choose(t, self._joined(particles, poses))
+            return choose(t, self._observer(particles, poses))
 
         def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
             bar = react(t, actions_bar)
             if bar is None:
                 return None
-            # What comes behind the poses is constant.
-            moved, posed = bar[:, : 6 * observed], bar[:, 6 * observed : 6 * observed + len(entries)]
-            whole = (
-                bar.new_zeros(self.size, shape[1] * 8)
-                if on_device(bar)
-                else np.zeros((self.size, shape[1] * 8))
-            )
-            whole[:, entries] = posed
-            return moved.reshape(self.size, observed, 6), whole.reshape(shape)
+            return self._observer.pull_back(bar)
 
         terms = self._simulator.closed_loop(
-            steps, chosen, reaction, stride=self._stride, discount=discount, like=like
+            steps, chosen, reaction, stride=self._observer.stride, discount=discount, like=like
         )
         self._step = now + steps
         return terms
@@ -407,21 +387,9 @@ class EpisodeBatch:
         self._problem = None
 
     def _observe(self, like: Array = None) -> Array:
-        seen = self._simulator.observe(self._stride, like), self._simulator.poses(like)
-        joined = self._joined(*seen, np.float32)
+        seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
+        joined = self._observer(*seen, np.float32)
         return joined.float() if on_device(joined) else joined
-
-    def _joined(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
-        """Observations, shape [batch, entry], of particles, shape [batch, observed, 6], all poses, shape
-        [batch, manipulator, 8], and the target if it is seen; ``dtype`` is that of an array."""
-        rows = [particles.reshape(self.size, -1), poses.reshape(self.size, -1)[:, self._pose_entries]]
-        rows.append(self._target.like(rows[0]))
-        if on_device(particles):
-            # Whoever gave a tensor has imported torch.
-            import torch
-
-            return torch.cat(rows, dim=1)
-        return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
 
     def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
         """Return what the current states are seen by: observations, loss terms and IoU."""
@@ -441,7 +409,7 @@ class EpisodeBatch:
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
     """See that observations hold the same things."""
-    for key in ("observe_particles", "observe_target"):
+    for key in OBSERVED:
         if len({getattr(cfg, key) for cfg in cfgs}) > 1:
             raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 

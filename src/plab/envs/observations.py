@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -11,28 +12,102 @@ from plab.config import Config
 from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
 from plab.scene import Scene
+from plab.sim.tensors import Constants, on_device
 
-__all__ = ["level_entries", "observed_count", "pose_entries", "spaces", "stride_of", "target_observations"]
+__all__ = ["Observer", "spaces"]
+
+Array: TypeAlias = Any
+"""A NumPy array, or a CUDA tensor where the caller gave one."""
 
 
-def pose_entries(scene: Scene) -> np.ndarray:
+class Observer:
+    """What the environments of a batch are seen by.
+
+    Attributes:
+        stride: Distance of the observed particles' numbers.
+    """
+
+    def __init__(self, problem: Problem, cfg: Config) -> None:
+        """Take over which entries a configuration asks for, and what is constant."""
+        scene = problem.scenes[0]
+        self.stride = _stride(scene, cfg.observe_particles)
+        self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
+        self._numbers = len(scene.manipulators) * 8
+        size = len(problem.scenes)
+        self._target = Constants(_target_observations(problem) if cfg.observe_target else np.empty((size, 0)))
+        self._positions = _position_entries(scene, cfg) if cfg.observe_relative else None
+
+    def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
+        """Return observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses,
+        shape [batch, manipulator, 8]; ``dtype`` is that of an array."""
+        size = len(particles)
+        rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
+        rows.append(self._target.like(rows[0]))
+        if self._positions is None:
+            return _joined(rows, dtype)
+        table = _joined([*rows, rows[0][:, :3]], dtype)
+        for axis, entries in enumerate(self._positions):
+            middle = table[:, entries[: self._count]].mean(1)
+            table[:, entries] -= middle[:, None]
+            table[:, axis - 3] = middle
+        return table
+
+    def pull_back(self, bar: Array) -> tuple[Array, Array]:
+        """Return the derivatives by particles, shape [batch, observed, 6], and poses, shape [batch,
+        manipulator, 8], from those by observations, shape [batch, entry]."""
+        size, particles = len(bar), 6 * self._count
+        if self._positions is not None:
+            bar = bar.clone() if on_device(bar) else bar.copy()
+            for axis, entries in enumerate(self._positions):
+                share = (bar[:, axis - 3] - bar[:, entries].sum(1)) / self._count
+                bar[:, entries[: self._count]] += share[:, None]
+        whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
+        # What comes behind the poses is constant.
+        whole[:, self._poses] = bar[:, particles : particles + len(self._poses)]
+        return bar[:, :particles].reshape(size, self._count, 6), whole.reshape(size, -1, 8)
+
+
+def _joined(rows: Sequence[Array], dtype: type) -> Array:
+    if on_device(rows[0]):
+        # Whoever gave a tensor has imported torch.
+        import torch
+
+        return torch.cat(list(rows), dim=1)
+    return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
+
+
+def _position_entries(scene: Scene, cfg: Config) -> list[list[int]]:
+    """Return which entries of an observation are positions along each axis: first those of the observed
+    particles, then those of the manipulators and, if it is seen, of the target."""
+    particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
+    # What has to leave, then what has to arrive: a share, a centroid and deviations.
+    centroids = [1, 8] if cfg.observe_target else []
+    along_x = [
+        *range(0, particles, 6),
+        *(particles + int(at) for at in np.flatnonzero(poses % 8 == 0)),
+        *(particles + len(poses) + entry for entry in centroids),
+    ]
+    return [[entry + axis for entry in along_x] for axis in range(3)]
+
+
+def _pose_entries(scene: Scene) -> np.ndarray:
     """Return which of the manipulators' 8 numbers each are observed: the gap only of chopsticks."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
     return np.flatnonzero(observed)
 
 
-def stride_of(scene: Scene, least: int) -> int:
+def _stride(scene: Scene, least: int) -> int:
     """Return the distance of the observed particles' numbers, of so many at least."""
     return max(scene.particle_count // least, 1)
 
 
-def observed_count(scene: Scene, least: int) -> int:
+def _count(scene: Scene, least: int) -> int:
     """Return how many particles are observed, of so many at least."""
-    return len(range(0, scene.particle_count, stride_of(scene, least)))
+    return len(range(0, scene.particle_count, _stride(scene, least)))
 
 
-def target_observations(problem: Problem) -> np.ndarray:
+def _target_observations(problem: Problem) -> np.ndarray:
     """Return what is seen of each environment's target, shape [batch, 14]."""
     found: dict[bytes, np.ndarray] = {}
     rows = []
@@ -48,18 +123,21 @@ def target_observations(problem: Problem) -> np.ndarray:
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
     """Return the spaces that hold the observations, of which a configuration says what they hold, and the
     actions of all scenes."""
-    observed = observed_count(scenes[0], cfg.observe_particles)
+    observed = _count(scenes[0], cfg.observe_particles)
     # A particle that crosses the domain in one substep is a fault that ends the simulation.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
-    bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, pose_entries(scenes[0])]
+    bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
     # Shares, centroids and deviations are within the unit cube.
     seen = TARGET_ENTRIES if cfg.observe_target else 0
-    observation = Box(
-        np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)]).astype(np.float32),
-        np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)]).astype(np.float32),
-        dtype=np.float32,
-    )
+    least = np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)])
+    most = np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)])
+    if cfg.observe_relative:
+        for entries in _position_entries(scenes[0], cfg):
+            # Less a position in the unit cube.
+            least[entries] -= 1.0
+        least, most = np.append(least, np.zeros(3)), np.append(most, np.ones(3))
+    observation = Box(least.astype(np.float32), most.astype(np.float32), dtype=np.float32)
     return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
 
 
@@ -72,17 +150,3 @@ def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
         # Opened all the way step by step, the gap is off by some rounding.
         high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]
     return low, high
-
-
-def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
-    """Return which entries of an observation are positions along x and along z, shape [2, position]: those of
-    the observed particles, of the manipulators and, if it is seen, of the target."""
-    particles, poses = 6 * observed_count(scene, cfg.observe_particles), pose_entries(scene)
-    # What has to leave, then what has to arrive: a share, a centroid and deviations.
-    centroids = [1, 8] if cfg.observe_target else []
-    along_x = [
-        *range(0, particles, 6),
-        *(particles + np.flatnonzero(poses % 8 == 0)),
-        *(particles + len(poses) + entry for entry in centroids),
-    ]
-    return np.stack([along_x, np.add(along_x, 2)])

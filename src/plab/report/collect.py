@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import Selection, one_protocol, require_possible
+from plab.config.selection import OBSERVED, Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import PlabError
 from plab.locks import held
@@ -39,7 +39,7 @@ NAMES = ("task", "variant", "method", "seed")
 KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that the table of runs has as columns."""
 
-_SINGLE = ("seed_particles", "observe_particles", "observe_target")
+_SINGLE = ("seed_particles", *OBSERVED)
 """What is in no section of a configuration and matters to a mean."""
 
 _HARMLESS = (

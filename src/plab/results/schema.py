@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.bodies import MATERIAL_KEYS
-from plab.config.selection import lookup
+from plab.config.selection import OBSERVED, lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
 
@@ -87,6 +87,7 @@ BEFORE: dict[str, Any] = {
     "seed_particles": 0,
     "observe_particles": 200,
     "observe_target": False,
+    "observe_relative": False,
 }
 """What the configurations of runs would say that are older than these choices."""
 
@@ -104,6 +105,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "seed_particles": int,
     "observe_particles": int,
     "observe_target": bool,
+    "observe_relative": bool,
 }
 """What every configuration says, and the types of it."""
 
@@ -272,7 +274,7 @@ def config_hash(cfg: Any) -> str:
         plain["protocol"] = chosen
     # Runs of the first draw and with the paper's observations keep the hashes that they had before there were
     # others.
-    for key in ("seed_particles", "observe_particles", "observe_target"):
+    for key in ("seed_particles", *OBSERVED):
         if plain.get(key, BEFORE[key]) == BEFORE[key]:
             plain.pop(key, None)
     # Always empty.

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from plab.config import Config, MethodConfig
+from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
 from plab.reuse import SimulatorCache
 from plab.runners.common import LAST, episode_columns
@@ -105,7 +106,7 @@ def environment_key(cfg: Config) -> str:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    seen = cfg.observe_particles, cfg.observe_target
+    seen = [getattr(cfg, key) for key in OBSERVED]
     return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles, seen])
 
 

@@ -23,7 +23,6 @@ import torch
 
 from plab.config import Config, PodsConfig
 from plab.envs.core import EpisodeBatch
-from plab.envs.observations import level_entries
 from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate, training_scenes
 
 __all__ = ["PODS", "PodsRunner", "PodsTraining"]
@@ -46,7 +45,6 @@ class PodsTraining(ActorTraining):
         super().__init__(cfg, batch)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
-        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
 
     def train(self) -> None:
         """Run a round: act, improve the actions, and imitate them."""
@@ -125,12 +123,9 @@ class PodsTraining(ActorTraining):
         for _ in range(count):
             minibatches = minibatches or list(torch.randperm(len(seen), **drawn).split(method.batch_size))
             rows = minibatches.pop()
-            moved = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
-            if method.shift > 0.0:
-                for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
-                    moved[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
+            noisy = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
             self._optimizer.zero_grad()
-            torch.nn.functional.mse_loss(self.policy(moved), wanted[rows]).backward()
+            torch.nn.functional.mse_loss(self.policy(noisy), wanted[rows]).backward()
             self._optimizer.step()
 
     def state(self) -> dict[str, Any]:

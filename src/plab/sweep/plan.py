@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 from plab.config import Config, RlConfig
+from plab.config.selection import OBSERVED
 from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
@@ -55,7 +56,7 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    seen = cfg.observe_particles, cfg.observe_target
+    seen = [getattr(cfg, key) for key in OBSERVED]
     kind = [cfg.task.name, cfg.method.family, seen, *shared, loss]
     own = family(cfg.method.family)
     if not (own.batching or own.joins_populations(cfg.method)):
