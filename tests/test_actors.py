@@ -287,6 +287,33 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monk
 
 
 @pytest.mark.physics
+def test_what_is_observed_is_moved_together(monkeypatch) -> None:
+    words = "method.shift=0.1", "method.observation_noise=0", "method.scenes=0", "observe_target=true"
+    cfg = make_config("results", "pods", *words)
+    (batch,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
+    training, given = PodsTraining(cfg, batch), []
+    training._hold_moments()
+    act = type(training.policy).forward
+    monkeypatch.setattr(
+        type(training.policy), "forward", lambda policy, seen: given.append(seen) or act(policy, seen)
+    )
+    start = torch.as_tensor(batch.reset()[0])
+    seen = training._scaled(torch.cat([start] * 50))
+    training._imitate(seen, torch.zeros((len(seen), 6)), 50)
+    # In the order of the rows: all are alike.
+    moved = (torch.cat(given) - seen[:1]) * training._deviation
+    particles, pose, target = 6 * 5, 2 * 7, 14
+    assert moved.shape == (2 * len(seen), particles + pose + target)
+    along_x = [0, 6, 12, 18, 24, 30, 37, 45, 52]
+    for first in (0, 2):
+        entries = [at + first for at in along_x]
+        torch.testing.assert_close(moved[:, entries], moved[:, entries[:1]].expand(-1, len(entries)))
+        assert 0.08 < moved[:, first].abs().max() <= 0.1 and moved[:, first].abs().mean() > 0.03
+        moved[:, entries] = 0.0
+    assert moved.abs().max() < 1e-5
+
+
+@pytest.mark.physics
 @pytest.mark.parametrize("broken", [[1], [0, 1]])
 def test_environments_that_break_off_teach_nothing(
     training: PodsTraining, broken: list[int], monkeypatch

@@ -324,29 +324,6 @@ def test_observations_may_tell_the_target() -> None:
         core.EpisodeBatch(cfgs)
 
 
-def test_positions_may_be_relative() -> None:
-    """To the mean of the observed particles, which stands at the end; all else is as it is."""
-    words = [*OVERRIDES, "observe_particles=4", "observe_target=true"]
-    plain = gymnasium.make("plab/Move-v1", overrides=words)
-    relative = gymnasium.make("plab/Move-v1", overrides=[*words, "observe_relative=true"])
-    action = random_actions()[0][0]
-    for absolute, seen in zip(
-        plain.reset()[:1] + plain.step(action)[:1],
-        relative.reset()[:1] + relative.step(action)[:1],
-        strict=True,
-    ):
-        assert relative.observation_space.contains(seen) and len(seen) == len(absolute) + 3
-        count = (len(absolute) - 14 - 14) // 6
-        middle = absolute[: 6 * count].reshape(-1, 6)[:, :3].mean(axis=0)
-        expected = absolute.copy()
-        places = [*range(0, 6 * count, 6), 6 * count, 6 * count + 7, 6 * count + 15, 6 * count + 22]
-        for at in places:
-            expected[at : at + 3] -= middle
-        np.testing.assert_allclose(seen, [*expected, *middle], atol=2e-7)
-    plain.close()
-    relative.close()
-
-
 def test_observations_may_hold_fewer_particles() -> None:
     few = gymnasium.make("plab/Move-v1", overrides=[*OVERRIDES, "observe_particles=3"])
     full = gymnasium.make("plab/Move-v1", overrides=OVERRIDES)

@@ -51,7 +51,6 @@ def make_config(folder: Path, **changes) -> dict:
         "seed_particles": 0,
         "observe_particles": 200,
         "observe_target": False,
-        "observe_relative": False,
         "results_dir": str(folder),
         "force": False,
         "progress": False,
@@ -72,7 +71,6 @@ def test_hash_ignores_what_cannot_change_a_result(tmp_path: Path) -> None:
         "seed_particles": (0, 3),
         "observe_particles": (200, 5),
         "observe_target": (False, True),
-        "observe_relative": (False, True),
     }
     for key, (usual, other) in usual_and_other.items():
         assert config_hash(config | {key: other}) != config_hash(config | {key: usual}) == hash_

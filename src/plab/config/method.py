@@ -234,6 +234,8 @@ class PodsConfig(ActorConfig):
         epochs: How often, after a round, the policy sees as many actions as the round has.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
+        shift: Where all that is observed of them stands is moved along x and along z by so much at most
+            [domain units].
     """
 
     num_envs: int = field(metadata=ranges.COUNT)
@@ -242,6 +244,7 @@ class PodsConfig(ActorConfig):
     epochs: int = field(metadata=ranges.COUNT)
     batch_size: int = field(metadata=ranges.COUNT)
     observation_noise: float = field(metadata=ranges.FINITE)
+    shift: float = field(metadata=ranges.FINITE)
 
 
 @dataclass

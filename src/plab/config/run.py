@@ -118,8 +118,6 @@ class Config:
             count // this)-th.
         observe_target: Whether observations of environments end with
             :func:`plab.objective.target_observation`, for policies that are to serve several targets.
-        observe_relative: Whether positions in observations are relative to the mean of the observed
-            particles, which then stands at the end.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
@@ -138,7 +136,6 @@ class Config:
     seed_particles: int
     observe_particles: int
     observe_target: bool
-    observe_relative: bool
     seed: int
     results_dir: str
     force: bool

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OBSERVED", "Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
 
-OBSERVED = ("observe_particles", "observe_target", "observe_relative")
+OBSERVED = ("observe_particles", "observe_target")
 """Keys of a configuration that say which numbers an observation holds."""
 
 

@@ -14,7 +14,7 @@ from plab.problem import Problem
 from plab.scene import Scene
 from plab.sim.tensors import Constants, on_device
 
-__all__ = ["Observer", "spaces"]
+__all__ = ["Observer", "level_entries", "spaces"]
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
@@ -35,7 +35,6 @@ class Observer:
         self._numbers = len(scene.manipulators) * 8
         size = len(problem.scenes)
         self._target = Constants(_target_observations(problem) if cfg.observe_target else np.empty((size, 0)))
-        self._positions = _position_entries(scene, cfg) if cfg.observe_relative else None
 
     def __call__(self, particles: Array, poses: Array, dtype: type = np.float64) -> Array:
         """Return observations, shape [batch, entry], of particles, shape [batch, observed, 6], and all poses,
@@ -43,24 +42,12 @@ class Observer:
         size = len(particles)
         rows = [particles.reshape(size, -1), poses.reshape(size, -1)[:, self._poses]]
         rows.append(self._target.like(rows[0]))
-        if self._positions is None:
-            return _joined(rows, dtype)
-        table = _joined([*rows, rows[0][:, :3]], dtype)
-        for axis, entries in enumerate(self._positions):
-            middle = table[:, entries[: self._count]].mean(1)
-            table[:, entries] -= middle[:, None]
-            table[:, axis - 3] = middle
-        return table
+        return _joined(rows, dtype)
 
     def pull_back(self, bar: Array) -> tuple[Array, Array]:
         """Return the derivatives by particles, shape [batch, observed, 6], and poses, shape [batch,
         manipulator, 8], from those by observations, shape [batch, entry]."""
         size, particles = len(bar), 6 * self._count
-        if self._positions is not None:
-            bar = bar.clone() if on_device(bar) else bar.copy()
-            for axis, entries in enumerate(self._positions):
-                share = (bar[:, axis - 3] - bar[:, entries].sum(1)) / self._count
-                bar[:, entries[: self._count]] += share[:, None]
         whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
         # What comes behind the poses is constant.
         whole[:, self._poses] = bar[:, particles : particles + len(self._poses)]
@@ -76,18 +63,18 @@ def _joined(rows: Sequence[Array], dtype: type) -> Array:
     return np.concatenate(rows, axis=1, dtype=dtype, casting="same_kind")
 
 
-def _position_entries(scene: Scene, cfg: Config) -> list[list[int]]:
-    """Return which entries of an observation are positions along each axis: first those of the observed
-    particles, then those of the manipulators and, if it is seen, of the target."""
+def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
+    """Return which entries of an observation are positions along x and along z, shape [2, position]: those of
+    the observed particles, of the manipulators and, if it is seen, of the target."""
     particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
     # What has to leave, then what has to arrive: a share, a centroid and deviations.
     centroids = [1, 8] if cfg.observe_target else []
     along_x = [
         *range(0, particles, 6),
-        *(particles + int(at) for at in np.flatnonzero(poses % 8 == 0)),
+        *(particles + np.flatnonzero(poses % 8 == 0)),
         *(particles + len(poses) + entry for entry in centroids),
     ]
-    return [[entry + axis for entry in along_x] for axis in range(3)]
+    return np.stack([along_x, np.add(along_x, 2)])
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
@@ -132,11 +119,6 @@ def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
     seen = TARGET_ENTRIES if cfg.observe_target else 0
     least = np.concatenate([low * observed, bounds[:, 0].min(axis=0), np.zeros(seen)])
     most = np.concatenate([high * observed, bounds[:, 1].max(axis=0), np.ones(seen)])
-    if cfg.observe_relative:
-        for entries in _position_entries(scenes[0], cfg):
-            # Less a position in the unit cube.
-            least[entries] -= 1.0
-        least, most = np.append(least, np.zeros(3)), np.append(most, np.ones(3))
     observation = Box(least.astype(np.float32), most.astype(np.float32), dtype=np.float32)
     return observation, Box(-1.0, 1.0, (scenes[0].action_dim,), np.float32)
 

@@ -87,7 +87,6 @@ BEFORE: dict[str, Any] = {
     "seed_particles": 0,
     "observe_particles": 200,
     "observe_target": False,
-    "observe_relative": False,
 }
 """What the configurations of runs would say that are older than these choices."""
 
@@ -105,7 +104,6 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "seed_particles": int,
     "observe_particles": int,
     "observe_target": bool,
-    "observe_relative": bool,
 }
 """What every configuration says, and the types of it."""
 

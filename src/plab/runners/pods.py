@@ -23,6 +23,7 @@ import torch
 
 from plab.config import Config, PodsConfig
 from plab.envs.core import EpisodeBatch
+from plab.envs.observations import level_entries
 from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate, training_scenes
 
 __all__ = ["PODS", "PodsRunner", "PodsTraining"]
@@ -43,6 +44,7 @@ class PodsTraining(ActorTraining):
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
         super().__init__(cfg, batch)
+        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
 
@@ -124,6 +126,9 @@ class PodsTraining(ActorTraining):
             minibatches = minibatches or list(torch.randperm(len(seen), **drawn).split(method.batch_size))
             rows = minibatches.pop()
             noisy = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
+            if method.shift > 0.0:
+                for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
+                    noisy[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
             self._optimizer.zero_grad()
             torch.nn.functional.mse_loss(self.policy(noisy), wanted[rows]).backward()
             self._optimizer.step()
