@@ -6,10 +6,11 @@ in place of a step of gradient descent or of second order. In a round the policy
 actions that it took are improved by some updates along the gradient of the trajectory's loss; they are run
 again, and the policy learns to take them where they lead, and where it came without them. What the gradient
 improves is a sequence of actions, which is much easier than a network; what keeps the sequences of different
-scenes alike is that all of them begin as the policy's. To reproduce a result:
+scenes alike is that all of them begin as the policy's. Where there are more scenes than environments, rounds
+take them in turn, and the policy imitates what each scene gave the last time. To reproduce a result:
 
-    python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true method=pods seed=0 \
-        sim.device=cuda
+    python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true observe_particles=10 \
+        method=pods method.scenes=640 method.shift=0.2 method.episodes=30000 seed=0 sim.device=cuda
 """
 
 from __future__ import annotations
