@@ -163,6 +163,18 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
 
 
 @pytest.mark.physics
+def test_it_is_not_tried_in_scenes_that_do_not_fit(
+    finished: RunResult, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    words = [str(finished.path), "--scenes", "3"]
+    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene != unseen.FIRST)
+    assert unseen.main(words) == 0 and "drawn scenes         2 " in capsys.readouterr().out
+    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene == unseen.FIRST)
+    assert unseen.main(words) == 2
+    assert "1 of 3 scenes fit into a grid of 32: too few" in capsys.readouterr().err
+
+
+@pytest.mark.physics
 def test_older_files_of_policies_are_read(finished: RunResult, tmp_path: Path) -> None:
     """Those of shac had profiles, without any in them."""
     kept = dict(np.load(policy_path(finished.path)))
