@@ -345,7 +345,7 @@ def test_observations_may_hold_fewer_particles() -> None:
         core.EpisodeBatch(cfgs)
 
 
-def test_environments_can_be_others_of_their_kind() -> None:
+def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
     words, actions = [*COARSE, "observe_target=true"], random_actions()
 
     def made_of(*variants: str) -> list[Config]:
@@ -371,6 +371,14 @@ def test_environments_can_be_others_of_their_kind() -> None:
     assert all(map(np.array_equal, before, episode(batch)))
     with pytest.raises(ValueError, match="1 configurations for 2 sub-environments"):
         batch.renew(made_of("1", "2")[:1])
+    monkeypatch.setattr(core, "Problem", None)
+    with pytest.raises(TypeError):
+        batch.renew(made_of("1", "3"))
+    monkeypatch.undo()
+    # Half way from one to the other, it is neither.
+    assert batch.configs == ()
+    batch.renew(made_of("1", "2"))
+    assert all(map(np.array_equal, before, episode(batch)))
     with pytest.raises(ValueError, match="observe_target differs"):
         batch.renew(core.compose_configs("Move", "1", num_envs=2, overrides=COARSE))
     for one in (batch, fresh):

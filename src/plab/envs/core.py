@@ -212,14 +212,17 @@ class EpisodeBatch:
         """
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
-        _require_alike([self.configs[0], *cfgs])
-        simulator = self._simulator
-        simulator.set_scenes(build_scenes(cfgs))
+        _require_alike([*self.configs[:1], *cfgs])
+        scenes, simulator = build_scenes(cfgs), self._simulator
+        # Of none, should there be an error half way.
+        self.configs: tuple[Config, ...] = ()
+        simulator.set_scenes(scenes)
         self._take(cfgs, Problem(cfgs, simulator))
         self._begin()
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
         """Be made of configurations, one per sub-environment."""
+        self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
         self._observer = Observer(problem, cfgs[0])
@@ -381,10 +384,13 @@ class EpisodeBatch:
 
     def close(self) -> None:
         """Let go of the simulator and the renderers; closing twice is allowed."""
+        self._close_renderers()
+        self._problem = None
+
+    def _close_renderers(self) -> None:
         for renderer in self._renderers:
             renderer.close()
         self._renderers = []
-        self._problem = None
 
     def _observe(self, like: Array = None) -> Array:
         seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
