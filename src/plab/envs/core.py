@@ -189,10 +189,11 @@ class EpisodeBatch:
         """
         if contact not in CONTACT_MODELS:
             raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
+        _require_alike(cfgs)
+        problem = Problem(cfgs)
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
         self._renderers: list[Renderer] = []
-        _require_alike(cfgs)
-        self._take(cfgs, Problem(cfgs))
+        self._take(cfgs, problem)
         self.observation_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
         self._begin()
 
