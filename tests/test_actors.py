@@ -24,6 +24,7 @@ from plab.runners.environments import shared_batches
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
+from plab.scene import SceneError
 from same_runs import assert_same_numbers, stopped_at
 
 HORIZON = 5
@@ -262,9 +263,10 @@ def test_scenes_that_do_not_fit_are_left_out(tmp_path: Path, monkeypatch) -> Non
     cfg = make_config(tmp_path, "pods", "method.scenes=4")
     monkeypatch.setattr("plab.runners.actors.fits", lambda one: one.seed_scene % 2)
     assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003]
-    monkeypatch.setattr("plab.runners.actors.fits", lambda one: False)
-    with pytest.raises(ConfigError, match="none of the scenes 1000 to 1003 fits into a grid of 32"):
-        training_scenes(cfg, cfg.method, 4)
+    monkeypatch.undo()
+    coarser = make_config(tmp_path, "pods", "method.scenes=4", "sim.dt=1e-2")
+    with pytest.raises(SceneError, match=r"dt 0\.01 is above the stability limit"):
+        run_config(coarser, CACHE)
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Whether the grid's domain, which is smaller where nodes are far apart, holds a scene and its target."""
+    """Whether a scene and its target can be built: the grid's domain is smaller where nodes are far apart."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):

@@ -67,7 +67,9 @@ def rows(
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
         seen = [f"{key}={config[key]}" for key in OBSERVED]
         cfg = load_config([f"task={config['task']['name']}", *seen, *sim, *words])
-        drawn = [one for one in drawn_configs(cfg, range(FIRST, FIRST + count)) if fits(one)]
+        every = drawn_configs(cfg, range(FIRST, FIRST + count))
+        # Building them says what is wrong with all of them.
+        drawn = [one for one in every if fits(one)] or every
         if len(drawn) < 2:
             raise ArgumentError(
                 f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"

@@ -292,6 +292,6 @@ def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0)
         return [cfg]
     some = min(method.scenes, count)
     seeds = [FIRST_SCENE + (turn * some + k) % method.scenes for k in range(some)]
-    if drawn := [one for one in drawn_configs(cfg, seeds) if fits(one)]:
-        return drawn
-    raise ConfigError(f"none of the scenes {seeds[0]} to {seeds[-1]} fits into a grid of {cfg.sim.grid_size}")
+    drawn = drawn_configs(cfg, seeds)
+    # Building them says what is wrong with all of them.
+    return [one for one in drawn if fits(one)] or drawn
