@@ -36,7 +36,7 @@ BIN := $(VENV)/bin
 # A test that hangs is ended after a quarter of an hour, and told with where it hung.
 PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
-.PHONY: run dev test test-quick test-gpu test-slow lint typecheck coverage benchmark docs docs-serve build clean system-packages \
+.PHONY: run dev test test-quick test-gpu test-slow lint typecheck coverage benchmark docs docs-serve bitcode build clean system-packages \
 	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
@@ -85,6 +85,10 @@ docs-serve: $(VENV)/.docs.stamp
 build: $(VENV)/.dev.stamp
 	$(BIN)/python -m build
 	PYTHON=$(BIN)/python tools/check_wheel.sh
+
+# The additions that sim/cuda_global.py calls, as LLVM's bitcode.
+bitcode: $(VENV)/.dev.stamp
+	$(BIN)/python tools/bitcode.py
 
 system-packages:
 	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri

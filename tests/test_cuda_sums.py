@@ -44,7 +44,7 @@ class Adder(SumPhases):
         for i in range(values.shape[0]):
             scale = self.momentum_scale(1)
             for c in ti.static(range(4)):
-                self.add_to_node(self.grid, 1, c, values[i, c], scale)
+                self.add_to_number(ti.get_addr(self.grid, 0), 4 + c, c, values[i, c], scale)
 
     @ti.kernel
     def gather_momentum(self):
@@ -64,7 +64,7 @@ class Adder(SumPhases):
     def scatter_adjoint(self, values: ti.types.ndarray()):
         for i in range(values.shape[0]):
             scale = self.adjoint_scale(0, 1)
-            self.add_to_node(self.grid, 0, 1, values[i], scale)
+            self.add_to_number(ti.get_addr(self.grid, 0), 1, 1, values[i], scale)
 
     @ti.kernel
     def gather_adjoint(self):

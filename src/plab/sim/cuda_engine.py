@@ -16,7 +16,7 @@ import taichi as ti
 
 from plab.sim.cuda_phases import DISTANCE_GROUPS
 from plab.sim.cuda_threads import RESIDENT_BLOCK, ThreadPhases
-from plab.sim.cuda_warp import NODE_BITS, WARP, WARP_BLOCK
+from plab.sim.cuda_warp import NODE_BITS, WARP_BLOCK
 from plab.sim.storage import STATE
 from plab.sim.tensors import Array
 
@@ -214,10 +214,7 @@ class CudaEngine(ThreadPhases):
             self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
         for q in range(self.particle_threads):
             e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
-            run, first, _rank, _total, doublings = self.run_of(node, node >= 0, q % WARP)
-            if first:
-                self.mark_shared(e, base, stamp)
-            self.scatter_mass_run(e, base, fx, run, first, doublings)
+            self.scatter_mass_thread(q, e, base, fx, node, stamp)
             particle = tile * self.lanes + lane
             self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
         ti.loop_config(block_dim=WARP_BLOCK)
@@ -245,7 +242,7 @@ class CudaEngine(ThreadPhases):
             if particle < self.particles:
                 tile = particle // self.lanes
                 entry = self.tile_entry(slot, e, tile)
-                lane = particle % self.lanes
+                lane = particle & (self.lanes - 1)
                 self.add_particle_gradient(state, entry, bar, self.tile_entry(0, e, tile), lane, e)
         if ti.static(self.beyond_nearest):
             for q in range(self.particle_threads):

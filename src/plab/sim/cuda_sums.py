@@ -10,6 +10,7 @@ import math
 
 import taichi as ti
 
+from plab.sim.cuda_global import add_f32, add_f64, add_i64
 from plab.sim.storage import Storage
 
 __all__ = ["SumPhases"]
@@ -47,7 +48,7 @@ class SumPhases(Storage):
     adjoint_bound: ti.Field
 
     def scattered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_node` adds to it."""
+        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_number` adds to it."""
         return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
 
     def sums(self, count: int) -> ti.Field:
@@ -96,14 +97,19 @@ class SumPhases(Storage):
     # -- grids --------------------------------------------------------------------------------------
 
     @ti.func
-    def add_to_node(self, grid: ti.template(), node, component, value, scale: ti.template()):
-        """Add to a component of a grid that is scattered to; ``scale`` is a 4-vector of how many of the
-        components' units make 1, as :meth:`momentum_scale` and :meth:`adjoint_scale` return them."""
+    def add_to_number(self, first, number, component, value, scale: ti.template()):
+        """Add to a number of a grid that is scattered to, whose first is at an address.
+
+        ``scale`` is a 4-vector of how many of the components' units make 1, as :meth:`momentum_scale` and
+        :meth:`adjoint_scale` return them; the number is one of ``component``.
+        """
+        place = ti.cast(number, ti.u64)
         if ti.static(self.deterministic):
-            share = value * ti.select(component == 3, scale[3], scale[0])
-            ti.atomic_add(grid[node][component], ti.cast(share, ti.i64))
+            add_i64(first + 8 * place, value * ti.select(component == 3, scale[3], scale[0]))
+        elif ti.static(self.real == ti.f32):
+            add_f32(first + 4 * place, value)
         else:
-            ti.atomic_add(grid[node][component], value)
+            add_f64(first + 8 * place, value)
 
     @ti.func
     def momentum_scale(self, power: ti.template()):

@@ -4,12 +4,15 @@ import taichi as ti
 
 from plab.sim.cuda_phases import CudaPhases
 from plab.sim.cuda_sums import LARGEST_MOMENTUM
-from plab.sim.cuda_warp import ALL_LANES, NODE_STRIDE, PLANE_STRIDE, RUN_BITS, WARP, WARP_BLOCK
+from plab.sim.cuda_warp import ALL_LANES, BLOCK_WARPS, NODE_STRIDE, RUN_BITS, WARP, WARP_BLOCK, WARP_NUMBERS
 from plab.sim.grid_phases import MASS_MIN
 from plab.sim.storage import AT_V
 from plab.sim.transfer import spline, widen
 
 __all__ = ["RESIDENT_BLOCK", "ThreadPhases"]
+
+MOMENTUM_AND_MASS, MASS, VELOCITY = (0, 1, 2, 3), (3,), (0, 1, 2)
+"""Components of grids that are scattered to."""
 
 RESIDENT_BLOCK = WARP_BLOCK
 """Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
@@ -73,15 +76,13 @@ class ThreadPhases(CudaPhases):
         ``time`` is noted where the state is broken by what an integer cannot hold.
         """
         e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q)
-        run, first, rank, total, doublings = self.run_of(node, node >= 0, q % WARP)
+        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
         if node >= 0:
             a = self.material_particle(state, source, self.tile_entry(after, e, tile), lane, e, True)
-        sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
-        heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
-        self.share_heads(heads, q, node, first, rank)
+        rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
         field = self.momentum_field(state, source, a, lane, fx)
         if ti.static(self.deterministic):
             fits = self.largest_share(field) < LARGEST_MOMENTUM * self.mass
@@ -90,8 +91,22 @@ class ThreadPhases(CudaPhases):
         w = spline(fx)
         scale = self.momentum_scale(1)
         self.scatter_runs(
-            self.momentum, 4, sums, heads, q, w, field, scale, run, first, rank, total, doublings
+            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, taking, False, 0
         )
+
+    @ti.func
+    def scatter_mass_thread(self, q, e, base, fx, node, stamp):
+        """Add the mass of thread q's particle to its 27 nodes as :meth:`scatter_mass` does; all lanes of a
+        warp take part."""
+        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
+        if first:
+            self.mark_shared(e, base, stamp)
+        rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
+        field = [ti.Vector([0.0, 0.0, 0.0, ti.cast(self.mass, self.real)])]
+        scale, w = self.momentum_scale(1), spline(fx)
+        folds = ti.cast(base[0] == 0, ti.i32) | (ti.cast(base[1] == 0, ti.i32) << 1)
+        folds |= ti.cast(base[2] == 0, ti.i32) << 2
+        self.scatter_runs(self.momentum, MASS, rows, q, w, field, scale, node, heads, taking, True, folds)
 
     @ti.func
     def grid_thread(self, w, q, s):
@@ -112,7 +127,7 @@ class ThreadPhases(CudaPhases):
         e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
-        run, first, rank, total, doublings = self.run_of(node, node >= 0, q % WARP)
+        first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
         a = ti.Vector.zero(self.real, 9)
@@ -120,20 +135,16 @@ class ThreadPhases(CudaPhases):
             a = self.material_particle(state, source, target, lane, e, False)
             for i in ti.static(range(9)):
                 self.affine[entry9 + i][lane] = a[i]
-        sums = ti.simt.block.SharedArray(WARP_BLOCK * PLANE_STRIDE, self.real)
-        heads = ti.simt.block.SharedArray(WARP_BLOCK, ti.i32)
-        self.share_heads(heads, q, node, first, rank)
+        rows = ti.simt.block.SharedArray(BLOCK_WARPS * WARP_NUMBERS, self.real)
         field = self.momentum_field(state, source, a, lane, fx)
         w = spline(fx)
         scale = self.momentum_scale(1)
         self.scatter_runs(
-            self.momentum, 4, sums, heads, q, w, field, scale, run, first, rank, total, doublings
+            self.momentum, MOMENTUM_AND_MASS, rows, q, w, field, scale, node, heads, taking, False, 0
         )
         h = self.velocity_adjoint_field(state, x, target, bar, self.tile_entry(0, e, tile), lane, fx)
         scale = self.adjoint_scale(e, 1)
-        self.scatter_runs(
-            self.velocity_bar, 3, sums, heads, q, w, h, scale, run, first, rank, total, doublings
-        )
+        self.scatter_runs(self.velocity_bar, VELOCITY, rows, q, w, h, scale, node, heads, taking, False, 0)
 
     @ti.func
     def grid_thread_adjoint(self, w, q, s):
@@ -163,7 +174,7 @@ class ThreadPhases(CudaPhases):
         bits = 0
         if particle < self.particles:
             tile = particle // self.lanes
-            lane = particle % self.lanes
+            lane = particle & (self.lanes - 1)
             x = self.vector(state, self.tile_entry(before, e, tile), lane)
             _base, fx = self.stencil(x)
             target = self.tile_entry(after, e, tile)
@@ -180,7 +191,7 @@ class ThreadPhases(CudaPhases):
         e, particle = self.particle_of(q)
         if particle < self.particles:
             tile = particle // self.lanes
-            lane = particle % self.lanes
+            lane = particle & (self.lanes - 1)
             source = self.tile_entry(before, e, tile)
             entry = self.tile_entry(0, e, tile)
             entry9 = (e * self.tiles + tile) * 9
@@ -234,7 +245,7 @@ class ThreadPhases(CudaPhases):
         particle, and to the poses'; all lanes of a warp take part."""
         e, particle = self.particle_of(q)
         tile = particle // self.lanes
-        lane = particle % self.lanes
+        lane = particle & (self.lanes - 1)
         x = self.vector(state, self.tile_entry(slot, e, tile), lane)
         entry = self.tile_entry(0, e, tile)
         for shape, start, stop in ti.static(self.shape_ranges):
@@ -258,4 +269,4 @@ class ThreadPhases(CudaPhases):
             tile = particle // self.lanes
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
-            self.gather_particle(state, source, target, particle % self.lanes, e, time)
+            self.gather_particle(state, source, target, particle & (self.lanes - 1), e, time)

@@ -13,16 +13,16 @@ from plab.sim.grid_phases import GridPhases
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import BLOCK_BITS
 from plab.sim.term_phases import TermPhases
-from plab.sim.transfer import spline
 
 __all__ = [
+    "BLOCK_WARPS",
     "NODE_BITS",
     "NODE_MASK",
     "NODE_STRIDE",
-    "PLANE_STRIDE",
     "RUN_BITS",
     "WARP",
     "WARP_BLOCK",
+    "WARP_NUMBERS",
     "WarpPhases",
 ]
 
@@ -38,8 +38,15 @@ WARP_BLOCK = 128
 RUN_BITS = 5
 """A run of particles in one cell is as long as a warp at most, 2^5."""
 
-PLANE_STRIDE = 37
-"""Distance of the runs' sums of 9 nodes in shared memory: odd, so that lanes meet different banks."""
+ROW_STRIDE = 39
+"""Distance of what particles give in shared memory, 39 numbers each: odd, so that lanes meet different
+banks."""
+
+WARP_NUMBERS = WARP * ROW_STRIDE + 27 * 4
+"""Numbers of a warp in shared memory: what its particles give, and a run's sums."""
+
+BLOCK_WARPS = WARP_BLOCK // WARP
+"""Warps of a block."""
 
 NODE_BITS = 3 * BLOCK_BITS
 NODE_MASK = (1 << NODE_BITS) - 1
@@ -53,6 +60,13 @@ def packed(a, b):
     """Two float32 as one 64-bit number."""
     low = ti.cast(ti.cast(ti.bit_cast(a, ti.i32), ti.u32), ti.i64)
     return low | (ti.cast(ti.bit_cast(b, ti.i32), ti.i64) << 32)
+
+
+@ti.func
+def within(at):
+    """An index of shared memory, of which LLVM can tell that sums with it do not wrap: with a constant they
+    cost nothing."""
+    return at & 0x1FFF
 
 
 class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
@@ -136,7 +150,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
         """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
         of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32.
-        ``unit`` has the units of the components, see :meth:`add_to_node`."""
+        ``unit`` has the units of the components, see :meth:`add_to_number`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for turn in ti.static(range(4)):
@@ -193,22 +207,12 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
             out += self.wide_from_above(out, 1 << k)
         return out
 
-    @ti.func
-    def from_lane_above(self, value, offset):
-        """The value that the lane ``offset`` above this one holds."""
-        out = value
-        if ti.static(self.real == ti.f32):
-            out = ti.simt.warp.shfl_down_f32(ti.u32(ALL_LANES), value, offset)
-        else:
-            out = self.wide_from_above(value, offset)
-        return out
-
     # -- scatter by runs ----------------------------------------------------------------------------
     #
     # Particles are in the order of their cells at the start, and neighbours stay neighbours, so that the
     # particles of a tile share few base nodes. A warp takes the particles of its tile in the order of their
-    # nodes; what a run of lanes with the same node adds to the grid is summed in registers first, and its
-    # first lane alone does the atomics. The sums are exact for any order of particles.
+    # nodes; what a run of lanes with the same node adds to the grid is summed first. The sums are exact for
+    # any order of particles.
 
     @ti.func
     def sorted_lane(self, state: ti.template(), source, tile, lane):
@@ -227,126 +231,113 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 # A lane keeps the lesser where it is the lower of a rising pair or the upper of a falling.
                 if (lane >> stage) & 1 == (lane >> step) & 1:
                     packed = least
-        return packed % self.lanes
+        return packed & (self.lanes - 1)
 
     @ti.func
-    def run_of(self, key, taking_part, lane):
-        """The runs of neighbouring lanes with the same key in a warp; all lanes of a run take part or none.
+    def heads_of(self, key, taking_part, lane):
+        """The runs of neighbouring lanes with the same key in a warp. Of a run all lanes take part or none,
+        and those that do are the warp's first.
 
-        Returns the lanes from this one on that hold the same key; whether this is the first lane of a run
-        that takes part; how many of these come before it; how many there are; and the number of doublings
-        that the longest run needs.
+        Returns whether this is the first lane of a run that takes part, a bit for each lane that is, and how
+        many lanes take part.
         """
-        run = 1
-        for k in ti.static(range(RUN_BITS)):
-            above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), run, 1 << k)
-            key_above = ti.simt.warp.shfl_down_i32(ti.u32(ALL_LANES), key, 1 << k)
-            if run == (1 << k) and lane + (1 << k) < self.lanes and key_above == key:
-                run += above
         key_below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), key, 1)
         first = taking_part and (lane == 0 or key_below != key)
-        doublings = 0
-        for k in ti.static(range(RUN_BITS)):
-            if ti.simt.warp.any_nonzero(ti.u32(ALL_LANES), ti.cast(run > (1 << k), ti.i32)):
-                doublings = k + 1
-        upto = ti.cast(first, ti.i32)
-        for k in ti.static(range(RUN_BITS)):
-            below = ti.simt.warp.shfl_up_i32(ti.u32(ALL_LANES), upto, 1 << k)
-            if lane >= (1 << k):
-                upto += below
-        total = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), upto, WARP - 1)
-        return run, first, upto - ti.cast(first, ti.i32), total, doublings
+        heads = ti.simt.warp.ballot(ti.cast(first, ti.i32))
+        taking = ti.simt.warp.ballot(ti.cast(taking_part, ti.i32))
+        return first, ti.cast(heads, ti.u32), ti.cast(ti.math.popcnt(ti.cast(taking, ti.u32)), ti.i32)
+
+    @ti.func
+    def lowest_bit(self, bits):
+        """Number of the lowest bit that is set; at least one is."""
+        return 31 - ti.math.clz(ti.cast(bits & (~bits + 1), ti.i32))
 
     @ti.func
     def scatter_runs(
         self,
         grid: ti.template(),
-        width: ti.template(),
-        sums: ti.template(),
-        heads: ti.template(),
+        components: ti.template(),
+        rows: ti.template(),
         q,
         w: ti.template(),
         field: ti.template(),
         scale: ti.template(),
-        run,
-        first,
-        rank,
-        total,
-        doublings,
+        node,
+        heads,
+        taking,
+        folded: ti.template(),
+        folds,
     ):
-        """Scatter an affine field as :meth:`scatter` does, or its first ``width`` components; every lane of
-        the warp must take part.
+        """Scatter an affine field as :meth:`scatter` does, to some components of a grid; every lane of the
+        warp must take part. The field's fourth component is the same at all nodes.
 
-        The first lane of each run, see :meth:`run_of`, sums the run's shares in registers. Then the lanes add
-        the sums of all runs to the grid together, neighbours to neighbouring numbers: the device takes up to
-        8 of them at once. ``sums`` is shared memory of the block for ``WARP_BLOCK * PLANE_STRIDE`` numbers,
-        ``heads`` for the base node of each run, filled by :meth:`share_heads`; ``scale`` is that of
-        :meth:`add_to_node`.
+        What each lane's particle gives goes to shared memory, ``rows`` for ``BLOCK_WARPS * WARP_NUMBERS``
+        numbers. Then the lanes are the 27 nodes of a run's stencil, and each sums what the run's particles
+        give to its node. The sums change lanes once more, so that neighbours add neighbouring numbers to the
+        grid: the device takes up to 8 of them at once. ``heads`` and ``taking`` are those of :meth:`heads_of`
+        for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_number`. If ``folded``, nodes are
+        those of :meth:`folded_node`; ``folds`` has a bit for each axis along which the base node is the
+        first.
         """
         lane = q % WARP
-        corner = q % WARP_BLOCK - lane
+        corner = ti.cast(q % WARP_BLOCK // WARP * WARP_NUMBERS, ti.i32)
+        width = ti.static(len(components))
+        sloping = ti.static([c for c in components if c < 3])
+        plane = ti.static(width + 2 * len(sloping))
+        own = within(corner + lane * ROW_STRIDE)
         for i in ti.static(range(3)):
+            for c in ti.static(range(width)):
+                value = field[0][components[c]]
+                if ti.static(i > 0 and components[c] < 3):
+                    value += float(i) * field[1][components[c]]
+                rows[own + plane * i + c] = w[i][0] * value
+            for c in ti.static(range(len(sloping))):
+                rows[own + plane * i + width + 2 * c] = w[i][0] * field[2][sloping[c]]
+                rows[own + plane * i + width + 2 * c + 1] = w[i][0] * field[3][sloping[c]]
             for j in ti.static(range(3)):
-                wij = w[i][0] * w[j][1]
-                r = wij * (field[0] + float(i) * field[1] + float(j) * field[2])
-                z = wij * field[3]
-                r0 = w[0][2] * r
-                r1 = w[1][2] * r + w[1][2] * z
-                r2 = w[2][2] * r + (2.0 * w[2][2]) * z
-                # The same number of rounds for all lanes of the warp.
-                for k in range(doublings):
-                    takes = run > (1 << k)
-                    for c in ti.static(range(width)):
-                        a0 = self.from_lane_above(r0[c], 1 << k)
-                        a1 = self.from_lane_above(r1[c], 1 << k)
-                        a2 = self.from_lane_above(r2[c], 1 << k)
-                        if takes:
-                            r0[c] += a0
-                            r1[c] += a1
-                            r2[c] += a2
-                if first:
-                    at = (corner + rank) * PLANE_STRIDE + 3 * width * j
-                    for c in ti.static(range(width)):
-                        sums[at + c] = r0[c]
-                        sums[at + width + c] = r1[c]
-                        sums[at + 2 * width + c] = r2[c]
-            self.wait_for_warp()
-            # What a run adds to a plane of its stencil: 9 nodes.
-            plane = ti.static(9 * width)
-            for turn in range((total * plane + WARP - 1) // WARP):
-                number = turn * WARP + lane
-                if number < total * plane:
-                    owner = number // plane
-                    part = number - owner * plane
-                    row = heads[corner + owner] + (i * self.axis + part // (3 * width)) * self.axis
-                    node = row + part % (3 * width) // width
-                    share = sums[(corner + owner) * PLANE_STRIDE + part]
-                    self.add_to_node(grid, node, part % width, share, scale)
-            self.wait_for_warp()
-
-    @ti.func
-    def share_heads(self, heads: ti.template(), q, node, first, rank):
-        """Write the base nodes of a warp's runs to shared memory, for :meth:`scatter_runs`."""
-        if first:
-            heads[q % WARP_BLOCK - q % WARP + rank] = node
+                rows[own + 3 * plane + 3 * i + j] = w[i][1] * w[j][2]
         self.wait_for_warp()
-
-    @ti.func
-    def scatter_mass_run(self, e, base, fx, run, first, doublings):
-        """Add every lane's mass to its 27 nodes as :meth:`scatter_mass` does, run by run."""
-        w = spline(fx)
-        scale = self.momentum_scale(1)
-        for i in ti.static(range(3)):
-            for j in ti.static(range(3)):
-                wij = self.mass * w[i][0] * w[j][1]
-                row = ti.Vector([wij * w[0][2], wij * w[1][2], wij * w[2][2]])
-                for k in range(doublings):
-                    takes = run > (1 << k)
-                    for c in ti.static(range(3)):
-                        above = self.from_lane_above(row[c], 1 << k)
-                        if takes:
-                            row[c] += above
-                if first:
-                    for c in ti.static(range(3)):
-                        node = e * self.nodes + self.linear(self.folded_node(base, i, j, c))
-                        self.add_to_node(self.momentum, node, 3, row[c], scale)
+        # Lanes beyond the last node do as that does.
+        place = ti.cast(ti.min(lane, 26), ti.u32)
+        i, j, k = place // 9, place // 3 % 3, place % 3
+        y, z = ti.cast(j, self.real), ti.cast(k, self.real)
+        from_plane = corner + plane * ti.cast(i, ti.i32)
+        from_share = corner + 3 * plane + ti.cast(3 * j + k, ti.i32)
+        sums = corner + WARP * ROW_STRIDE
+        to = within(sums + ti.cast(place, ti.i32) * width)
+        first = ti.get_addr(grid, 0)
+        rest = heads
+        while rest != 0:
+            begin, end = self.lowest_bit(rest), taking
+            rest &= rest - 1
+            if rest != 0:
+                end = self.lowest_bit(rest)
+            total = ti.Vector.zero(self.real, width)
+            for p in range(begin, end):
+                share = rows[within(from_share + p * ROW_STRIDE)]
+                at = within(from_plane + p * ROW_STRIDE)
+                for c in ti.static(range(width)):
+                    value = rows[at + c]
+                    if ti.static(components[c] < 3):
+                        value += y * rows[at + width + 2 * c] + z * rows[at + width + 2 * c + 1]
+                    total[c] += share * value
+            for c in ti.static(range(width)):
+                rows[to + c] = total[c]
+            self.wait_for_warp()
+            head = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), node, begin)
+            least = ti.Vector([0, 0, 0])
+            if ti.static(folded):
+                bits = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), folds, begin)
+                least = ti.Vector([bits & 1, (bits >> 1) & 1, bits >> 2])
+            for turn in ti.static(range((27 * width + WARP - 1) // WARP)):
+                number = turn * WARP + lane
+                if number < 27 * width:
+                    near = ti.cast(number, ti.u32) // width
+                    offset = ti.cast(ti.Vector([near // 9, near // 3 % 3, near % 3]), ti.i32)
+                    if ti.static(folded):
+                        offset = ti.max(offset, least)
+                    component = ti.static(components[0]) + number % width
+                    share = rows[within(sums + number)]
+                    at = 4 * (head + self.linear(offset)) + component
+                    self.add_to_number(first, at, component, share, scale)
+            self.wait_for_warp()
