@@ -18,7 +18,7 @@ from plab.config import Config, ConfigError, drawn_configs, load_config
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
-from plab.runners import run_config
+from plab.runners import actors, run_config
 from plab.runners.actors import DEVIATION_MIN, ActorPolicy, training_scenes
 from plab.runners.environments import shared_batches
 from plab.runners.pods import PodsTraining
@@ -26,6 +26,7 @@ from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
 from plab.scene import SceneError
 from same_runs import assert_same_numbers, stopped_at
+from test_rl import break_evaluation
 
 HORIZON = 5
 COARSE = (
@@ -134,6 +135,19 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunRe
     known, got = (np.load(policy_path(result.path)) for result in (finished, again))
     for name in known.files:
         np.testing.assert_array_equal(got[name], known[name])
+
+
+@pytest.mark.physics
+def test_an_evaluation_that_breaks_off_ends_nothing(
+    tmp_path: Path, finished: RunResult, monkeypatch, caplog
+) -> None:
+    break_evaluation(monkeypatch, actors, 1)
+    result = run(make_config(tmp_path, name_of(finished)))
+    assert result.provenance["broken_evaluations"] == 1 and result.best_iteration != 1
+    rows, whole = result.iterations["loss"], finished.iterations["loss"]
+    assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert "the evaluation of iteration 1 broke off" in told
 
 
 @pytest.mark.physics

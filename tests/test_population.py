@@ -32,10 +32,11 @@ from torch.distributions import normal
 from plab.bench import rl as bench
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.families import family
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import Job, _runner, run_batch, run_config
-from plab.runners.environments import policy_episode, torch_settings
+from plab.runners.environments import evaluation, torch_settings
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
@@ -421,7 +422,7 @@ def test_the_trained_policy_is_beside_the_result(tmp_path: Path, lone, method) -
     """Its episode is that of the last row, but for rounding: the library multiplies otherwise."""
     alone = lone(method)
     cfg = configs(tmp_path, method)[0]
-    done = policy_episode(EpisodeBatch([cfg]), load_policy(alone[0].path))
+    done = evaluation(EpisodeBatch([cfg]), load_policy(alone[0].path))
     last = alone[0].iterations.iloc[-1]
     for name, value in done.measures.items():
         assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
@@ -523,6 +524,31 @@ def test_episodes_that_break_off_are_counted_and_end_nothing(
     assert re.search(
         "2 of [68] episodes of training broke off .* environment step 1, substep 1: the state", told
     )
+
+
+@pytest.mark.physics
+def test_an_evaluation_that_breaks_off_ends_nothing(tmp_path, lone, monkeypatch, caplog) -> None:
+    alone = lone("ppo")
+    cfgs = configs(tmp_path, "ppo")
+    intact, calls = Population._advance, itertools.count()
+
+    def advance(self: Population, env: TensorEnv, actions: torch.Tensor) -> Any:
+        # In the third step of the second evaluation.
+        if env is self._evaluation and next(calls) == env.batch.horizon + 2:
+            make_not_finite(env.batch.problem.simulator, 1)
+        return intact(self, env, actions)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Population, "_advance", advance)
+        assert [one.status for one in carry(cfgs)] == ["finished"] * 3
+    for k in (0, 2):
+        assert "broken_evaluations" not in assert_same_numbers(cfgs[k], alone[k]).provenance
+    result = read(result_path(cfgs[1]))
+    assert result.provenance["broken_evaluations"] == 1 and result.best_iteration != 1
+    rows, whole = result.iterations["loss"], alone[1].iterations["loss"]
+    assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert str(result.path) in told and "the evaluation of iteration 1 broke off" in told
 
 
 @pytest.mark.physics

@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,7 +29,7 @@ from plab.objective import scores
 from plab.results import ResultsError, RunResult, read, result_path
 from plab.runners import RunError, rl, run_config
 from plab.runners.common import episode_columns
-from plab.runners.environments import policy_episode, shared_batches
+from plab.runners.environments import evaluation, shared_batches
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.replay import EpisodeReplay
 from plab.runners.rl_models import LinearDecay, cycle_steps
@@ -128,7 +129,7 @@ def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult],
     policy = load_policy(result.path)
     last = result.iterations.iloc[-1]
     (batch,) = shared_batches(CACHE, ([make_config(result.path.parents[2], method)], 1, "hard"))
-    done = policy_episode(batch, policy)
+    done = evaluation(batch, policy)
     assert {name: done.measures[name] for name in COLUMNS} == {name: last[name] for name in COLUMNS}
 
 
@@ -252,12 +253,12 @@ def test_an_update_is_the_unit_of_ppo_a_batch_of_episodes_that_of_the_others(tmp
 
 def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseException) -> None:
     """Let the run break off in the training that follows some evaluations."""
-    looked, intact = rl.RlRunner.episode, Trainer.note_step
+    looked, intact = rl.evaluation, Trainer.note_step
     counts = {"evaluations": 0, "steps": 0}
 
-    def episode(self, trainer):
+    def evaluated(batch, policy):
         counts["evaluations"] += 1
-        return looked(self, trainer)
+        return looked(batch, policy)
 
     def note_step(self, actions, infos):
         counts["steps"] += counts["evaluations"] >= evaluations
@@ -265,7 +266,7 @@ def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseEx
             raise error
         return intact(self, actions, infos)
 
-    monkeypatch.setattr(rl.RlRunner, "episode", episode)
+    monkeypatch.setattr(rl, "evaluation", evaluated)
     monkeypatch.setattr(Trainer, "note_step", note_step)
 
 
@@ -304,7 +305,7 @@ def test_networks_on_cuda_are_trained_resumed_and_kept(tmp_path, monkeypatch) ->
     assert_nothing_else_is_left(resumed)
     policy = load_policy(resumed.path, "cuda")
     assert policy.network.device.type == "cuda"
-    done = policy_episode(EpisodeBatch([cfg]), policy)
+    done = evaluation(EpisodeBatch([cfg]), policy)
     assert all(math.isfinite(done.measures[name]) for name in COLUMNS)
 
 
@@ -359,6 +360,50 @@ def test_an_episode_that_breaks_off_is_counted_and_ends_nothing(
     (told,) = (record.getMessage() for record in caplog.records)
     assert re.search(
         "1 of [68] episodes of training broke off .* environment step 1, substep 1: the state", told
+    )
+
+
+def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) -> None:
+    """Let an evaluation break off in its third step."""
+    intact, calls = module.evaluation, itertools.count()
+
+    def evaluated(batch: EpisodeBatch, policy: Any) -> Any:
+        steps, breaks = itertools.count(), next(calls) == number
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            if breaks and next(steps) == 2:
+                make_not_finite(batch.problem.simulator, 0)
+            return policy(observation)
+
+        return intact(batch, act)
+
+    monkeypatch.setattr(module, "evaluation", evaluated)
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_an_evaluation_that_breaks_off_ends_only_a_run_of_no_other(
+    tmp_path, finished, monkeypatch, caplog, number: int
+) -> None:
+    cfg = make_config(tmp_path, "ppo")
+    with monkeypatch.context() as patch:
+        break_evaluation(patch, rl, number)
+        if number == 0:
+            with pytest.raises(
+                RunError, match="iteration 0: environment step 1, substep 1: the state is not finite"
+            ):
+                run_config(cfg, CACHE)
+            assert_same_numbers(run(cfg), finished["ppo"])
+            return
+        result = run(cfg)
+    assert result.provenance["broken_evaluations"] == 1
+    assert np.isfinite(result.iterations[1:].to_numpy()).all()
+    rows, whole = result.iterations, finished["ppo"].iterations
+    others = [k for k in range(len(rows)) if k != number]
+    assert rows["loss"][others].equals(whole["loss"][others]) and rows["loss"][2] != whole["loss"][2]
+    assert result.best_iteration == whole["loss"][others].idxmin()
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert re.search(
+        "the evaluation of iteration 2 broke off .*: environment step 1, substep 1: the state", told
     )
 
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from plab.config import ActorConfig, Config, ConfigError, PolicyConfig, drawn_configs
 from plab.envs.core import EpisodeBatch
 from plab.problem import fits
-from plab.runners.environments import PolicyRunner, policy_episode, shared_batches
+from plab.runners.environments import PolicyRunner, evaluation, shared_batches
 from plab.runners.jobs import RunError
 from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
 from plab.runners.policy import Policy, save_policy
@@ -253,7 +253,9 @@ class ActorRunner(PolicyRunner):
             if why := self.note_broken(track, broken, training.episodes - before):
                 raise RunError(f"iteration {track.iteration}: {why}")
             self.enter("evaluate")
-        done = policy_episode(self._evaluation, training.predictor())
+        done = evaluation(self._evaluation, training.predictor())
+        if why := self.note_evaluation(track, done.failure):
+            raise RunError(f"iteration {track.iteration}: {why}")
         trained = (training.episodes - before) * horizon
         every, differentiated = training.round_episodes
         with_gradient = trained // every * differentiated
@@ -266,6 +268,7 @@ class ActorRunner(PolicyRunner):
             steps_forward=horizon + trained - with_gradient,
             steps_gradient=with_gradient,
             keep=True,
+            whole=not done.failure,
         )
 
     def extent(self) -> tuple[int, int, int]:

@@ -21,10 +21,10 @@ from plab.runners.common import LAST, episode_columns
 from plab.runners.runner import Runner, Track
 
 __all__ = [
-    "PolicyEpisode",
+    "Evaluation",
     "PolicyRunner",
     "environment_key",
-    "policy_episode",
+    "evaluation",
     "shared_batches",
     "torch_settings",
 ]
@@ -73,32 +73,56 @@ class PolicyRunner(Runner):
         )
         return ""
 
+    def note_evaluation(self, track: Track, failure: str) -> str:
+        """Warn of an evaluation that broke off, which is the best of none, and count it in the result's
+        provenance.
+
+        Args:
+            track: The run.
+            failure: When and why it broke off; empty if it did not.
+
+        Returns:
+            Why the run cannot go on, if it has no other actions yet; otherwise an empty text.
+        """
+        if not failure or track.best_actions is None:
+            return failure
+        result = track.job.run.result
+        result.provenance["broken_evaluations"] = result.provenance.get("broken_evaluations", 0) + 1
+        _log.warning(
+            "%s: the evaluation of iteration %d broke off and rested from then on: %s",
+            track.job.run.path,
+            track.iteration,
+            failure,
+        )
+        return ""
+
 
 @dataclass(frozen=True)
-class PolicyEpisode:
-    """What an episode of a policy gave: observations before each step, shape [T, entry], actions, shape
-    [T, A], and values of :func:`plab.runners.common.episode_columns`."""
+class Evaluation:
+    """What an episode of a deterministic policy gave: values of
+    :func:`plab.runners.common.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
+    not; from then on it rests as :meth:`plab.envs.core.EpisodeBatch.step` has it."""
 
-    observations: np.ndarray
-    actions: np.ndarray
     measures: dict[str, float]
+    actions: np.ndarray
+    failure: str
 
 
-def policy_episode(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> PolicyEpisode:
+def evaluation(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> Evaluation:
     """Run an episode of a policy, observations, shape [1, entry], to actions, shape [1, A], in a batch of
     one."""
     observation, _ = batch.reset()
     sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
-    observations, actions = [], []
+    actions, failure = [], ""
     for _ in range(batch.horizon):
-        observations.append(observation)
         actions.append(policy(observation))
-        step = batch.step(actions[-1])
+        step = batch.step(actions[-1], strict=False)
+        failure = failure or step.failures.get(0, "")
         observation, values = step.observation, step.info | {"reward": step.reward}
         for name in sums:
             sums[name] += float(values[name][0])
     last = {name: float(values[name][0]) for name in LAST}
-    return PolicyEpisode(np.concatenate(observations), np.concatenate(actions), sums | last)
+    return Evaluation(sums | last, np.concatenate(actions), failure)
 
 
 def environment_key(cfg: Config) -> str:

@@ -22,7 +22,7 @@ from stable_baselines3.common.policies import BasePolicy
 from plab.config import ConfigError, PolicyConfig, RlConfig
 from plab.progress import Report
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import PolicyEpisode, PolicyRunner, policy_episode, shared_batches
+from plab.runners.environments import PolicyRunner, evaluation, shared_batches
 from plab.runners.jobs import RunError
 from plab.runners.loggers import RunLog
 from plab.runners.model_state import restore_policy
@@ -74,16 +74,14 @@ class RlRunner(PolicyRunner):
             if why := self.note_broken(track, *trainer.take_broken()):
                 raise RunError(f"iteration {track.iteration}: {why}")
             self.enter("evaluate")
-        done = self.episode(trainer)
+        done = evaluation(self._evaluation, trainer.predict)
+        if why := self.note_evaluation(track, done.failure):
+            raise RunError(f"iteration {track.iteration}: {why}")
         measured = done.measures | trainer.take_statistics()
         simulated = trainer.steps - before + len(done.actions)
         # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
         counts = trainer.episodes, trainer.steps, simulated
-        return Step(measured, done.actions, trainer.state(), *counts, keep=True)
-
-    def episode(self, trainer: Trainer) -> PolicyEpisode:
-        """Run an episode of the deterministic policy."""
-        return policy_episode(self._evaluation, trainer.predict)
+        return Step(measured, done.actions, trainer.state(), *counts, keep=True, whole=not done.failure)
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""

@@ -51,6 +51,7 @@ class Step:
         steps_gradient: Those that it has simulated with a gradient.
         seconds: The run's share of the wall time; None: all of it.
         keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
+        whole: Whether the actions were run to the end; those that were not are never the best.
     """
 
     measures: Mapping[str, float]
@@ -62,6 +63,7 @@ class Step:
     steps_gradient: int = 0
     seconds: float | None = None
     keep: bool = False
+    whole: bool = True
 
 
 class Track:
@@ -132,6 +134,7 @@ class Track:
         # Of several with the highest score the one of lowest loss.
         if self._by_score and row["score"] != self._best_score:
             better = row["score"] > self._best_score
+        better = better and step.whole
         best: dict[str, Any] = {
             "best_actions": step.actions,
             "best_iteration": self.iteration,

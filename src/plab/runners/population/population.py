@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,11 @@ from plab.envs.core import Transition
 from plab.envs.tensors import TensorEnv
 from plab.families import family
 from plab.runners.common import LAST, episode_columns
-from plab.runners.environments import torch_settings
+from plab.runners.environments import Evaluation, torch_settings
 from plab.runners.population.agents import Agents
 from plab.runners.rl_models import Spaces, cycle_steps, total_steps
 
-__all__ = ["Evaluation", "Population", "population_settings"]
+__all__ = ["Population", "population_settings"]
 
 NOT_FINITE = "the policy's actions are not finite"
 
@@ -31,17 +30,6 @@ def population_settings(method: RlConfig) -> AbstractContextManager[None]:
     The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
     """
     return torch_settings(method.torch_threads, tf32=method.torch_device == "cuda")
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What an episode of an agent's deterministic policy gave: values of
-    :func:`plab.runners.common.episode_columns`, actions, shape [T, A], and why it broke off, empty if it
-    did not."""
-
-    measures: dict[str, float]
-    actions: np.ndarray
-    failure: str
 
 
 class Population:
@@ -128,11 +116,12 @@ class Population:
             observations = self._own(done.observation, 1)
         # From the device at once.
         rows = torch.stack([sums[name] for name in columns]).cpu().numpy()
-        ran = torch.stack(actions, dim=1).squeeze(2).cpu().numpy()
+        ran = torch.stack(actions, dim=1).squeeze(2)
+        self._lost |= ~ran.isfinite().all(2).all(1)
         evaluations = []
-        for own, k in zip(ran, self._numbers.tolist(), strict=True):
-            failure = failures.get(k, "") if np.isfinite(own).all() else NOT_FINITE
-            evaluations.append(Evaluation(dict(zip(columns, rows[:, k].tolist(), strict=True)), own, failure))
+        for own, k in zip(ran.cpu().numpy(), self._numbers.tolist(), strict=True):
+            measures = dict(zip(columns, rows[:, k].tolist(), strict=True))
+            evaluations.append(Evaluation(measures, own, failures.get(k, "")))
         return evaluations
 
     def take_statistics(self) -> list[dict[str, float]]:

@@ -113,7 +113,8 @@ class PopulationRunner(PolicyRunner):
         for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
             start = time.perf_counter()
             unusable = self.note_broken(track, broken.get(track.number, ()), ended)
-            if failure := lost.get(track.number) or done.failure or unusable:
+            unusable = unusable or self.note_evaluation(track, done.failure)
+            if failure := lost.get(track.number) or unusable:
                 track.fail(failure)
                 continue
             try:
@@ -130,7 +131,8 @@ class PopulationRunner(PolicyRunner):
             finished = population.steps >= self._total
             simulated = population.steps - before + len(done.actions)
             counts = population.episodes, population.steps, simulated
-            yield track, Step(measured, done.actions, states[place], *counts, seconds=seconds, keep=finished)
+            told: dict[str, Any] = {"seconds": seconds, "keep": finished, "whole": not done.failure}
+            yield track, Step(measured, done.actions, states[place], *counts, **told)
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
