@@ -44,7 +44,20 @@ class Adder(SumPhases):
         for i in range(values.shape[0]):
             scale = self.momentum_scale(1)
             for c in ti.static(range(4)):
-                self.add_to_number(ti.get_addr(self.grid, 0), 4 + c, c, values[i, c], scale)
+                self.add_to_node(ti.get_addr(self.grid, 0), 1, c, values[i, c], scale)
+
+    @ti.kernel
+    def scatter_far(self, far: ti.i32, value: ti.f32):
+        """Add to node 1 as if it were another's, of a grid that begins before this one."""
+        for _ in range(1):
+            scale = self.momentum_scale(1)
+            before = ti.static(4 * (8 if self.deterministic else 4)) * (ti.cast(far, ti.u64) - 1)
+            self.add_to_node(ti.get_addr(self.grid, 0) - before, far, 2, value, scale)
+
+    @ti.kernel
+    def units(self) -> ti.f64:
+        """How many units of momentum make 1."""
+        return ti.cast(self.momentum_scale(1)[0], ti.f64)
 
     @ti.kernel
     def gather_momentum(self):
@@ -64,7 +77,7 @@ class Adder(SumPhases):
     def scatter_adjoint(self, values: ti.types.ndarray()):
         for i in range(values.shape[0]):
             scale = self.adjoint_scale(0, 1)
-            self.add_to_number(ti.get_addr(self.grid, 0), 1, 1, values[i], scale)
+            self.add_to_node(ti.get_addr(self.grid, 0), 0, 1, values[i], scale)
 
     @ti.kernel
     def gather_adjoint(self):
@@ -101,6 +114,15 @@ def test_a_sum_of_floating_point_numbers_is_a_sum() -> None:
 @pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf, 2 * LARGEST_TERM])
 def test_a_sum_with_a_broken_term_is_not_finite(broken: float) -> None:
     assert not np.isfinite(total(np.array([1.0, broken, 2.0])))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_nodes_of_many_environments_have_addresses_of_64_bits(deterministic: bool) -> None:
+    adder = Adder(deterministic=deterministic)
+    adder.scatter_far(2**29 + 5, 1.5e-5)
+    added = adder.grid.to_numpy()
+    assert added[1, 2] == pytest.approx(1.5e-5 * (adder.units() if deterministic else 1.0))
+    assert np.count_nonzero(added) == 1
 
 
 def test_momentum_is_added_in_any_order_to_the_digits_of_float32() -> None:

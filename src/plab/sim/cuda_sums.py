@@ -48,7 +48,7 @@ class SumPhases(Storage):
     adjoint_bound: ti.Field
 
     def scattered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_number` adds to it."""
+        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_node` adds to it."""
         return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
 
     def sums(self, count: int) -> ti.Field:
@@ -97,13 +97,14 @@ class SumPhases(Storage):
     # -- grids --------------------------------------------------------------------------------------
 
     @ti.func
-    def add_to_number(self, first, number, component, value, scale: ti.template()):
-        """Add to a number of a grid that is scattered to, whose first is at an address.
+    def add_to_node(self, first, node, component, value, scale: ti.template()):
+        """Add to a component of a grid that is scattered to, whose ``first`` number is at an address.
 
         ``scale`` is a 4-vector of how many of the components' units make 1, as :meth:`momentum_scale` and
-        :meth:`adjoint_scale` return them; the number is one of ``component``.
+        :meth:`adjoint_scale` return them.
         """
-        place = ti.cast(number, ti.u64)
+        # In 64 bits: 32 count the nodes of many environments, but not their numbers.
+        place = 4 * ti.cast(node, ti.u64) + ti.cast(component, ti.u64)
         if ti.static(self.deterministic):
             add_i64(first + 8 * place, value * ti.select(component == 3, scale[3], scale[0]))
         elif ti.static(self.real == ti.f32):

@@ -48,6 +48,9 @@ WARP_NUMBERS = WARP * ROW_STRIDE + 27 * 4
 BLOCK_WARPS = WARP_BLOCK // WARP
 """Warps of a block."""
 
+SHARED_MASK = (1 << (BLOCK_WARPS * WARP_NUMBERS).bit_length()) - 1
+"""Largest index of a block's numbers in shared memory, all bits set."""
+
 NODE_BITS = 3 * BLOCK_BITS
 NODE_MASK = (1 << NODE_BITS) - 1
 
@@ -66,7 +69,7 @@ def packed(a, b):
 def within(at):
     """An index of shared memory, of which LLVM can tell that sums with it do not wrap: with a constant they
     cost nothing."""
-    return at & 0x1FFF
+    return at & SHARED_MASK
 
 
 class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
@@ -150,7 +153,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
         """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
         of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32.
-        ``unit`` has the units of the components, see :meth:`add_to_number`."""
+        ``unit`` has the units of the components, see :meth:`add_to_node`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for turn in ti.static(range(4)):
@@ -275,7 +278,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         numbers. Then the lanes are the 27 nodes of a run's stencil, and each sums what the run's particles
         give to its node. The sums change lanes once more, so that neighbours add neighbouring numbers to the
         grid: the device takes up to 8 of them at once. ``heads`` and ``taking`` are those of :meth:`heads_of`
-        for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_number`. If ``folded``, nodes are
+        for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_node`. If ``folded``, nodes are
         those of :meth:`folded_node`; ``folds`` has a bit for each axis along which the base node is the
         first.
         """
@@ -338,6 +341,5 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                         offset = ti.max(offset, least)
                     component = ti.static(components[0]) + number % width
                     share = rows[within(sums + number)]
-                    at = 4 * (head + self.linear(offset)) + component
-                    self.add_to_number(first, at, component, share, scale)
+                    self.add_to_node(first, head + self.linear(offset), component, share, scale)
             self.wait_for_warp()

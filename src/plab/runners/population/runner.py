@@ -131,8 +131,11 @@ class PopulationRunner(PolicyRunner):
             finished = population.steps >= self._total
             simulated = population.steps - before + len(done.actions)
             counts = population.episodes, population.steps, simulated
-            told: dict[str, Any] = {"seconds": seconds, "keep": finished, "whole": not done.failure}
-            yield track, Step(measured, done.actions, states[place], *counts, **told)
+            whole = not done.failure
+            step = Step(
+                measured, done.actions, states[place], *counts, seconds=seconds, keep=finished, whole=whole
+            )
+            yield track, step
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
