@@ -11,8 +11,9 @@ import pytest
 from plab.losses import make_terms
 from plab.scene import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator
-from plab.sim.memory import ENTRIES_MAX
+from plab.sim.memory import ENTRIES_MAX, batch_limit
 from plab.sim.order import curve_order, hilbert_index
+from plab.sim.storage import CHUNKS, INDEX_MASK
 
 pytestmark = pytest.mark.physics
 
@@ -276,6 +277,15 @@ def test_too_many_environments_for_an_array_are_named(
     monkeypatch.setitem(ENTRIES_MAX, sim.device, 1)
     with pytest.raises(MemoryError, match="3 environments are too many for a gradient of"):
         sim.rollout(actions())
+
+
+def test_more_nodes_than_can_be_numbered_are_refused(device: str) -> None:
+    scene = replace(ball(), grid_size=256, dt=2e-5, substeps=10)
+    most = batch_limit(scene, "float32", device, 1e12)
+    grids = 256**3 * (1 if device == "cuda" else CHUNKS)
+    assert most * grids <= INDEX_MASK < (most + 1) * grids
+    with pytest.raises(MemoryError, match=rf"of 256\^3 nodes are more .* use at most {most} at once"):
+        Simulator([scene] * (most + 1), device=device)
 
 
 def test_bad_physics_is_refused() -> None:

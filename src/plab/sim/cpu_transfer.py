@@ -39,11 +39,6 @@ class TransferTiles(ParticlePhases):
 
     def _allocate(self) -> None:
         grids = self.batch * self.chunks
-        if grids * self.nodes > INDEX_MASK:
-            raise MemoryError(
-                f"{self.batch} environments of {self.n}^3 nodes are more than one simulator can number: "
-                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
-            )
         # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
         self.scratch = ti.Vector.field(4, self.real, shape=grids * SCRATCH)
         self.stencils = ti.Vector.field(self.lanes, self.real, shape=grids * STENCILS)

@@ -7,7 +7,7 @@ import math
 import taichi as ti
 
 from plab.scene import Scene
-from plab.sim.storage import BLOCK, CHUNKS, LANES, STATE, STATE_MASK
+from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
 
 __all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
@@ -61,10 +61,11 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     kept += 6
     # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts by cell; target and
     # distance.
-    nodes = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
-    grids = nodes * (8 * (CHUNKS if device == "cpu" else 1) + 9) + 2 * scene.grid_size**3
+    nodes, chunks = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3, CHUNKS if device == "cpu" else 1
+    grids = nodes * (8 * chunks + 9) + 2 * scene.grid_size**3
     fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
-    return max(1, min(fitting, ENTRIES_MAX[device] // ((slots_per_step + 1) * entries)))
+    numbered = ENTRIES_MAX[device] // ((slots_per_step + 1) * entries), INDEX_MASK // (chunks * nodes)
+    return max(1, min(fitting, *numbered))
 
 
 def array_bytes(data: ti.Field | ti.Ndarray) -> int:

@@ -75,7 +75,8 @@ STATE_MASK = 2**27 - 1
 its successors fit into 32 bits."""
 
 INDEX_MASK = 2**30 - 1
-"""Largest index into other fields on the CPU, all bits set."""
+"""Largest index into other fields on the CPU, all bits set; on CUDA grids are read in halves of a node, which
+are numbered in 32 bits."""
 
 # What follows are strides of the threads' working areas, which keep apart what two threads write: a cache
 # line that both of them use costs more than the work itself.
@@ -179,6 +180,11 @@ class Storage:
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
+        if b * self.chunks * self.nodes > INDEX_MASK:
+            raise MemoryError(
+                f"{b} environments of {self.n}^3 nodes are more than one simulator can number: "
+                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
+            )
         m = max(1, self.manipulators)
         self.lane_type = ti.types.vector(self.lanes, real)
         # Vectors first: fields lie one behind the other, and behind single numbers a vector straddles two
