@@ -225,6 +225,15 @@ def test_an_experiment_presets_what_it_says():
     assert load_config(["+experiment=yield_ablation"]).task.yield_stress == 200
 
 
+def test_the_fast_recipe_is_ppo_with_large_batches():
+    cfg, faithful = load_config(["+experiment=ppo_fast", "task=Torus"]), load_config(["method=ppo"])
+    fast, slow = dataclasses.asdict(cfg.method), dataclasses.asdict(faithful.method)
+    assert {key for key in slow if fast[key] != slow[key]} == {
+        *("name", "episodes", "num_envs", "evaluate_every", "steps_per_update", "minibatches", "epochs"),
+        "statistics_episodes",
+    }
+
+
 def test_reference_is_fast_in_float64():
     fast, reference = (dataclasses.asdict(load_config([f"sim={s}"]).sim) for s in ("fast", "reference"))
     assert reference == fast | {"precision": "float64"}
