@@ -14,6 +14,7 @@ checkpoints included, without their files.
 
 from __future__ import annotations
 
+import gc
 import sys
 import tempfile
 import time
@@ -108,6 +109,9 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
     method, horizon = cfg.method_as(RlConfig), cfg.sim.horizon
     cfgs = [replace(cfg, seed=seed) for seed in range(agents)]
     if torch.cuda.is_initialized():
+        # The population before, whose parts know each other, and its share of the memory.
+        gc.collect()
+        torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     with population_settings(method):
         training = TensorEnv([one for one in cfgs for _ in range(method.num_envs)], contact=method.contact)

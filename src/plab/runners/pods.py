@@ -10,7 +10,7 @@ scenes alike is that all of them begin as the policy's. Where there are more sce
 take them in turn, and the policy imitates what each scene gave the last time. To reproduce a result:
 
     python -m plab.run task=Move variant=random seed_scene=9000 observe_target=true observe_particles=10 \
-        method=pods method.scenes=640 method.shift=0.2 method.episodes=30000 seed=0 sim.device=cuda
+        method=pods method.scenes=1280 method.shift=0.2 method.episodes=15360 seed=0 sim.device=cuda
 """
 
 from __future__ import annotations
