@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -63,7 +65,14 @@ def make_recipe(target: Mapping[str, Any]) -> Recipe:
     Raises:
         TargetError: If the recipe or a parameter does not exist, is missing or has a wrong type.
     """
-    parameters = dict(target)
+    return _made(pickle.dumps(dict(target)))
+
+
+@functools.lru_cache(maxsize=64)
+def _made(pickled: bytes) -> Recipe:
+    """Make the recipe of a pickled ``target`` section; a configuration's checks and its target ask for the
+    same one several times, and OmegaConf takes milliseconds."""
+    parameters = pickle.loads(pickled)
     name = parameters.pop("recipe", None)
     kind = RECIPES.get(str(name))
     if kind is None:
