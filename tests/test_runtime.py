@@ -43,6 +43,16 @@ def test_standard_output_belongs_to_the_caller(module) -> None:
     assert done.stdout == ""
 
 
+def test_taichi_does_not_tell_its_makers() -> None:
+    """It would ask for newer versions of itself, in a thread."""
+    given = {name: value for name, value in os.environ.items() if name != "TI_SKIP_VERSION_CHECK"}
+    begin = (
+        "from plab.sim import runtime; import sys, threading; threading.Thread.start = lambda _: sys.exit(9)"
+    )
+    command = [sys.executable, "-c", f"{begin}; runtime.start_runtime('cpu', 'float32')"]
+    assert subprocess.run(command, env=given, check=False).returncode == 0
+
+
 @pytest.mark.physics
 def test_a_function_is_read_once_and_errors_still_name_its_line(monkeypatch) -> None:
     start_runtime("cpu", "float32")

@@ -3,8 +3,10 @@
 import inspect
 import os
 
-# Taichi prints a banner on standard output unless told so before it is imported, by whichever part of plab.
+# Before Taichi is imported, by whichever part of plab: it would print a banner on standard output, and send
+# version, platform and a number of its own to its makers.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
 from plab.envs import register_suite
 
