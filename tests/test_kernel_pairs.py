@@ -14,11 +14,12 @@ import taichi as ti
 import suite
 from plab.scene import Scene
 from plab.sim.cpu_phases import CpuPhases
+from plab.sim.cpu_stencils import address_of
 from plab.sim.cuda_threads import ThreadPhases
 from plab.sim.runtime import start_runtime
 from plab.sim.skips import Skips
 from plab.sim.storage import FRAME_ADJOINT, STATE
-from plab.sim.transfer import scatter, spline
+from plab.sim.transfer import spline
 
 pytestmark = [
     pytest.mark.physics,
@@ -51,29 +52,49 @@ MIXED = [
 class Tiles(CpuPhases):
     """The CPU's phases, one at a time."""
 
-    @ti.kernel
-    def scatter_all(self, state: ti.types.ndarray(ndim=1)):
-        for e in range(self.batch):
-            for c in range(self.chunks):
-                self.scatter_chunk(state, 0, 1, e, c, 1)
+    def scatter_all(self, state: ti.Ndarray) -> None:
+        self._scatter(state, address_of(state))
+
+    def gather_all(self, state: ti.Ndarray) -> None:
+        self._gather(state, address_of(state))
+
+    def scatter_adjoint_all(self, state: ti.Ndarray, bar: ti.Ndarray) -> None:
+        self._scatter_adjoint(state, bar, address_of(bar))
+
+    def gather_adjoint_all(self, state: ti.Ndarray, bar: ti.Ndarray) -> None:
+        self._gather_adjoint(state, address_of(state), bar, address_of(bar))
 
     @ti.kernel
-    def gather_all(self, state: ti.types.ndarray(ndim=1)):
+    def _scatter(self, state: ti.types.ndarray(ndim=1), state_at: ti.u64):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.gather_chunk(state, 0, 1, e, c, 6)
+                self.scatter_chunk(state, state_at, 0, 1, e, c, 1)
 
     @ti.kernel
-    def scatter_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+    def _gather(self, state: ti.types.ndarray(ndim=1), state_at: ti.u64):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.scatter_chunk_adjoint(state, 0, 1, bar, e, c, 2)
+                self.gather_chunk(state, state_at, 0, 1, e, c, 6)
 
     @ti.kernel
-    def gather_adjoint_all(self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1)):
+    def _scatter_adjoint(
+        self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1), bar_at: ti.u64
+    ):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.gather_chunk_adjoint(state, 0, 1, bar, e, c)
+                self.scatter_chunk_adjoint(state, 0, 1, bar, bar_at, e, c, 2)
+
+    @ti.kernel
+    def _gather_adjoint(
+        self,
+        state: ti.types.ndarray(ndim=1),
+        state_at: ti.u64,
+        bar: ti.types.ndarray(ndim=1),
+        bar_at: ti.u64,
+    ):
+        for e in range(self.batch):
+            for c in range(self.chunks):
+                self.gather_chunk_adjoint(state, state_at, 0, 1, bar, bar_at, e, c)
 
     @ti.kernel
     def advance_all(self, poses: ti.types.ndarray(ndim=1), actions: ti.types.ndarray(ndim=1)):
@@ -95,8 +116,10 @@ class Threads(ThreadPhases):
     @ti.func
     def scatter_alone(self, grid: ti.template(), e, base, fx, field: ti.template()):
         w = spline(fx)
-        node = e * self.nodes + self.linear(base)
-        scatter(grid, node, self.axis * self.axis, self.axis, w, field, self.scratch, 0)
+        for i, j, k in ti.static(ti.ndrange(3, 3, 3)):
+            node = e * self.nodes + self.linear(base + ti.Vector([i, j, k]))
+            value = field[0] + i * field[1] + j * field[2] + k * field[3]
+            grid[node] += w[i][0] * w[j][1] * w[k][2] * value
 
     @ti.kernel
     def scatter_all(self, state: ti.types.ndarray(ndim=1)):
@@ -172,7 +195,6 @@ def built(scenes: list[Scene]) -> tuple[Tiles, Threads]:
         phases.fill_bodies(scenes, order)
         phases.allocate_adjoint()
         phases.clear_adjoint()
-    both[1].scratch = ti.Vector.field(4, runtime.real, shape=9)
     return both
 
 

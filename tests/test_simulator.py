@@ -84,7 +84,7 @@ def sim(device: str) -> Simulator:
 
 def test_no_vector_of_a_tile_or_a_node_straddles_two_cache_lines() -> None:
     engine = simulator(SCENES[:1], "cpu")._engine
-    for name in ("scratch", "stencils", "bases", "strains", "affine", "momentum", "velocity"):
+    for name in ("stencils", "bases", "strains", "affine", "momentum", "velocity"):
         field = getattr(engine, name)
         node, offset = field.parent().ptr, 0
         while node is not None:

@@ -6,6 +6,7 @@ of its own: LLVM gives up on larger ones.
 
 import taichi as ti
 
+from plab.sim.cpu_stencils import copy
 from plab.sim.linalg import det
 from plab.sim.material import (
     flow,
@@ -49,7 +50,9 @@ class MaterialTiles(ParticlePhases):
         return self.served(z_squared.max(), j.max()) and j.min() >= self.series.j_min
 
     @ti.func
-    def material_tile(self, state: ti.template(), source, target, entry9, e, at, update: ti.template()):
+    def material_tile(
+        self, state: ti.template(), state_at, source, target, entry9, e, at, update: ti.template()
+    ):
         """Return mapping and A = stress_scale tau + mass C for a tile, in the thread's share of ``strains``
         from entry ``at``; the new F is stored if ``update``."""
         p = self.parameters_of_tile(e, entry9)
@@ -74,10 +77,8 @@ class MaterialTiles(ParticlePhases):
                     trial = [self.strains[at + i] for i in range(9)]
                     f_new = flow(strain, trial, p[2], self.series)
                     for i in ti.static(range(9)):
-                        state[target + AT_F + i] = f_new[i]
-                else:
-                    for i in ti.static(range(9)):
-                        state[target + AT_F + i] = self.strains[at + i]
+                        self.strains[at + i] = f_new[i]
+                copy(self.real, self.lane_in(self.strains, at, 0), self.lane_of(state_at, target + AT_F, 0))
         else:
             for lane in range(self.lanes):
                 a = self.spectral_material(state, source, target, lane, e, update)
@@ -85,7 +86,9 @@ class MaterialTiles(ParticlePhases):
                     self.affine[entry9 + i][lane] = a[i]
 
     @ti.func
-    def material_tile_adjoint(self, state: ti.template(), source, bar: ti.template(), target, entry9, e, at):
+    def material_tile_adjoint(
+        self, state: ti.template(), source, bar: ti.template(), bar_at, target, entry9, e, at
+    ):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
         p = self.parameters_of_tile(e, entry9)
         served = self.strain_tile(state, source, at)
@@ -98,7 +101,7 @@ class MaterialTiles(ParticlePhases):
                     self.strains[at + STRAIN_G_BAR + i] = bar[target + AT_F + i]
             if ti.static(self.full_gradient):
                 self.parameter_tile_adjoint(entry9, p[2], at)
-            self.strain_tile_adjoint(state, source, bar, target, entry9, p[2], at)
+            self.strain_tile_adjoint(state, source, bar_at, target, entry9, p[2], at)
         else:
             for lane in range(self.lanes):
                 a_bar = self.load(self.affine, entry9, lane, 9)
@@ -193,10 +196,8 @@ class MaterialTiles(ParticlePhases):
             self.material_bar[row, i] = self.material_bar[row, i] + wide
 
     @ti.func
-    def strain_tile_adjoint(
-        self, state: ti.template(), source, bar: ti.template(), target, entry9, yield_strain, at
-    ):
-        """Adjoint of a tile's strain, from ``strains`` to C and F in ``bar``."""
+    def strain_tile_adjoint(self, state: ti.template(), source, bar_at, target, entry9, yield_strain, at):
+        """Adjoint of a tile's strain, from ``strains`` to C and F in the array at ``bar_at``."""
         # A loop of one round, which LLVM cannot know: it keeps the two parts in blocks of their own.
         for _ in range(self.once[None]):
             z = [self.strains[at + STRAIN_Z + i] for i in range(6)]
@@ -230,6 +231,6 @@ class MaterialTiles(ParticlePhases):
                 self.strains[at + i] = c_out[i]
                 self.strains[at + STRAIN_D + i] = f_out[i]
         for i in ti.static(range(9)):
-            bar[target + AT_C + i] = self.strains[at + i] + self.mass * self.affine[entry9 + i]
-        for i in ti.static(range(9)):
-            bar[target + AT_F + i] = self.strains[at + STRAIN_D + i]
+            self.strains[at + i] = self.strains[at + i] + self.mass * self.affine[entry9 + i]
+        copy(self.real, self.lane_in(self.strains, at, 0), self.lane_of(bar_at, target + AT_C, 0))
+        copy(self.real, self.lane_in(self.strains, at + STRAIN_D, 0), self.lane_of(bar_at, target + AT_F, 0))

@@ -11,7 +11,7 @@ from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, with_unit_rotation
-from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, SCRATCH, STENCILS, STRAINS
+from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STENCILS, STRAINS
 from plab.sim.term_phases import TermPhases
 
 __all__ = ["BLOCK_NODES", "CpuPhases"]
@@ -66,7 +66,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     # -- phases of one chunk ------------------------------------------------------------------------
 
     @ti.func
-    def scatter_chunk(self, state: ti.template(), before, after, e, c, stamp):
+    def scatter_chunk(self, state: ti.template(), state_at, before, after, e, c, stamp):
         """Material update and scatter of momentum and mass."""
         grid_index = e * self.chunks + c
         at = self.bounded(grid_index * STENCILS)
@@ -77,6 +77,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             entry9 = self.bounded((e * self.tiles + tile) * 9)
             self.material_tile(
                 state,
+                state_at,
                 source,
                 self.tile_entry(after, e, tile),
                 entry9,
@@ -91,9 +92,8 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                base_node = self.bases[bases_at + NODE][lane]
-                node = self.bounded(grid_index * self.nodes + base_node)
-                self.scatter_momentum(entry9, lane, base_node, node, at, self.bounded(grid_index * SCRATCH))
+                node = self.bounded(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at)
 
     @ti.func
     def grid_chunk(self, e, c, s):
@@ -125,7 +125,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         return total
 
     @ti.func
-    def gather_chunk(self, state: ti.template(), before, after, e, c, time):
+    def gather_chunk(self, state: ti.template(), state_at, before, after, e, c, time):
         """Velocities, affine matrices and positions after the substep."""
         grid_index = e * self.chunks + c
         at = self.bounded(grid_index * STENCILS)
@@ -136,24 +136,24 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             self.stencil_tile(state, source, at, bases_at, False)
             for lane in range(self.lanes_of(tile)):
                 node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
-                self.gather_particle(
-                    state, source, target, lane, node, e, time, at, self.bounded(grid_index * SCRATCH)
-                )
+                self.gather_particle(state_at, source, target, lane, node, e, time, at)
 
     @ti.func
-    def scatter_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c, stamp):
+    def scatter_chunk_adjoint(
+        self, state: ti.template(), before, after, bar: ti.template(), bar_at, e, c, stamp
+    ):
         """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
         at = self.bounded(grid_index * STENCILS)
         bases_at = self.bounded(grid_index * BASES)
-        scratch_at = self.bounded(grid_index * SCRATCH)
         known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)
             entry = self.tile_entry(0, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
-            self.material_tile(state, source, target, entry9, e, self.bounded(grid_index * STRAINS), False)
+            at_strains = self.bounded(grid_index * STRAINS)
+            self.material_tile(state, ti.u64(0), source, target, entry9, e, at_strains, False)
             self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
             self.adjoint_tile(state, source, target, bar, entry, at)
@@ -162,10 +162,9 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 if key != known:
                     self.mark(grid_index, key, stamp)
                     known = key
-                base_node = self.bases[bases_at + NODE][lane]
-                node = self.bounded(grid_index * self.nodes + base_node)
-                self.scatter_momentum(entry9, lane, base_node, node, at, scratch_at)
-                self.scatter_adjoint(bar, entry, lane, base_node, node, at, scratch_at)
+                node = self.bounded(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
+                self.scatter_momentum(entry9, lane, node, at)
+                self.scatter_adjoint(bar_at, entry, lane, node, at)
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
@@ -186,7 +185,9 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 self.momentum_bar[e * self.nodes + node] = total_bar
 
     @ti.func
-    def gather_chunk_adjoint(self, state: ti.template(), before, after, bar: ti.template(), e, c):
+    def gather_chunk_adjoint(
+        self, state: ti.template(), state_at, before, after, bar: ti.template(), bar_at, e, c
+    ):
         """Adjoints of the particles before the substep."""
         grid_index = e * self.chunks + c
         at = self.bounded(grid_index * STENCILS)
@@ -201,20 +202,9 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
                 node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
-                self.gather_particle_adjoint(
-                    state,
-                    source,
-                    target,
-                    bar,
-                    entry,
-                    entry9,
-                    lane,
-                    node,
-                    at,
-                    self.bounded(grid_index * SCRATCH),
-                )
+                self.gather_particle_adjoint(state_at, source, target, bar_at, entry, entry9, lane, node, at)
             self.material_tile_adjoint(
-                state, source, bar, entry, entry9, e, self.bounded(grid_index * STRAINS)
+                state, source, bar, bar_at, entry, entry9, e, self.bounded(grid_index * STRAINS)
             )
 
     # -- poses --------------------------------------------------------------------------------------

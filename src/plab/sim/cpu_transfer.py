@@ -1,18 +1,19 @@
 """Transfers on the CPU: what a tile's particles need of their stencils, computed by lanes, and sums over the
 nodes of one particle after the other.
 
-LLVM vectorises what ends in stores to a field, and what begins with loads from one. So each part of the work
-leaves its results in ``stencils`` (lane vectors, one particle per lane) or in ``scratch`` (4-vectors of one
-particle), and the next part takes them from there. ``at``, ``bases_at`` and ``scratch_at`` are the first
-entries of a thread's shares of ``stencils``, ``bases`` and ``scratch``; ``source``, ``target`` and ``entry9``
-those of a tile in states and in ``affine``.
+LLVM vectorises what ends in stores to a field, and what begins with loads from one. So the first part leaves
+its results in ``stencils`` (lane vectors, one particle per lane), and the second takes them from there.
+``at`` and ``bases_at`` are the first entries of a thread's shares of ``stencils`` and ``bases``; ``source``,
+``target`` and ``entry9`` those of a tile in states and in ``affine``; ``state_at`` and ``bar_at`` are the
+addresses of arrays of states.
 """
 
 import taichi as ti
 
+from plab.sim.cpu_stencils import gather, gather_adjoint, scatter
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import AT_C, AT_V, BASES, INDEX_MASK, SCRATCH, STENCILS
-from plab.sim.transfer import at_base, column, gather, gather_adjoint, scatter, spline, spline_slope
+from plab.sim.storage import AT_C, AT_V, BASES, INDEX_MASK, STENCILS
+from plab.sim.transfer import at_base, spline, spline_slope
 
 __all__ = ["TransferTiles"]
 
@@ -40,7 +41,6 @@ class TransferTiles(ParticlePhases):
     def _allocate(self) -> None:
         grids = self.batch * self.chunks
         # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
-        self.scratch = ti.Vector.field(4, self.real, shape=grids * SCRATCH)
         self.stencils = ti.Vector.field(self.lanes, self.real, shape=grids * STENCILS)
         self.bases = ti.Vector.field(self.lanes, ti.i32, shape=grids * BASES)
         super()._allocate()
@@ -113,129 +113,58 @@ class TransferTiles(ParticlePhases):
     # -- particle by particle -----------------------------------------------------------------------
 
     @ti.func
-    def weights(self, at, lane):
-        """A particle's weights (or, from their first entry, slopes) as 3-vectors by offset."""
-        return [
-            ti.Vector(
-                [
-                    self.stencils[at + 3 * k][lane],
-                    self.stencils[at + 3 * k + 1][lane],
-                    self.stencils[at + 3 * k + 2][lane],
-                ]
-            )
-            for k in range(3)
-        ]
+    def scatter_momentum(self, entry9, lane, grid_node, at):
+        """Add a particle's momentum and mass to its nodes; ``grid_node`` is its base node in ``momentum``."""
+        grid, stencil = ti.get_addr(self.momentum, [grid_node]), self.lane_in(self.stencils, at, lane)
+        value = self.lane_in(self.stencils, at + MOMENTUM_FIELD, lane)
+        a = self.lane_in(self.affine, entry9, lane)
+        scatter(self.real, grid, stencil, value, a, self.axis, self.mass, self.dx)
 
     @ti.func
-    def own(self, entry, base_node):
-        """An entry, the same, that LLVM takes for a particle's own: with one for the whole tile it would keep
-        an address for each of dozens of entries, more than there are registers.
-
-        ``base_node`` is the base node as it stands in ``bases``: not negative, but LLVM must not know.
-        """
-        return self.bounded(entry + (base_node >> 31))
-
-    @ti.func
-    def base_value(self, at, lane, last):
-        """Value of an affine field at a particle's base node, as a 4-vector."""
-        return ti.Vector(
-            [self.stencils[at][lane], self.stencils[at + 1][lane], self.stencils[at + 2][lane], last]
-        )
-
-    @ti.func
-    def scatter_momentum(self, entry9, lane, base_node, grid_node, at, scratch_at):
-        """Add a particle's momentum and mass to its nodes; ``base_node`` is from ``bases``, ``grid_node`` its
-        index in ``momentum``."""
-        a = self.load(self.affine, self.own(entry9, base_node), lane, 9)
-        value = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        own_scratch = self.own(scratch_at, base_node)
-        self.scatter_field(self.momentum, grid_node, value, a, self.dx, lane, at, own_scratch)
-
-    @ti.func
-    def scatter_adjoint(self, bar: ti.template(), target, lane, base_node, grid_node, at, scratch_at):
+    def scatter_adjoint(self, bar_at, target, lane, grid_node, at):
         """Add what a particle contributes to the adjoint of the grid's velocities, from that of the state
         after the substep."""
-        c_bar = self.load(bar, target + AT_C, lane, 9)
-        value = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
-        own_scratch = self.own(scratch_at, base_node)
-        self.scatter_field(
-            self.velocity_bar, grid_node, value, c_bar, 4.0 * self.inv_dx, lane, at, own_scratch
-        )
+        grid, stencil = ti.get_addr(self.velocity_bar, [grid_node]), self.lane_in(self.stencils, at, lane)
+        value = self.lane_in(self.stencils, at + ADJOINT_FIELD, lane)
+        c_bar = self.lane_of(bar_at, target + AT_C, lane)
+        scatter(self.real, grid, stencil, value, c_bar, self.axis, 0.0, 4.0 * self.inv_dx)
 
     @ti.func
-    def scatter_field(
-        self, grid: ti.template(), grid_node, value, a: ti.template(), scale, lane, at, scratch_at
-    ):
-        """Scatter an affine field: its value at the base node, its increments scale times A's columns."""
-        q = [value, column(a, 0, scale), column(a, 1, scale), column(a, 2, scale)]
-        w = self.weights(at + WEIGHTS, lane)
-        scatter(grid, grid_node, self.axis * self.axis, self.axis, w, q, self.scratch, scratch_at)
-
-    @ti.func
-    def gather_particle(self, state: ti.template(), source, target, lane, node, e, time, at, scratch_at):
+    def gather_particle(self, state_at, source, target, lane, node, e, time, at):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
-        # A variable: what is passed on as an expression is compiled again wherever it is used.
-        w = self.weights(at + WEIGHTS, lane)
-        gather(self.velocity, node, self.axis * self.axis, self.axis, w, self.scratch, scratch_at)
-        f = [self.stencils[at + OFFSETS + j][lane] for j in range(3)]
-        x = self.vector(state, source, lane)
-        m0 = self.scratch[scratch_at]
-        mx = self.scratch[scratch_at + 1]
-        my = self.scratch[scratch_at + 2]
-        mz = self.scratch[scratch_at + 3]
-        # Everything is read before the first store, after which LLVM has to look up where arrays are again.
-        self.put_gathered(state, target, lane, x, f, m0, mx, my, mz, e, time)
+        speed = gather(
+            self.real,
+            ti.get_addr(self.velocity, [node]),
+            self.lane_in(self.stencils, at, lane),
+            self.lane_of(state_at, source, lane),
+            self.lane_of(state_at, target, lane),
+            self.axis,
+            self.dt,
+            self.x_max,
+            4.0 * self.inv_dx,
+        )
+        self.note_speed(speed, e, time)
 
     @ti.func
-    def gather_particle_adjoint(
-        self,
-        state: ti.template(),
-        source,
-        after,
-        bar: ti.template(),
-        target,
-        entry9,
-        lane,
-        node,
-        at,
-        scratch_at,
-    ):
-        """Adjoint of both transfers for one particle: of x and v in ``bar``, and of A in ``affine``."""
-        a = self.load(self.affine, entry9, lane, 9)
-        c_bar = self.load(bar, target + AT_C, lane, 9)
-        self.scratch[scratch_at + 7] = self.base_value(at + MOMENTUM_FIELD, lane, self.mass)
-        self.scratch[scratch_at + 11] = self.base_value(at + ADJOINT_FIELD, lane, 0.0)
-        for j in ti.static(range(3)):
-            self.scratch[scratch_at + 8 + j] = column(a, j, self.dx)
-            self.scratch[scratch_at + 12 + j] = column(c_bar, j, 4.0 * self.inv_dx)
-        w = self.weights(at + WEIGHTS, lane)
-        dw = self.weights(at + SLOPES, lane)
-        for i in ti.static(range(3)):
-            self.scratch[scratch_at + 15][i] = w[i][0]
-            self.scratch[scratch_at + 16][i] = dw[i][0]
-            self.scratch[scratch_at + 17][i] = float(i)
+    def gather_particle_adjoint(self, state_at, source, after, bar_at, target, entry9, lane, node, at):
+        """Adjoint of both transfers for one particle: of x and v in the array at ``bar_at``, and of A in
+        ``affine``."""
         gather_adjoint(
-            self.velocity,
-            self.momentum_bar,
-            node,
-            self.axis * self.axis,
+            self.real,
+            ti.get_addr(self.velocity, [node]),
+            ti.get_addr(self.momentum_bar, [node]),
+            self.lane_in(self.stencils, at, lane),
+            self.lane_in(self.affine, entry9, lane),
+            self.lane_of(state_at, source, lane),
+            self.lane_of(state_at, after, lane),
+            self.lane_of(bar_at, target, lane),
             self.axis,
-            w,
-            dw,
-            self.scratch,
-            scratch_at,
+            self.dt,
+            self.x_max,
+            self.dx,
+            self.inv_dx,
+            self.mass,
         )
-        slope = ti.Vector([self.scratch[scratch_at + 4 + i].sum() for i in range(3)])
-        f = [self.stencils[at + OFFSETS + j][lane] for j in range(3)]
-        x = self.vector(state, source, lane)
-        v_after = self.vector(state, after + AT_V, lane)
-        m0 = self.scratch[scratch_at]
-        mx = self.scratch[scratch_at + 1]
-        my = self.scratch[scratch_at + 2]
-        mz = self.scratch[scratch_at + 3]
-        a_bar = self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, f, m0, mx, my, mz, slope)
-        for i in ti.static(range(9)):
-            self.affine[entry9 + i][lane] = a_bar[i]
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 

@@ -171,6 +171,66 @@ class CudaPhases(OrderPhases, PosePhases):
         return self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, fx, m0, mx, my, mz, slope)
 
     @ti.func
+    def put_gathered(self, state: ti.template(), target, lane, x, fx, m0, mx, my, mz, e, time):
+        """Write v, C and x after the substep of the particle at x, from moments of the grid's velocities.
+
+        ``m0`` is the sum of w v over the stencil, ``mx``, ``my``, ``mz`` are those of w v times the node's
+        offset (0, 1, 2) along an axis, 4-vectors whose last entry is ignored. ``time`` is noted where the
+        speed is not sane.
+        """
+        scale = 4.0 * self.inv_dx
+        c0 = scale * (mx - fx[0] * m0)
+        c1 = scale * (my - fx[1] * m0)
+        c2 = scale * (mz - fx[2] * m0)
+        for i in ti.static(range(3)):
+            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * m0[i], 0.0), self.x_max)
+            state[target + AT_V + i][lane] = m0[i]
+            state[target + AT_C + 3 * i][lane] = c0[i]
+            state[target + AT_C + 3 * i + 1][lane] = c1[i]
+            state[target + AT_C + 3 * i + 2][lane] = c2[i]
+        speed = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
+        self.note_speed(speed, e, time)
+
+    @ti.func
+    def put_transfer_adjoint(
+        self,
+        bar: ti.template(),
+        target,
+        lane,
+        a: ti.template(),
+        c_bar: ti.template(),
+        x,
+        v_after,
+        fx: ti.template(),
+        m0,
+        mx,
+        my,
+        mz,
+        slope,
+    ):
+        """Write the adjoints of x and v before the substep; returns that of A, row by row.
+
+        Takes A, the adjoint of C, x before and v after the substep; the moments of the momentum's adjoint as
+        in :meth:`put_gathered`; and ``slope``, the sum of grad_f w (momentum_bar . q + velocity . h) over the
+        stencil, 3-vector.
+        """
+        scale = 4.0 * self.inv_dx * self.inv_dx
+        open_axes = self.unclamped(x, v_after)
+        a_bar = ti.Vector.zero(self.real, 9)
+        for i in ti.static(range(3)):
+            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
+            # the scatter.
+            offsets = scale * (
+                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
+            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
+            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
+            bar[target + AT_V + i][lane] = self.mass * m0[i]
+            a_bar[3 * i] = self.dx * (mx[i] - fx[0] * m0[i])
+            a_bar[3 * i + 1] = self.dx * (my[i] - fx[1] * m0[i])
+            a_bar[3 * i + 2] = self.dx * (mz[i] - fx[2] * m0[i])
+        return a_bar
+
+    @ti.func
     def momentum_field(self, state: ti.template(), source, a: ti.template(), lane, fx):
         """The affine field of momentum and mass that a particle scatters, given A."""
         v = self.vector(state, source + AT_V, lane)

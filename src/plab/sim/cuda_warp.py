@@ -271,7 +271,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         folded: ti.template(),
         folds,
     ):
-        """Scatter an affine field as :meth:`scatter` does, to some components of a grid; every lane of the
+        """Scatter an affine field, weighted, to some components of a grid; every lane of the
         warp must take part. The field's fourth component is the same at all nodes.
 
         What each lane's particle gives goes to shared memory, ``rows`` for ``BLOCK_WARPS * WARP_NUMBERS``

@@ -9,6 +9,7 @@ is one launch over all environments.
 import taichi as ti
 
 from plab.sim.cpu_phases import BLOCK_NODES, CpuPhases
+from plab.sim.cpu_stencils import address_of
 from plab.sim.storage import STATE
 from plab.sim.teams import TeamChoice
 from plab.sim.tensors import Array
@@ -40,18 +41,20 @@ class CpuEngine(CpuPhases):
         sizes = (self.team_size, 1) if self.skips.waiting else (self.team_size,)
         self._teams = {name: TeamChoice(sizes) for name in ("step", "losses", "step_adjoint")}
 
-    def step(self, *args: object) -> None:
-        """One environment step; arguments as for :meth:`step_kernel` after the team's size."""
-        self._teams["step"].run(self.step_kernel, args)
+    def step(self, state: ti.Ndarray, *args: object) -> None:
+        """One environment step; arguments as for :meth:`step_kernel` after the team's size, without the
+        address."""
+        self._teams["step"].run(self.step_kernel, (state, address_of(state), *args))
 
     def losses(self, *args: object) -> None:
         """Loss terms; arguments as for :meth:`losses_kernel` after the team's size."""
         self._teams["losses"].run(self.losses_kernel, args)
 
-    def step_adjoint(self, *args: object) -> None:
+    def step_adjoint(self, state: ti.Ndarray, bar: ti.Ndarray, *args: object) -> None:
         """Adjoint of one environment step; arguments as for :meth:`step_adjoint_kernel` after the team's
-        size."""
-        self._teams["step_adjoint"].run(self.step_adjoint_kernel, args)
+        size, without the addresses."""
+        arrays = state, address_of(state), bar, address_of(bar)
+        self._teams["step_adjoint"].run(self.step_adjoint_kernel, (*arrays, *args))
 
     # -- threads ------------------------------------------------------------------------------------
 
@@ -116,6 +119,7 @@ class CpuEngine(CpuPhases):
         self,
         size: ti.i32,
         state: Array,
+        state_at: ti.u64,
         poses: Array,
         actions: Array,
         slot: ti.i32,
@@ -141,7 +145,7 @@ class CpuEngine(CpuPhases):
                     for s in range(self.substeps):
                         before = slot + s * stride
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                            self.scatter_chunk(state, before, before + stride, e, c, stamp + s)
+                            self.scatter_chunk(state, state_at, before, before + stride, e, c, stamp + s)
                         self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, stamp + s)
@@ -150,7 +154,8 @@ class CpuEngine(CpuPhases):
                             self.grid_chunk(e, c, s)
                         self.barrier(team, size)
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                            self.gather_chunk(state, before, before + stride, e, c, t * self.substeps + s)
+                            time = t * self.substeps + s
+                            self.gather_chunk(state, state_at, before, before + stride, e, c, time)
 
     @ti.kernel
     def losses_kernel(
@@ -174,7 +179,9 @@ class CpuEngine(CpuPhases):
         self,
         size: ti.i32,
         state: Array,
+        state_at: ti.u64,
         bar: Array,
+        bar_at: ti.u64,
         poses: Array,
         actions: Array,
         actions_bar: Array,
@@ -210,10 +217,10 @@ class CpuEngine(CpuPhases):
                     self.loss_gradient_of_team(state, end, bar, e, team, rank, size, contact)
                     for back in range(self.substeps):
                         s = self.substeps - 1 - back
-                        now = stamp + 1 + back
+                        before, now = slot + s, stamp + 1 + back
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.scatter_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c, now)
+                                self.scatter_chunk_adjoint(state, before, before + 1, bar, bar_at, e, c, now)
                             self.barrier(team, size)
                             if rank == 0:
                                 self.collect_blocks(e, now)
@@ -225,7 +232,9 @@ class CpuEngine(CpuPhases):
                             self.retreat_manipulators(e, s, actions, actions_bar, t)
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.gather_chunk_adjoint(state, slot + s, slot + s + 1, bar, e, c)
+                                self.gather_chunk_adjoint(
+                                    state, state_at, before, before + 1, bar, bar_at, e, c
+                                )
                             self.barrier(team, size)
 
     @ti.kernel

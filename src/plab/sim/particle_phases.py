@@ -4,10 +4,13 @@ adjoints."""
 import taichi as ti
 
 from plab.sim.spectral import spectral_parameter_adjoint, spectral_return_map, spectral_return_map_adjoint
-from plab.sim.storage import AT_C, AT_F, AT_V, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
+from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
 
 __all__ = ["ParticlePhases"]
+
+SIZES = {ti.f32: 4, ti.f64: 8}
+"""Bytes of a number."""
 
 
 @ti.func
@@ -45,6 +48,16 @@ class ParticlePhases(Storage):
     def vector(self, state: ti.template(), entry, lane):
         """Three scalars of one particle as a vector."""
         return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
+
+    @ti.func
+    def lane_in(self, field: ti.template(), entry, lane):
+        """Address of a particle's number in a lane vector of a field."""
+        return ti.get_addr(field, [entry]) + ti.u64(lane * ti.static(SIZES[self.real]))
+
+    @ti.func
+    def lane_of(self, state_at, entry, lane):
+        """Address of a particle's number in a lane vector of an array that begins at ``state_at``."""
+        return state_at + ti.u64(entry * self.lanes + lane) * ti.static(SIZES[self.real])
 
     @ti.kernel
     def observe(self, state: Array, slot: ti.i32, order: Array, stride: ti.i32, out: Array):
@@ -88,66 +101,11 @@ class ParticlePhases(Storage):
         return v_bar + self.dt * (self.unclamped(x, v) * x_bar)
 
     @ti.func
-    def put_gathered(self, state: ti.template(), target, lane, x, fx, m0, mx, my, mz, e, time):
-        """Write v, C and x after the substep of the particle at x, from moments of the grid's velocities.
-
-        ``m0`` is the sum of w v over the stencil, ``mx``, ``my``, ``mz`` are those of w v times the node's
-        offset (0, 1, 2) along an axis, 4-vectors whose last entry is ignored. ``time`` is noted where the
-        speed is not sane.
-        """
-        scale = 4.0 * self.inv_dx
-        c0 = scale * (mx - fx[0] * m0)
-        c1 = scale * (my - fx[1] * m0)
-        c2 = scale * (mz - fx[2] * m0)
-        for i in ti.static(range(3)):
-            state[target + i][lane] = ti.min(ti.max(x[i] + self.dt * m0[i], 0.0), self.x_max)
-            state[target + AT_V + i][lane] = m0[i]
-            state[target + AT_C + 3 * i][lane] = c0[i]
-            state[target + AT_C + 3 * i + 1][lane] = c1[i]
-            state[target + AT_C + 3 * i + 2][lane] = c2[i]
-        speed = m0[0] * m0[0] + m0[1] * m0[1] + m0[2] * m0[2]
+    def note_speed(self, speed, e, time):
+        """Note the time if a particle's squared speed is not sane."""
         # Faster than a domain per substep is as broken as NaN, which fails this comparison too.
         if not (speed * (self.dt * self.dt) < 1.0) and self.fault[e] == 0:
             self.fault[e] = time + 1
-
-    @ti.func
-    def put_transfer_adjoint(
-        self,
-        bar: ti.template(),
-        target,
-        lane,
-        a: ti.template(),
-        c_bar: ti.template(),
-        x,
-        v_after,
-        fx: ti.template(),
-        m0,
-        mx,
-        my,
-        mz,
-        slope,
-    ):
-        """Write the adjoints of x and v before the substep; returns that of A, row by row.
-
-        Takes A, the adjoint of C, x before and v after the substep; the moments of the momentum's adjoint as
-        in :meth:`put_gathered`; and ``slope``, the sum of grad_f w (momentum_bar . q + velocity . h) over the
-        stencil, 3-vector.
-        """
-        scale = 4.0 * self.inv_dx * self.inv_dx
-        open_axes = self.unclamped(x, v_after)
-        a_bar = ti.Vector.zero(self.real, 9)
-        for i in ti.static(range(3)):
-            # Offsets node - x shrink as the particle moves: - C_bar^T v from the gather, - A^T p_bar from
-            # the scatter.
-            offsets = scale * (
-                c_bar[i] * v_after[0] + c_bar[3 + i] * v_after[1] + c_bar[6 + i] * v_after[2]
-            ) + (a[i] * m0[0] + a[3 + i] * m0[1] + a[6 + i] * m0[2])
-            bar[target + i][lane] = open_axes[i] * bar[target + i][lane] + self.inv_dx * slope[i] - offsets
-            bar[target + AT_V + i][lane] = self.mass * m0[i]
-            a_bar[3 * i] = self.dx * (mx[i] - fx[0] * m0[i])
-            a_bar[3 * i + 1] = self.dx * (my[i] - fx[1] * m0[i])
-            a_bar[3 * i + 2] = self.dx * (mz[i] - fx[2] * m0[i])
-        return a_bar
 
     # -- material -----------------------------------------------------------------------------------
 

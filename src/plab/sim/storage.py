@@ -37,7 +37,6 @@ __all__ = [
     "CHUNKS",
     "FRAME_ADJOINT",
     "INDEX_MASK",
-    "SCRATCH",
     "STATE",
     "STATE_MASK",
     "STENCILS",
@@ -80,9 +79,6 @@ are numbered in 32 bits."""
 
 # What follows are strides of the threads' working areas, which keep apart what two threads write: a cache
 # line that both of them use costs more than the work itself.
-
-SCRATCH = 32
-"""4-vectors per chunk of particles for the transfers of one particle; 18 are used."""
 
 STENCILS = 32
 """Lane vectors per chunk for weights and affine fields of one tile; 27 are used."""
