@@ -18,6 +18,19 @@ def test_bitcode_is_that_of_its_source(monkeypatch) -> None:
     assert stencils.files() == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def test_environments_share_a_copy_which_is_that_of_the_package(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "cache"))
+    copied = Path(cpu_stencils._file())
+    original = Path(cpu_stencils.__file__).parent / "stencils" / copied.name
+    assert copied.parent == tmp_path / "cache" and copied.read_bytes() == original.read_bytes()
+    copied.write_bytes(b"of somebody else")
+    assert Path(cpu_stencils._file()).read_bytes() == original.read_bytes()
+    assert [path.name for path in copied.parent.iterdir()] == [copied.name]
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "file"))
+    assert cpu_stencils._file() == str(original)
+
+
 def test_a_platform_without_bitcode_is_told(monkeypatch) -> None:
     monkeypatch.setattr(sys, "platform", "sunos5")
     with pytest.raises(ImportError, match="plab's simulator has no code for sunos5-"):

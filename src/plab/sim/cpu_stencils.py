@@ -3,20 +3,36 @@
 It takes addresses: of a node in a grid, and of one particle's number in the first of some lane vectors.
 """
 
+import os
 import platform
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import taichi as ti
 from taichi.lang.impl import get_runtime
 from taichi.lang.source_builder import SourceBuilder
 
+from plab.cache import cache_dir
+
 __all__ = ["address_of", "copy", "gather", "gather_adjoint", "scatter"]
 
 
 def _file() -> str:
+    """Return where this platform's bitcode is: a copy in plab's cache folder, if that can be written to.
+    Taichi knows compiled kernels by that place, which is then the same for all environments and checkouts."""
     name = f"{sys.platform}-{platform.machine().lower()}"
     for path in (Path(__file__).parent / "stencils").glob(f"{name}-*.bc"):
+        code = path.read_bytes()
+        # RuntimeError: there is no home.
+        with suppress(OSError, RuntimeError):
+            copied = cache_dir() / path.name
+            if not copied.exists() or copied.read_bytes() != code:
+                copied.parent.mkdir(parents=True, exist_ok=True)
+                own = copied.with_name(f"{path.name}.{os.getpid()}")
+                own.write_bytes(code)
+                own.replace(copied)
+            return str(copied)
         return str(path)
     raise ImportError(f"plab's simulator has no code for {name}: `make bitcode` has to learn its data layout")
 
