@@ -16,7 +16,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from llvmlite import ir
 
-from plab.sim.storage import AT_C, AT_V, LANES
+from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, LANES, MOMENTUM_FIELD, OFFSETS, SLOPES, WEIGHTS
 
 LANE = LANES["cpu"]
 
@@ -253,10 +253,6 @@ class Sums:
         self.plain, self.y = times(along, self._wx[i], self.plain), times(of_y, self._wx[i], self.y)
         if i:
             self.x = times(along, self._wx[1] if i == 1 else self._twice[0], self.x)
-
-
-WEIGHTS, SLOPES, OFFSETS, MOMENTUM_FIELD, ADJOINT_FIELD = 0, 9, 18, 21, 24
-"""Entries of ``stencils``, see :mod:`plab.sim.cpu_transfer`."""
 
 
 def scatter(module: ir.Module, name: str, real: ir.Type) -> None:

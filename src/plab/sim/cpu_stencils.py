@@ -93,13 +93,8 @@ def gather_adjoint(
     and v at ``bar``, and of A in A's place at ``matrix``; x is at ``source``, v at ``after``."""
     g, h, s, m = ti.u64(velocity), ti.u64(momentum), ti.u64(stencil), ti.u64(matrix)
     x, y, z, n = ti.u64(source), ti.u64(after), ti.u64(bar), ti.i64(axis)
-    t, b, d, i, w = (
-        ti.cast(dt, real),
-        ti.cast(end, real),
-        ti.cast(dx, real),
-        ti.cast(inv_dx, real),
-        ti.cast(mass, real),
-    )
+    t, b, w = ti.cast(dt, real), ti.cast(end, real), ti.cast(mass, real)
+    d, i = ti.cast(dx, real), ti.cast(inv_dx, real)
     if ti.static(real == ti.f32):
         _BITCODE.gather_adjoint_f32(g, h, s, m, x, y, z, n, t, b, d, i, w)
     else:

@@ -12,18 +12,21 @@ import taichi as ti
 
 from plab.sim.cpu_stencils import gather, gather_adjoint, scatter
 from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import AT_C, AT_V, BASES, INDEX_MASK, STENCILS
+from plab.sim.storage import (
+    ADJOINT_FIELD,
+    AT_C,
+    AT_V,
+    BASES,
+    INDEX_MASK,
+    MOMENTUM_FIELD,
+    OFFSETS,
+    SLOPES,
+    STENCILS,
+    WEIGHTS,
+)
 from plab.sim.transfer import at_base, spline, spline_slope
 
 __all__ = ["TransferTiles"]
-
-# Entries of a tile in ``stencils``: weights and their slopes by offset and axis, x / dx - base, and values
-# at the base node of the two affine fields that are scattered, without their last entries.
-WEIGHTS = 0
-SLOPES = 9
-OFFSETS = 18
-MOMENTUM_FIELD = 21
-ADJOINT_FIELD = 24
 
 # Entries in ``bases``: node in the environment's grid; block and crossing in one number.
 NODE = 0

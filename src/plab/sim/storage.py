@@ -28,6 +28,7 @@ from plab.sim.skips import Skips
 from plab.sim.tensors import Array
 
 __all__ = [
+    "ADJOINT_FIELD",
     "AT_C",
     "AT_F",
     "AT_V",
@@ -37,10 +38,14 @@ __all__ = [
     "CHUNKS",
     "FRAME_ADJOINT",
     "INDEX_MASK",
+    "MOMENTUM_FIELD",
+    "OFFSETS",
+    "SLOPES",
     "STATE",
     "STATE_MASK",
     "STENCILS",
     "STRAINS",
+    "WEIGHTS",
     "Storage",
 ]
 
@@ -82,6 +87,10 @@ are numbered in 32 bits."""
 
 STENCILS = 32
 """Lane vectors per chunk for weights and affine fields of one tile; 27 are used."""
+
+WEIGHTS, SLOPES, OFFSETS, MOMENTUM_FIELD, ADJOINT_FIELD = 0, 9, 18, 21, 24
+"""Entries of a tile among these: weights and their slopes by offset and axis, x / dx - base, and values at
+the base node of the two affine fields that are scattered, without their last entries."""
 
 BASES = 8
 """Lane vectors of integers per chunk for the base nodes of one tile; 2 are used."""
