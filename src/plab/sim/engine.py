@@ -42,8 +42,7 @@ class CpuEngine(CpuPhases):
         self._teams = {name: TeamChoice(sizes) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, state: ti.Ndarray, *args: object) -> None:
-        """One environment step; arguments as for :meth:`step_kernel` after the team's size, without the
-        address."""
+        """One environment step; arguments as for :meth:`step_kernel`, without size and address."""
         self._teams["step"].run(self.step_kernel, (state, address_of(state), *args))
 
     def losses(self, *args: object) -> None:
@@ -51,8 +50,7 @@ class CpuEngine(CpuPhases):
         self._teams["losses"].run(self.losses_kernel, args)
 
     def step_adjoint(self, state: ti.Ndarray, bar: ti.Ndarray, *args: object) -> None:
-        """Adjoint of one environment step; arguments as for :meth:`step_adjoint_kernel` after the team's
-        size, without the addresses."""
+        """Adjoint of one step; arguments as for :meth:`step_adjoint_kernel`, without size and addresses."""
         arrays = state, address_of(state), bar, address_of(bar)
         self._teams["step_adjoint"].run(self.step_adjoint_kernel, (*arrays, *args))
 
