@@ -10,8 +10,9 @@ import pandas as pd
 import pytest
 
 from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
-from plab.bench.diagrams import draw
-from plab.bench.precision import angle, compare, markdown, starts
+from plab.bench.precision import angle, compare, starts, summary
+from plab.report.costs import diagrams
+from plab.report.figures import save, style
 from plab.scene import Body
 
 pytestmark = pytest.mark.physics
@@ -65,9 +66,15 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
         for precision in ("float32", "float64")
         for n in (5, 10, 20)
     ]
-    files = list(draw(pd.DataFrame(table, columns=COLUMNS), tmp_path))
-    assert [path.name for path in files] == ["Move_substeps.png", "Move_substeps.pdf"]
-    assert all(path.stat().st_size > 5000 for path in files)
+    with style():
+        (drawing,) = diagrams(pd.DataFrame(table, columns=COLUMNS))
+    assert len(drawing.figure.axes) == 2 * 5
+    for panel in drawing.figure.axes:
+        # A line and what broke off, in each precision.
+        assert [tuple(line.get_xdata()) for line in panel.get_lines()] == [(10.0, 20.0), (5.0,)] * 2
+        assert [text.get_text() for text in panel.texts] == ["10", "20", "5"] * 2
+    save([drawing], tmp_path, {"footer": []})
+    assert all((tmp_path / f"Move_substeps.{kind}").stat().st_size > 5000 for kind in ("png", "pdf"))
 
 
 @pytest.mark.slow
@@ -88,4 +95,4 @@ def test_float32_is_close_to_float64() -> None:
     assert list(table["actions"]) == ["demonstration", "random"]
     assert (table["failures"] == "").all()
     assert table["difference"].astype(float).abs().max() < 0.01
-    assert "| Move | random |" in markdown(table, 200)
+    assert "| Move | random |" in summary(table.to_dict("records"), 200)

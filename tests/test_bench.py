@@ -15,7 +15,7 @@ import pytest
 
 from plab.bench import bound, everyday, skips, speed, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config import build_scene, load_config
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms
@@ -132,7 +132,7 @@ def test_rows_are_kept_when_a_benchmark_breaks_off(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        report(("a", "b"), rows(), tmp_path / "table.csv")
+        measure_table(("a", "b"), rows(), tmp_path / "table.csv")
     assert read(tmp_path / "table.csv") == [{"a": "1", "b": "2"}]
 
 

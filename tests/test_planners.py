@@ -16,7 +16,7 @@ from plab.config import Config, ConfigError, build_scene, load_config
 from plab.problem import Problem
 from plab.report.series import rows_on_axes
 from plab.results import BUDGETS, RunResult, checking, load, read, result_path, write
-from plab.results.checking import problems
+from plab.results.checking import faults
 from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
@@ -92,7 +92,7 @@ def test_it_improves_on_its_random_start(finished, method: str) -> None:
     result = finished[method]
     rows, judged = result.iterations, result.evaluation
     assert judged["loss"] < rows["loss"][0] and judged["score"] > rows["score"][0]
-    assert problems(result) == []
+    assert faults(result) == []
     assert result.best_actions.shape == (STEPS, 6)
 
 
@@ -201,7 +201,7 @@ def break_candidates(monkeypatch: pytest.MonkeyPatch, which: list[int]) -> None:
 def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypatch, method: str) -> None:
     break_candidates(monkeypatch, [1])
     result = run(make_config(tmp_path, method))
-    assert problems(result) == []
+    assert faults(result) == []
 
 
 @pytest.mark.physics
@@ -273,11 +273,11 @@ def test_a_run_ends_when_it_is_solved(finished, tmp_path: Path, monkeypatch) -> 
     run_batch(cfgs)
     results = [read(result_path(cfg)) for cfg in cfgs]
     for result, own, count in zip(results, scores, rows, strict=True):
-        assert result.status == "finished" and problems(result) == []
+        assert result.status == "finished" and faults(result) == []
         assert result.iterations["score"].tolist() == own[:count].tolist()
     monkeypatch.setattr(checking, "SOLVED", 1.0)
     shorter = results[int(np.argmin(rows))]
-    assert f"it is finished after {min(rows)} of 4 iterations" in problems(shorter)
+    assert f"it is finished after {min(rows)} of 4 iterations" in faults(shorter)
 
 
 def rows_until(scores: np.ndarray, enough: float) -> list[int]:
@@ -343,7 +343,7 @@ def test_files_without_budgets_are_read_and_gone_on_with(finished, tmp_path: Pat
     columns = {name: values for name, values in left.columns.items() if name not in BUDGETS}
     write(replace(left, columns=columns), partial)
     result = run(cfg)
-    assert problems(result) == [] and not set(BUDGETS) & set(result.iterations)
+    assert faults(result) == [] and not set(BUDGETS) & set(result.iterations)
     assert result.iterations["episodes"].tolist() == [0, 1]
     assert rows_on_axes(result.config, result.iterations)["substeps"].tolist() == [STEPS * 5, 2 * STEPS * 5]
     assert load(tmp_path)["score"].tolist() == [result.evaluation["score"]]
@@ -364,7 +364,7 @@ def _second_fails(intact):
 def test_the_check_finds_a_best_row_that_is_not_the_best(finished) -> None:
     result = finished["cem"]
     worst = int(result.iterations["score"].argmin())
-    found = problems(replace(result, best_iteration=worst))
+    found = faults(replace(result, best_iteration=worst))
     assert found[0].startswith(
         f"the score of the best is {result.iterations['score'][worst]:g}, the highest in"
     )

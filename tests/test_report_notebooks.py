@@ -139,14 +139,14 @@ def test_curves_of_run_time_against_error(results: Path, bench: Path, tmp_path: 
         drawing = work_precision(accuracy_rows())
     assert len(drawing.figure.axes) == 2 * 2 * 2
     lines = [line for axes in drawing.figure.axes for line in axes.get_lines()]
-    assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0)}
+    assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0), (6.0,)}
 
 
 def test_without_run_times_errors_are_drawn_against_substeps() -> None:
     with style():
         drawing = work_precision(accuracy_rows().assign(ms_per_step=math.nan))
     lines = [line for axes in drawing.figure.axes for line in axes.get_lines()]
-    assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0)}
+    assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0), (6.0,)}
     assert {axes.get_xlabel() for axes in drawing.figure.axes} == {"substeps per step"}
     assert any("no run times" in note for note in drawing.notes)
 

@@ -226,8 +226,8 @@ def test_forms_of_output(folder: Path, capsys) -> None:
     (folder / "bad.h5").write_bytes(b"")
     arguments = [str(folder), "task=Rope", "variant=1"]
     assert main([*arguments]) == 0
-    text = capsys.readouterr().out
-    assert "2/3" in text and "iteration 2: loss is nan" in text and "bad.h5" in text
+    text, told = capsys.readouterr()
+    assert "2/3" in text and "iteration 2: loss is nan" in text and "bad.h5" in told
     assert main([*arguments, "--json"]) == 0
     known = json.loads(capsys.readouterr().out)
     assert known["workers"] == 0 and len(known["runs"]) == 3 and len(known["unreadable"]) == 1

@@ -29,7 +29,7 @@ from plab.render import graphics
 from plab.render.recording import Recording, record, record_with_motion
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.sim import Simulator
-from plab.view import View, show
+from plab.view import Viewer, show
 
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
@@ -343,7 +343,7 @@ def test_simulators_stay_usable_beside_the_viewer(simulated, monkeypatch):
 
 @browsing
 def test_the_viewer_plays_in_a_notebooks_frame(browser, page, recording, tmp_path):
-    frame = View(page, recording.score)._repr_html_()
+    frame = Viewer(page, recording.score)._repr_html_()
     (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><body>{frame}</body>", encoding="utf-8")
     browser.get((tmp_path / "notebook.html").as_uri())
     browser.switch_to.frame(browser.find_element("tag name", "iframe"))

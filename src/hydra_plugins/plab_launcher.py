@@ -161,6 +161,7 @@ class BatchLauncher(Launcher):
         self, overrides: dict[str, Sequence[str]]
     ) -> Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]:
         """Return what hands batches to the inner launcher, one job each; ``overrides`` are by result file."""
+        from plab.errors import tell
         from plab.plugins import passed_on
         from plab.results import result_path
         from plab.sweep.carry import BatchTask, look_up
@@ -184,7 +185,7 @@ class BatchLauncher(Launcher):
             except Exception as error:
                 # A job's process was killed, say, or the queue refused the jobs: the files know how far they
                 # came.
-                print(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}", flush=True)
+                tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
                 outcomes = [look_up(cfg) for batch in batches for cfg in batch]
             yield from outcomes
 

@@ -1,6 +1,6 @@
 """Work-precision diagrams: what a run costs against how far it is from a fine reference.
 
-    python -m plab.bench.accuracy --output accuracy           # a folder: CSV, and PNG and PDF per task
+    python -m plab.bench.accuracy --output accuracy           # a folder: CSV, and per task PNG, PDF, JSON
     python -m plab.bench.accuracy --quick --output accuracy   # two tasks, coarser, fewer settings
     python -m plab.bench.accuracy --task Move,Rope --particles 3000
     python -m plab.bench.accuracy --device cuda --output accuracy_cuda
@@ -39,10 +39,12 @@ from plab.bench.common_scene import (
 from plab.bench.precision import angle
 from plab.cli.arguments import Parser, folder, positive, task_list
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
+from plab.report.costs import diagrams
+from plab.report.figures import save, style
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, DEVICES, PRECISIONS, Simulator, Skips
 
@@ -353,12 +355,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
     output = options.output
     output.mkdir(parents=True, exist_ok=True)
-    table = report(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
-    # Imported late: the numbers are there even where Matplotlib is not.
-    from plab.bench.diagrams import draw
-
-    for path in draw(pd.DataFrame(table), output):
-        print(path)
+    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
+    with style():
+        drawings = diagrams(pd.DataFrame(table))
+    save(drawings, output, {"footer": ["python -m plab.bench.accuracy"]})
+    for drawing in drawings:
+        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ GPU_THREADS = 1 << 18
 TARGET_S = 0.02
 """Seconds that a single measurement takes at least."""
 
-RUNS = 3
+REPEATS = 3
 
 NODE = 4
 """Numbers per grid node: momentum and mass, or velocity."""
@@ -81,7 +81,7 @@ class Copy:
         seconds(passes)
         while seconds(passes) < TARGET_S and passes < 1 << 24:
             passes *= 2
-        return passes * 8.0 * size * self.width / min(seconds(passes) for _ in range(RUNS))
+        return passes * 8.0 * size * self.width / min(seconds(passes) for _ in range(REPEATS))
 
 
 def bandwidth(device: str) -> tuple[float, ...]:

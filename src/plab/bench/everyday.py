@@ -24,7 +24,7 @@ import plab
 from plab.bench.results import SETTLE, write_runs
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import progress, report
+from plab.cli.tables import measure_table, progress
 
 __all__ = ["COLUMNS", "THINGS", "main", "measure"]
 
@@ -139,7 +139,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         folder = Path(name)
         write_runs(options.runs, options.rows, folder / "results")
         time.sleep(SETTLE)
-        report(COLUMNS, measure(folder, sources, options.repeats, options.only), options.csv, {"what": 18})
+        rows = measure(folder, sources, options.repeats, options.only)
+        measure_table(COLUMNS, rows, options.csv, {"what": 18})
 
 
 if __name__ == "__main__":

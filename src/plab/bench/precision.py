@@ -11,7 +11,7 @@ share one compiled simulator per precision, see :mod:`plab.bench.common_scene`; 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -21,11 +21,12 @@ import pandas as pd
 from plab.bench.common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import markdown, measure_table
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
+from plab.report.costs import precision_summary
 from plab.scene import Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
@@ -115,7 +116,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
             simulator.set_contact("hard")
             hard = simulator.rollout(actions[None], gradient=False, strict=False)
             final[kind] = simulator.state().x[0], list(hard.failures.values())
-        target = targets[number] if targets else spread(start.scene, final["demonstration"][0])
+        target = targets[number] if targets else mass_of(start.scene, final["demonstration"][0])
         # As much less as there are fewer particles than the task has.
         threshold = TARGET_MASS * start.scene.particle_count / start.particles
         simulator.set_target(target[None], target_sdf(target, threshold)[None])
@@ -129,7 +130,7 @@ def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarra
         yield target, outcomes
 
 
-def spread(scene: Scene, x: np.ndarray) -> np.ndarray:
+def mass_of(scene: Scene, x: np.ndarray) -> np.ndarray:
     """Mass tensor of positions."""
     return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor)
 
@@ -143,10 +144,10 @@ def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
     targets = [target for target, _ in exact]
     rounded = run(configurations, "float32", targets)
     for start, (target, right), (_, got) in zip(configurations, exact, rounded, strict=True):
-        initial = spread(start.scene, sample_particles(start.scene))
+        initial = mass_of(start.scene, sample_particles(start.scene))
         for kind in start.actions:
             a, b = got[kind], right[kind]
-            at = [scores(initial, spread(start.scene, o.x), target).score for o in (a, b)]
+            at = [scores(initial, mass_of(start.scene, o.x), target).score for o in (a, b)]
             norm = np.linalg.norm(b.gradient)
             yield {
                 "task": start.task,
@@ -173,32 +174,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
     options = parser.parse_args(argv)
-    rows = report(COLUMNS, compare(starts(options.task, options.variant, options.particles)), options.csv)
+    configurations = starts(options.task, options.variant, options.particles)
+    rows = measure_table(COLUMNS, compare(configurations), options.csv)
     if options.markdown is not None:
         options.markdown.parent.mkdir(parents=True, exist_ok=True)
-        options.markdown.write_text(markdown(pd.DataFrame(rows), options.particles), encoding="utf-8")
+        options.markdown.write_text(summary(rows, options.particles), encoding="utf-8")
 
 
-def markdown(table: pd.DataFrame, particles: int) -> str:
-    """Return the table of a row per task and kind of actions: the worst of its variants, and the median."""
-    numbers = table.astype({"difference": float, "angle_deg": float})
-    lines = [
-        f"float32 against float64, {particles} particles, 50 steps, five variants each.",
-        "",
-        "| task | actions | largest score difference | median | largest angle of gradients | median |",
-        "|---|---|---|---|---|---|",
-    ]
-    for (task, kind), rows in numbers.groupby(["task", "actions"], sort=False):
-        score, turn = rows["difference"].abs(), rows["angle_deg"]
-        lines.append(
-            f"| {task} | {kind} | {score.max():.1e} | {score.median():.1e} | {_degrees(turn.max())} "
-            f"| {_degrees(turn.median())} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def _degrees(value: float) -> str:
-    return "no gradient" if np.isnan(value) else f"{value:.2g}°"
+def summary(rows: Sequence[Mapping[str, object]], particles: int) -> str:
+    """Return a table in Markdown of a row per task and kind of actions: the worst and the median."""
+    table = precision_summary(pd.DataFrame(rows))
+    lines = markdown(list(table.columns), table.to_dict("records"))
+    return f"float32 against float64, {particles} particles, 50 steps.\n\n{lines}"
 
 
 if __name__ == "__main__":

@@ -27,10 +27,10 @@ import numpy as np
 import taichi as ti
 
 from plab.bench.common_scene import grid_terms
-from plab.bench.precision import Start, angle, spread, starts
+from plab.bench.precision import Start, angle, mass_of, starts
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
@@ -165,7 +165,7 @@ def _gradients(configurations: Sequence[Start]) -> Mapping[str, Mapping[str, np.
         simulator.set_scenes([start.scene])
         simulator.set_contact("hard")
         simulator.rollout(shown[None], gradient=False)
-        target = spread(start.scene, simulator.state().x[0])
+        target = mass_of(start.scene, simulator.state().x[0])
         threshold = TARGET_MASS * start.scene.particle_count / start.particles
         simulator.set_target(target[None], target_sdf(target, threshold)[None])
         simulator.set_contact("soft")
@@ -188,9 +188,9 @@ def _row(start: Start, kind: str, ours: np.ndarray, theirs: np.ndarray) -> dict[
         return row | {"norm_ratio": f"{ratio:.4f}", "angle_deg": f"{angle(theirs, ours):.3g}"}
     if not np.isfinite(theirs).all():
         return row | {"score_release": "breaks off"}
-    initial, target = spread(start.scene, sample_particles(start.scene)), spread(start.scene, ours)
+    initial, target = mass_of(start.scene, sample_particles(start.scene)), mass_of(start.scene, ours)
     for column, x in (("score", ours), ("score_release", theirs)):
-        row[column] = f"{scores(initial, spread(start.scene, x), target).score:.4f}"
+        row[column] = f"{scores(initial, mass_of(start.scene, x), target).score:.4f}"
     row["positions_rms"] = f"{np.sqrt(((ours - theirs) ** 2).sum(axis=1).mean()):.2e}"
     return row
 
@@ -204,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--choice", nargs="+", choices=CHOICES, default=list(CHOICES), help="only these")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_args(argv)
-    report(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
+    measure_table(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
 
 
 if __name__ == "__main__":

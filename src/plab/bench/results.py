@@ -25,7 +25,7 @@ import numpy as np
 
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config import load_config
 from plab.config.selection import Selection
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
@@ -192,7 +192,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
         table = _rows(options.runs, options.rows, Path(folder), options.archive)
-        report(("what", "count", "seconds", "times_faster"), table, options.csv)
+        measure_table(("what", "count", "seconds", "times_faster"), table, options.csv)
     # Linux counts in KiB, macOS in bytes.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1024.0)
     print(f"most memory: {peak:.0f} MiB")

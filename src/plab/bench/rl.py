@@ -32,7 +32,7 @@ from stable_baselines3.common.logger import Logger
 
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
@@ -227,10 +227,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             for agents in options.agents
             for num_envs, method in kinds
         )
-        report(POPULATION, rows, options.csv)
+        measure_table(POPULATION, rows, options.csv)
         return
     table = (measure(_config(overrides, method, num_envs, batches), batches) for num_envs, method in kinds)
-    report(COLUMNS, table, options.csv)
+    measure_table(COLUMNS, table, options.csv)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from plab.bench.workload import (
 )
 from plab.cli.arguments import Parser, positive, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import markdown, progress, report
+from plab.cli.tables import markdown, measure_table, progress
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks
 from plab.errors import tell
@@ -124,7 +124,7 @@ def rows(
             continue
         median, best, most = timing.ms(steps)
         least = least_ms(load, traffic(load, kind == GRADIENT), speeds)
-        work = batch * simulator.particle_count * simulator.substeps
+        updates = batch * simulator.particle_count * simulator.substeps
         yield {
             "task": cfg.task.name,
             "device": simulator.device,
@@ -136,7 +136,7 @@ def rows(
             "min_ms": round(best, 3),
             "max_ms": round(most, 3),
             "steps_per_s": round(batch * 1e3 / median, 1),
-            "ns_per_particle": round(median * 1e6 / work, 3),
+            "ns_per_particle": round(median * 1e6 / updates, 3),
             "memory_mb": round(simulator.memory_bytes() / 1e6, 1),
             "peak_rss_mb": round(peak_rss_mb()) if simulator.device == "cpu" else "",
             "bound_ms": round(least, 3),
@@ -293,7 +293,7 @@ def _run(options: argparse.Namespace) -> int:
     overrides = [*options.overrides, *(f"sim.precision={p}" for p in (options.precision or ())[:1])]
     refused: list[str] = []
     if options.limits:
-        report(LIMIT_COLUMNS, _limit_rows(options), options.csv)
+        measure_table(LIMIT_COLUMNS, _limit_rows(options), options.csv)
     elif options.skips is not None:
         return _run_skips(options, overrides)
     elif options.scaling:
@@ -305,18 +305,18 @@ def _run(options: argparse.Namespace) -> int:
             for count in options.particles
             for row in _scaling_rows(chosen, count, grid, kinds, options.repeats)
         )
-        report(SCALING_COLUMNS, table, options.csv, WIDE)
+        measure_table(SCALING_COLUMNS, table, options.csv, WIDE)
     elif options.paper:
         measured = (
             _paper_row(task, overrides, batch, options.steps, options.repeats)
             for batch in options.batch
             for task in options.task
         )
-        done = report(PAPER_COLUMNS, measured, options.csv, {"task": 10})
+        done = measure_table(PAPER_COLUMNS, measured, options.csv, {"task": 10})
         if options.markdown is not None:
             write_markdown(options.markdown, done)
     else:
-        report(COLUMNS, _all_rows(options, refused), options.csv, WIDE)
+        measure_table(COLUMNS, _all_rows(options, refused), options.csv, WIDE)
     return _not_measured(refused)
 
 
@@ -332,7 +332,7 @@ def _run_skips(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     how = (options.steps, options.repeats, options.quick)
     refused: list[str] = []
     rows = (row for batch in options.batch for row in skips.rows(cases, overrides, batch, *how, refused))
-    table = report(skips.COLUMNS, rows, options.csv, WIDE)
+    table = measure_table(skips.COLUMNS, rows, options.csv, WIDE)
     code = _not_measured(refused)
     if broken := [str(row["skip"]) for row in table if not row["equal"]]:
         cuda = table[0]["device"] == "cuda" and table[0]["precision"] == "float32"

@@ -29,10 +29,12 @@ import pandas as pd
 from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
 from plab.cli.arguments import Parser, positive, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table, print_table, write_csv
 from plab.config import ConfigError
 from plab.config.suite import suite_tasks
+from plab.errors import tell
 from plab.losses import make_terms
+from plab.report.figures import legend, log_axis, single, style
 from plab.scene import SceneError
 from plab.sim import PRECISIONS, SimulationError, Simulator
 
@@ -43,6 +45,9 @@ BATCH = 12
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
+
+LABELLED = 12
+"""With more cases than this a figure of norms has no legend: colours repeat."""
 
 REFUSAL = "refusal"
 """Family of the scenes that are to be refused."""
@@ -207,7 +212,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cases = _cases(options)
     rows = itertools.chain.from_iterable(run_cases(cases, precision) for precision in options.precision)
     refused = run_refusals() if not options.family or REFUSAL in options.family else ()
-    table = report(COLUMNS, itertools.chain(rows, refused), options.csv)
+    table = measure_table(COLUMNS, itertools.chain(rows, refused), options.csv)
     if options.gradients is not None:
         write_norms(table, options.gradients)
     return _summarise(pd.DataFrame(table))
@@ -233,32 +238,41 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
         path: CSV file; the drawing is a PNG of the same name.
     """
     parts = [
-        pd.DataFrame(
-            {name: row[name] for name in ("precision", "family", "case")}
-            | {"back": np.arange(len(norms)), "norm": norms[::-1]}
-        )
+        (row["precision"], row["family"], row["case"], norms[::-1])
         for row in rows
         if (norms := cast("np.ndarray | None", row.get("norms"))) is not None
     ]
     if not parts:
-        print("no case has a gradient", file=sys.stderr)
+        tell("no case has a gradient")
         return
-    table = pd.concat(parts, ignore_index=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table.to_csv(path, index=False, float_format="%.6g")
-    # Imported late: the numbers are there even where Matplotlib is not.
-    from plab.bench.diagrams import draw_norms
-
-    print(draw_norms(table, path.with_suffix(".png")))
+    table = [(*which, back, norm) for *which, norms in parts for back, norm in enumerate(norms)]
+    write_csv(path, [("precision", "family", "case", "back", "norm"), *table], digits=6)
+    with style():
+        figure, panel = single(7.0, 4.0)
+        colours: dict[str, str] = {}
+        for precision, _family, case, norms in parts:
+            label = None if case in colours else str(case)
+            colour = colours.setdefault(str(case), f"C{len(colours) % 10}")
+            # Steps that nothing depends on have no place on a log scale.
+            norms = np.where(norms > 0, norms, np.nan)
+            panel.plot(norms, "-" if precision == "float32" else ":", color=colour, label=label)
+        panel.set_xlabel("environment steps back from the end")
+        panel.set_title("solid: float32, dotted: float64", loc="right")
+        log_axis(panel, "norm of a step's gradient", vertical=True)
+        if len(colours) <= LABELLED:
+            legend(figure, columns=3)
+        figure.savefig(path.with_suffix(".png"))
+    print(path.with_suffix(".png"))
 
 
 def _summarise(table: pd.DataFrame) -> int:
     """Print how many cases of each family survived; return the exit code."""
     table["survived"] = table["outcome"].isin(["survived", "refused"])
-    groups = table.groupby(["precision", "family"], sort=False)["survived"]
-    summary = pd.DataFrame({"cases": groups.size(), "survived": groups.sum()})
-    summary.loc[("", "all"), :] = [len(table), table["survived"].sum()]
-    print(f"\n{summary.astype(int).to_string()}")
+    groups = table.groupby(["precision", "family"], sort=False, as_index=False)["survived"]
+    rows = groups.agg(["size", "sum"]).itertuples(index=False, name=None)
+    total = ("", "all", len(table), table["survived"].sum())
+    print()
+    print_table(("precision", "family", "cases", "survived"), [*rows, total])
     return 0 if table["survived"].all() else 1
 
 

@@ -17,7 +17,7 @@ from scipy import stats
 
 from plab.cli.arguments import Parser, positive, sources_and_words, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import report
+from plab.cli.tables import measure_table
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if options.scenes < 2:
         parser.error("--scenes has to be at least 2: one score has no interval")
     widths = {"policy": max(map(len, paths)), "trained_on": 17}
-    report(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
+    measure_table(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
 
 
 if __name__ == "__main__":

@@ -57,7 +57,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         if now != before and not (options.follow and runs.table.empty and not quiet):
             made = _MAKERS[options.what](runs, options, out, command)
             expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
-            print(f"{out}: {made} of {len(runs.table)} out of {expected} runs", *runs.left_out(), sep="\n")
+            print(f"{out}: {made} of {len(runs.table)} out of {expected} runs")
+            for line in runs.left_out():
+                tell(line)
             before = now
         if not options.follow or quiet == _QUIET:
             return

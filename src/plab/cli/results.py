@@ -130,8 +130,8 @@ def _unpack_arguments(parser: Parser) -> None:
 def _scores(options: argparse.Namespace) -> int:
     sources, words = sources_and_words(options.arguments)
     chosen = _finished_unless_said(select(words, SELECTABLE))
-    places = list(map(resolve, sources or ["results"]))
-    table, unreadable = scores(places, chosen, options.keys, options.sort, descending=options.descending)
+    given = list(map(resolve, sources or ["results"]))
+    table, unreadable = scores(given, chosen, options.keys, options.sort, descending=options.descending)
     _tell_left_out(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
     return 0
@@ -152,11 +152,11 @@ def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
 def _check(options: argparse.Namespace) -> int:
     count = wrong = 0
     for source in options.sources:
-        for _, problem in check(source):
+        for _, fault in check(source):
             count += 1
-            if problem is not None:
+            if fault is not None:
                 wrong += 1
-                print(f"{problem.path}: {problem.reason}: {problem.advice}", flush=True)
+                print(f"{fault.path}: {fault.reason}: {fault.advice}", flush=True)
     print(f"{count} run(s) checked, {f'{wrong} with something wrong' if wrong else 'all well'}")
     return 1 if wrong else 0
 

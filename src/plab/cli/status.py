@@ -35,10 +35,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     form.add_argument("--csv", action="store_true", help="print the table, for scripts")
     options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.arguments)
-    places, chosen = [resolve(source) for source in sources or ["results"]], select(words, NAMES)
+    given, chosen = [resolve(source) for source in sources or ["results"]], select(words, NAMES)
 
     def look() -> Survey:
-        return survey(places, chosen, missing=options.missing)
+        return survey(given, chosen, missing=options.missing)
 
     if options.json:
         found = look()

@@ -59,9 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if fault := inconsistency(submission):
         raise SubmissionError(fault)
     write(submission, options.output)
-    places = {entry.configuration for entry in submission.entries}
+    configurations = {entry.configuration for entry in submission.entries}
     size = options.output.stat().st_size / 1e3
-    print(f"{options.output}: {submission.track} for {len(places)} configuration(s), {size:.1f} kB")
+    print(f"{options.output}: {submission.track} for {len(configurations)} configuration(s), {size:.1f} kB")
     return 0
 
 

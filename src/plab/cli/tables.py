@@ -11,12 +11,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["markdown", "print_table", "progress", "report"]
+__all__ = ["markdown", "measure_table", "print_table", "progress", "write_csv"]
 
 _NUMBER = re.compile(r"([-+]?(\d[\d,]*(\.\d+)?(e[-+]\d+)?|inf))?")
 
 
-def report(
+def measure_table(
     columns: Sequence[str],
     rows: Iterable[Mapping[str, object]],
     path: Path | None,
@@ -36,19 +36,13 @@ def report(
     """
     least = [max(len(name), (widths or {}).get(name, 8)) for name in columns]
 
-    def write(values: Iterable[object], mode: str) -> None:
-        if path is not None:
-            with path.open(mode, newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerow(values)
-
     def show(values: Iterable[object]) -> None:
         progress("")
         shown = (f"{value!s:>{width}s}" for value, width in zip(values, least, strict=True))
         print("  ".join(shown), flush=True)
 
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write(columns, "w")
+        write_csv(path, [columns])
     table: list[Mapping[str, object]] = []
     for row in rows:
         if not table:
@@ -56,9 +50,26 @@ def report(
             show(columns)
         values = [row[name] for name in columns]
         show(values)
-        write(values, "a")
+        if path is not None:
+            write_csv(path, [values], "a")
         table.append(row)
     return table
+
+
+def write_csv(path: Path, rows: Iterable[Iterable[Any]], mode: str = "w", digits: int | None = None) -> None:
+    """Write rows to a CSV file, whose folder is made if need be.
+
+    Args:
+        path: The file.
+        rows: Its rows; the names of the columns are the first.
+        mode: ``w``, or ``a`` to add rows to those that are there.
+        digits: Digits of numbers with a fraction; all if None.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if digits is not None:
+        rows = ([_text(value, digits) for value in row] for row in rows)
+    with path.open(mode, newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def print_table(
@@ -91,7 +102,7 @@ def print_table(
 
 
 def _text(value: Any, digits: int) -> str:
-    if value is None:
+    if value is None or value != value:
         return ""
     return f"{value:.{digits}g}" if isinstance(value, float) else " ".join(str(value).split())
 

@@ -22,7 +22,7 @@ import pandas as pd
 from plab.cache import cache_dir
 from plab.cli.arguments import Parser, refuse_task, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import print_table
+from plab.cli.tables import print_table, write_csv
 from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -93,8 +93,8 @@ def _moments(mass: np.ndarray) -> dict[str, float]:
 
 
 def _write(table: pd.DataFrame, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    table.drop(columns="seconds").to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
+    table = table.drop(columns="seconds")
+    write_csv(path, [table.columns, *table.itertuples(index=False, name=None)], digits=6)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

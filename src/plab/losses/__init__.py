@@ -40,12 +40,12 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
     from plab.losses.term import Term
 
     terms: list[Term] = []
-    for name, place in check_terms(weights, choices).items():
+    for name, path in check_terms(weights, choices).items():
         if weights[name] == 0.0:
             continue
-        kind = load_object(place, type)
+        kind = load_object(path, type)
         if not issubclass(kind, Term):
-            raise ConfigError(f"method.loss_terms.{name}: '{place}' is no term of plab.losses.term")
+            raise ConfigError(f"method.loss_terms.{name}: '{path}' is no term of plab.losses.term")
         term = kind()
         term.name, term.weight = name, float(weights[name])
         terms.append(term)

@@ -22,7 +22,7 @@ CHOICES = {"contact": "nearest"}
 
 
 def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return the place, ``module:Class``, of each weight's term; nothing is imported.
+    """Return the class, ``module:Class``, of each weight's term; nothing is imported.
 
     Raises:
         ConfigError: If a name stands for no term, or a choice for no weight.
@@ -31,7 +31,7 @@ def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None 
     for name in choices or {}:
         if name not in weights:
             raise ConfigError(f"method.loss_terms.{name} has no weight; {pick(name, list(weights))}")
-    places = {}
+    classes = {}
     for name in weights:
         term = chosen.get(name, name)
         if term not in TERMS and ":" not in term:
@@ -39,5 +39,5 @@ def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None 
                 f"method.loss_weights.{name}: there is no term '{term}'; {pick(term, list(TERMS))}, or set "
                 f"method.loss_terms.{name}=module:Class"
             )
-        places[name] = TERMS.get(term, term)
-    return places
+        classes[name] = TERMS.get(term, term)
+    return classes

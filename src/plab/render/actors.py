@@ -1,4 +1,4 @@
-"""What is on the stage: clay, manipulators and the target, as PyVista draws them."""
+"""What is in the scene: clay, manipulators and the target, as PyVista draws them."""
 
 from __future__ import annotations
 

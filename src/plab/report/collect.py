@@ -20,7 +20,7 @@ from plab.locks import held
 from plab.report.methods import method, ordered
 from plab.report.splitting import SEED, split_rows
 from plab.results import Row, lookup, rows
-from plab.results.loading import places, readable_rows
+from plab.results.loading import readable_rows, sources_of
 
 __all__ = [
     "KEYS",
@@ -186,7 +186,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
     complete = [row for row in inside if row.values["status"] == "finished"]
     methods, seeds = asked["method"], asked["seed"]
     if split:
-        complete, names = split_rows(complete, split, places(source))
+        complete, names = split_rows(complete, split, sources_of(source))
         methods = [name for whole in methods for name in names.get(whole, [whole])]
         # Of each seed that is a method of its own there is one run.
         seeds = seeds[:1] if split == SEED else seeds

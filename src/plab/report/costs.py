@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,6 +21,7 @@ from plab.report.tables import ordered_tasks
 __all__ = [
     "PHASES",
     "contact_models",
+    "diagrams",
     "phases",
     "precision_summary",
     "step_times",
@@ -28,8 +31,17 @@ __all__ = [
 PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
 """Phases of a run, with their colours."""
 
+_ERRORS = {
+    "positions": "final positions, RMS",
+    "mass": "mass tensor, L1 / mass",
+    "score": "score",
+    "gradient": "norm of gradient, relative",
+    "angle_deg": "angle of gradient [deg]",
+}
+"""Columns of errors, and what their axes say."""
+
 _FLOOR = 1e-16
-"""Errors are drawn no smaller than this."""
+"""Errors are drawn no smaller than this: those of a reference with itself, say."""
 
 
 def step_times(compared: pd.DataFrame) -> Drawing | None:
@@ -96,39 +108,72 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
     if table.empty:
         return None
     tasks, contacts = list(dict.fromkeys(table["task"])), list(dict.fromkeys(table["contact"]))
-    shown = {"positions": "final positions, RMS", "gradient": "norm of gradient, relative"}
-    columns = [(column, text, contact) for column, text in shown.items() for contact in contacts]
+    panels = itertools.product(tasks, ("positions", "gradient"), contacts)
+    return _diagram("run_time_against_error", table, list(panels), len(tasks))
+
+
+def diagrams(table: pd.DataFrame) -> list[Drawing]:
+    """Draw run time against each kind of error, a figure per task and per axis that was varied.
+
+    Args:
+        table: As :func:`work_precision` takes it, or the rows as they are before they are written.
+    """
+    table = table.astype(dict.fromkeys(("ms_per_step", *_ERRORS), float))
+    out = []
+    for (axis, task), own in table.groupby(["axis", "task"], sort=False):
+        contacts = list(dict.fromkeys(own["contact"]))
+        columns = [column for column in _ERRORS if own[column].notna().any()]
+        panels = [(task, column, contact) for contact in contacts for column in columns]
+        out.append(_diagram(f"{task}_{axis}", own, panels, len(contacts)))
+    return out
+
+
+def _diagram(name: str, table: pd.DataFrame, panels: Sequence[tuple[str, str, str]], rows: int) -> Drawing:
+    """Draw panels in so many rows, each of a task, a column of errors and a contact model."""
+    varied = table["axis"].iloc[0]
+    numbers = {"substeps": "substeps per step", "grid": "grid nodes per axis"}[varied]
     timed = bool(table["ms_per_step"].notna().any())
-    figure, axes = grid(len(tasks), len(columns), width=2.2, height=1.9)
-    for line, task in zip(axes, tasks, strict=True):
-        for panel, (column, text, contact) in zip(line, columns, strict=True):
-            own = table[(table["task"] == task) & (table["contact"] == contact)]
-            _errors(panel, own, "ms_per_step" if timed else "substeps", column)
-            panel.set_title(f"{task}, {contact} contact")
-            log_axis(panel, "ms per step with gradient" if timed else "substeps per step")
-            log_axis(panel, text, vertical=True)
+    figure, axes = grid(rows, len(panels) // rows, width=2.2, height=2.0)
+    for panel, (task, column, contact) in zip(axes.flat, panels, strict=True):
+        own = table[(table["task"] == task) & (table["contact"] == contact)]
+        _errors(panel, own, "ms_per_step" if timed else varied, column, varied)
+        panel.set_title(f"{task}, {contact} contact", pad=12)
+        panel.margins(0.1)
+        log_axis(panel, "ms per step with gradient" if timed else numbers)
+        log_axis(panel, _ERRORS[column], vertical=True)
     legend(figure)
+    marks = f"numbers: {numbers}; x above: broke off"
+    figure.supxlabel(marks, fontsize=6, x=0.99, ha="right")
     notes = [
-        "Error against a reference in float64 with many more substeps; numbers: substeps per environment "
-        "step. Settings that diverge are left out.",
-        *([] if timed else ["There are no run times in the file: errors are drawn against substeps."]),
+        f"Error against a much finer reference in float64; {marks}.",
+        *([] if timed else [f"There are no run times in the file: errors are drawn against {varied}."]),
         *origin(table),
     ]
-    return Drawing("run_time_against_error", figure, notes)
+    return Drawing(name, figure, notes)
 
 
-def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str) -> None:
-    """Draw a line per precision: a column of errors against one of costs, with the numbers of substeps."""
-    for precision, rows in own.groupby("precision", sort=False):
-        stable = rows[rows["outcome"] == "stable"].sort_values("substeps")
-        colour, mark = _PRECISIONS.get(precision, ("#777777", "x"))
-        costs, error = stable[cost], stable[column].astype(float).clip(lower=_FLOOR)
-        panel.plot(costs, error, f"{mark}-", color=colour, markersize=3.5, label=precision)
-        for x, y, steps in zip(costs, error, stable["substeps"], strict=True):
-            panel.annotate(str(steps), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
+def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str) -> None:
+    """Draw a line per precision and material: a column of errors against one of costs, with what was
+    varied."""
+    for (precision, material), rows in own.groupby(["precision", "material"], sort=False):
+        (colour, dashes), mark = _LINES.get(precision, ("#777777", "-")), _MARKS.get(material, "^")
+        label = precision if material == "series" else f"{precision}, {material}"
+        rows = rows.sort_values(varied).assign(error=rows[column].astype(float).clip(lower=_FLOOR))
+        stable = rows[rows["outcome"] == "stable"]
+        panel.plot(stable[cost], stable["error"], mark + dashes, color=colour, markersize=3.5, label=label)
+        for x, y, number in stable[[cost, "error", varied]].itertuples(index=False):
+            panel.annotate(str(number), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
+        # What broke off has no error: it is at the upper edge, whatever the scale.
+        above: Any = panel.get_xaxis_transform()
+        small: dict[str, Any] = {"fontsize": 5, "textcoords": "offset points", "xycoords": above}
+        for x, number in rows.loc[rows["outcome"] != "stable", [cost, varied]].itertuples(index=False):
+            panel.plot(x, 1.0, "x", color=colour, transform=above, clip_on=False, markersize=4)
+            panel.annotate(str(number), (x, 1.0), xytext=(0, 4), ha="center", **small)
 
 
-_PRECISIONS = {"float32": ("#D55E00", "o"), "float64": ("#0072B2", "s")}
+# Both are seen where one lies on the other.
+_LINES = {"float32": ("#D55E00", "-"), "float64": ("#0072B2", "--")}
+_MARKS = {"series": "o", "singular values": "s"}
 
 
 def precision_summary(table: pd.DataFrame) -> pd.DataFrame:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from plab.report.statistics import Summary
 
-__all__ = ["MINUS", "NOTHING", "Table", "aligned", "number", "spread", "write_index", "write_table"]
+__all__ = ["MINUS", "NOTHING", "Table", "aligned", "mean_and_std", "number", "write_index", "write_table"]
 
 
 NOTHING = "\N{EN DASH}"
@@ -76,7 +76,7 @@ _NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
 """What begins a cell with a number: a share of runs, an interval, a mean with its spread, one with a unit."""
 
 
-def spread(summary: Summary, decimals: int = 2) -> str:
+def mean_and_std(summary: Summary, decimals: int = 2) -> str:
     """Write a mean and its standard deviation, which a single number does not have."""
     mean = number(summary.mean, decimals)
     return mean if summary.count < 2 else f"{mean} ± {number(summary.std, decimals)}"

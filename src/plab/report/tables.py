@@ -17,7 +17,7 @@ from plab.report.collect import Runs
 from plab.report.methods import GRADIENT, RL, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
-from plab.report.table import NOTHING, Table, number, spread
+from plab.report.table import NOTHING, Table, mean_and_std, number
 
 __all__ = [
     "INTERVAL",
@@ -62,7 +62,7 @@ class Cell:
         count = f"{self.summary.count}/{self.expected}"
         if not self.summary.count:
             return count
-        text = spread(self.summary)
+        text = mean_and_std(self.summary)
         return text if self.complete else f"{text} ({count})"
 
 
@@ -339,4 +339,4 @@ def _printed_best(row: Any) -> str:
     if not row.paper_method:
         return NOTHING
     printed = Summary(row.paper_mean, row.paper_std, PAPER_SEED_COUNT)
-    return f"{spread(printed)} ({method(row.paper_method).label})"
+    return f"{mean_and_std(printed)} ({method(row.paper_method).label})"

@@ -12,7 +12,7 @@ from plab.report.collect import Runs
 from plab.report.measurements import origin
 from plab.report.reference import paper_table
 from plab.report.statistics import Interval, Summary, stratified_difference, summarise
-from plab.report.table import NOTHING, Table, number, spread
+from plab.report.table import NOTHING, Table, mean_and_std, number
 from plab.report.tables import INTERVAL, ends, ordered_tasks, settings_note
 
 __all__ = ["timing"]
@@ -113,7 +113,7 @@ def _time_row(task: str, where: str, kind: str, ms: np.ndarray, theirs: float) -
 
 
 def _measured(ms: Summary) -> str:
-    return f"{spread(ms)} ({ms.count})" if ms.count else NOTHING
+    return f"{mean_and_std(ms)} ({ms.count})" if ms.count else NOTHING
 
 
 def _our_times(rows: Sequence[dict[str, Any]], runs: Runs) -> Table:

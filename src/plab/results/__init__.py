@@ -30,7 +30,7 @@ from plab.results.schema import (
 
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack
-    from plab.results.checking import Problem, check
+    from plab.results.checking import Fault, check
     from plab.results.curves import read_curves
     from plab.results.database import Row
     from plab.results.loading import load, rows
@@ -40,8 +40,8 @@ __all__ = [
     "BUDGETS",
     "SCHEMA_VERSION",
     "STATUSES",
+    "Fault",
     "NewerSchemaError",
-    "Problem",
     "ResultsError",
     "Row",
     "RunBusyError",

@@ -28,7 +28,7 @@ from plab.results.schema import (
     row_count,
 )
 
-__all__ = ["Problem", "check", "problems"]
+__all__ = ["Fault", "check", "faults"]
 
 _IN_UNIT_INTERVAL = ("iou", "score", "iou_initial", "iou_target_self")
 
@@ -37,7 +37,7 @@ _TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class Problem:
+class Fault:
     """What is wrong with a file, or a run in an archive, and what to do, a line each."""
 
     path: Path
@@ -45,7 +45,7 @@ class Problem:
     advice: str
 
 
-def check(source: str | Path) -> Iterator[tuple[Path, Problem | None]]:
+def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
     """Check all result files of a folder, all runs of an archive, or one file, in full.
 
     Args:
@@ -64,7 +64,7 @@ def check(source: str | Path) -> Iterator[tuple[Path, Problem | None]]:
             yield path, _check_file(path)
 
 
-def problems(run: RunResult) -> list[str]:
+def faults(run: RunResult) -> list[str]:
     """Return what is wrong with the contents of a run that could be read, nothing if all is well."""
     found = [*_status(run), *_iterations(run), *_best(run)]
     if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
@@ -79,30 +79,30 @@ def problems(run: RunResult) -> list[str]:
 _GET_RIGHTS = "ask whom it belongs to for the right to read it"
 
 
-def _check_archive(path: Path) -> Iterator[tuple[Path, Problem | None]]:
+def _check_archive(path: Path) -> Iterator[tuple[Path, Fault | None]]:
     try:
         with opened_archive(path) as archive:
             names = members(archive)
     except ResultsError as error:
         reason = _reason(error, path)
         hidden = reason.startswith("may not be read")
-        yield path, Problem(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
+        yield path, Fault(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
         return
     for name in names:
         yield path / name, _check_file(path / name)
 
 
-def _check_file(path: Path) -> Problem | None:
+def _check_file(path: Path) -> Fault | None:
     try:
         run = read(path)
-        found = problems(run)
+        found = faults(run)
     except ResultsError as error:
         reason = _reason(error, path)
-        return Problem(path, reason, _advice_unreadable(path, reason))
+        return Fault(path, reason, _advice_unreadable(path, reason))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
     if found:
-        return Problem(path, "; ".join(found), "run it again with force=true, or delete it")
+        return Fault(path, "; ".join(found), "run it again with force=true, or delete it")
     return None
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from plab.results.database import quoted, run_number
 from plab.results.files import read_iterations
 from plab.results.hdf5 import columns
-from plab.results.loading import counting_files, places, read_each
+from plab.results.loading import counting_files, read_each, sources_of
 from plab.results.schema import ARCHIVE_SUFFIX, ResultsError
 from plab.results.store import Store, file_key
 from plab.results.workers import each
@@ -56,7 +56,7 @@ def read_curves(source: str | Path | Sequence[str | Path], paths: Iterable[str |
     files = {path.partition(_INSIDE)[0] + ARCHIVE_SUFFIX if _INSIDE in path else path for path in wanted}
     found: dict[str, Curves] = {}
     asked = set(wanted)
-    for root in places(source):
+    for root in sources_of(source):
         for path, member, curves in _stored(root, files):
             place = str(path / member) if member else str(path)
             if place in asked:

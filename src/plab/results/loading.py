@@ -41,12 +41,12 @@ __all__ = [
     "counting_files",
     "load",
     "members",
-    "places",
     "read_each",
     "read_rows",
     "readable_rows",
     "rows",
     "run_files",
+    "sources_of",
     "up_to_date",
     "warn_of",
 ]
@@ -113,7 +113,7 @@ def rows(
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    entries = [entry for root in places(source) for entry in _all_rows(root, database)]
+    entries = [entry for root in sources_of(source) for entry in _all_rows(root, database)]
     found = [entry for entry in entries if isinstance(entry, Row)]
     return _without_repetitions(found), [entry for entry in entries if isinstance(entry, ResultsError)]
 
@@ -125,12 +125,12 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = rows(source)
-    if unreadable and not found and not any(root.is_dir() for root in places(source)):
+    if unreadable and not found and not any(root.is_dir() for root in sources_of(source)):
         raise unreadable[0]
     return found, unreadable
 
 
-def places(source: str | Path | Sequence[str | Path]) -> list[Path]:
+def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Return the folders, archives and files that are meant.
 
     Raises:

@@ -14,7 +14,7 @@ from plab.config.selection import Selection, SelectionError, lookup
 from plab.errors import PlabError
 from plab.results.curves import add_iterations
 from plab.results.database import Row, tables_of
-from plab.results.loading import places, readable_rows, up_to_date, warn_of
+from plab.results.loading import readable_rows, sources_of, up_to_date, warn_of
 from plab.results.schema import ResultsError
 
 __all__ = ["QueryError", "connect", "query", "scores"]
@@ -39,7 +39,7 @@ def connect(
     Raises:
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
-    connection, unreadable = _connected(places(source), iterations)
+    connection, unreadable = _connected(sources_of(source), iterations)
     warn_of(unreadable)
     return connection
 
@@ -56,7 +56,7 @@ def query(
         QueryError: If it is no query, or wrong.
         ResultsError: As for :func:`connect`.
     """
-    sources = places(source)
+    sources = sources_of(source)
     try:
         try:
             return _answer(sources, sql, iterations=False)

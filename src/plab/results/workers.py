@@ -47,7 +47,7 @@ def each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
         todo.put(number)
     results: dict[int, list[R]] = {}
 
-    def work(worker: subprocess.Popen[bytes] | None = None) -> None:
+    def answer(worker: subprocess.Popen[bytes] | None = None) -> None:
         with contextlib.suppress(queue.Empty):
             while True:
                 number = todo.get_nowait()
@@ -59,14 +59,14 @@ def each(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
                     return
                 results[number] = list(map(function, chunks[number])) if found is None else found
 
-    threads = [threading.Thread(target=work, args=(worker,)) for worker in workers]
+    threads = [threading.Thread(target=answer, args=(worker,)) for worker in workers]
     try:
         for thread in threads:
             thread.start()
-        work()
+        answer()
         for thread in threads:
             thread.join()
-        work()
+        answer()
     finally:
         for worker in workers:
             worker.kill()

@@ -11,6 +11,7 @@ import taichi as ti
 
 from plab.errors import ArgumentError
 from plab.sim.particles import Particles
+from plab.sim.storage import AT_V
 from plab.sim.tensors import copy_numbers, numbers_of, on_device, step_actions
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ class ClosedLoop:
                 f"derivatives by the observation have shapes {tuple(moved.shape)} and "
                 f"{tuple(posed.shape)}, not {expected} and {(engine.batch, engine.manipulators, 8)}"
             )
-        for first in (0, 3):
+        for first in (0, AT_V):
             whole = self._zeros(moved)
             whole[:, ::stride] = moved[..., first : first + 3]
             engine.add_cotangents(bar, self._numbers[t + 1], whole.reshape(-1), first)

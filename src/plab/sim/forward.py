@@ -22,12 +22,11 @@ from plab.sim.skips import Skips
 from plab.sim.state import Measures, State, rest_state
 from plab.sim.tape import Tape
 from plab.sim.tensors import numbers_of, on_device, output_for, step_actions
+from plab.sim.term_phases import LossTerm
 from plab.sizes import require_memory
 
 if TYPE_CHECKING:
     import torch
-
-    from plab.losses.term import Term
 
 __all__ = ["CONTACT_MODELS", "ForwardSimulator"]
 
@@ -41,7 +40,7 @@ class ForwardSimulator:
         self,
         scenes: Sequence[Scene],
         *,
-        terms: Sequence[Term] = (),
+        terms: Sequence[LossTerm] = (),
         precision: str = "float32",
         device: str = "cpu",
         memory_mb: float = 4000.0,
@@ -129,7 +128,7 @@ class ForwardSimulator:
         return self.scenes[0].action_dim
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[LossTerm, ...]:
         """Terms of the loss, in the order of :attr:`Measures.terms`."""
         return tuple(term for term in self._engine.terms if term.weighted)
 

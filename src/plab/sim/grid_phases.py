@@ -8,7 +8,14 @@ import taichi as ti
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.friction import slid, slid_adjoint
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
-from plab.sim.storage import BLOCK, FRAME_ADJOINT, Storage
+from plab.sim.storage import (
+    AT_FRAME_GAP,
+    AT_FRAME_ROTATION,
+    AT_FRAME_SPIN,
+    AT_FRAME_VELOCITY,
+    BLOCK,
+    Storage,
+)
 
 __all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases"]
 
@@ -182,17 +189,14 @@ class GridPhases(Storage):
             centre_bar = -self.out_of_frame(shape, e, s, m, p_bar)
             for i in ti.static(range(3)):
                 self.accumulate_frame(grid_index, m, i, centre_bar[i])
-                self.accumulate_frame(grid_index, m, 3 + i, u_bar[i])
+                self.accumulate_frame(grid_index, m, AT_FRAME_VELOCITY + i, u_bar[i])
                 if ti.static(self.turns(shape)):
                     for j in ti.static(range(3)):
-                        self.accumulate_frame(
-                            grid_index, m, 6 + 3 * i + j, normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
-                        )
-                        self.accumulate_frame(grid_index, m, 15 + 3 * i + j, u_bar[i] * p[j])
+                        turned = normal_bar[i] * n_local[j] + offset[i] * p_bar[j]
+                        self.accumulate_frame(grid_index, m, AT_FRAME_ROTATION + 3 * i + j, turned)
+                        self.accumulate_frame(grid_index, m, AT_FRAME_SPIN + 3 * i + j, u_bar[i] * p[j])
             if ti.static(MANIPULATOR_SHAPES[shape].grips):
-                self.accumulate_frame(
-                    grid_index, m, FRAME_ADJOINT - 1, gap_slope(shape, p) * from_distance[0]
-                )
+                self.accumulate_frame(grid_index, m, AT_FRAME_GAP, gap_slope(shape, p) * from_distance[0])
 
     # -- walls --------------------------------------------------------------------------------------
 

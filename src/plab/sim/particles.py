@@ -9,7 +9,7 @@ import taichi as ti
 
 from plab.sim.order import ParticleOrder
 from plab.sim.state import State
-from plab.sim.storage import STATE
+from plab.sim.storage import AT_C, AT_F, AT_V, STATE
 from plab.sim.tensors import clear
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Particles:
         engine = self.engine
         b, n = engine.batch, engine.particles
         flat: np.ndarray = np.zeros((b, engine.tiles * engine.lanes, STATE), self._numpy_real)
-        flat[:, :, [15, 19, 23]] = 1.0
+        flat[:, :, [AT_F, AT_F + 4, AT_F + 8]] = 1.0
         parts = (state.x, state.v, np.reshape(state.C, (b, n, 9)), np.reshape(state.F, (b, n, 9)))
         values = np.concatenate(parts, axis=2)
         flat[:, :n] = np.take_along_axis(values, self.order.initial[:, :, None], axis=1)
@@ -132,9 +132,9 @@ class Particles:
         np.put_along_axis(values, order[:, :, None], flat.astype(np.float64), axis=1)
         shape = (b, n, 3, 3)
         return State(
-            values[..., 0:3],
-            values[..., 3:6],
-            values[..., 6:15].reshape(shape),
-            values[..., 15:24].reshape(shape),
+            values[..., :AT_V],
+            values[..., AT_V:AT_C],
+            values[..., AT_C:AT_F].reshape(shape),
+            values[..., AT_F:].reshape(shape),
             poses,
         )

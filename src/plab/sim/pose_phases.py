@@ -4,7 +4,7 @@ import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
 from plab.sim.motion import advance_pose_adjoint, rotation_matrix, rotation_matrix_adjoint
-from plab.sim.storage import Storage
+from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 
 __all__ = ["PosePhases", "vec7", "with_unit_rotation"]
@@ -105,12 +105,12 @@ class PosePhases(Storage):
         rotation_bar = mat3(0.0)
         spin_bar = mat3(0.0)
         for i in ti.static(range(3)):
-            end_bar[i] = frame[3 + i] * inv_dt
-            start_bar[i] = frame[i] - frame[3 + i] * inv_dt
+            end_bar[i] = frame[AT_FRAME_VELOCITY + i] * inv_dt
+            start_bar[i] = frame[i] - frame[AT_FRAME_VELOCITY + i] * inv_dt
             for j in ti.static(range(3)):
-                rotation_bar[i, j] = frame[6 + 3 * i + j]
-                spin_bar[i, j] = frame[15 + 3 * i + j] * inv_dt
-        start_bar[7] = frame[24]
+                rotation_bar[i, j] = frame[AT_FRAME_ROTATION + 3 * i + j]
+                spin_bar[i, j] = frame[AT_FRAME_SPIN + 3 * i + j] * inv_dt
+        start_bar[7] = frame[AT_FRAME_GAP]
         if ti.static(MANIPULATOR_SHAPES[self.shapes[m]].turns):
             end_q = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
             start_q = rotation_matrix_adjoint(quaternion(self.pose[e, s, m]), rotation_bar - spin_bar)

@@ -12,6 +12,7 @@ import taichi as ti
 
 from plab.errors import ArgumentError
 from plab.sim.particles import Particles
+from plab.sim.storage import AT_V
 from plab.sim.tensors import on_device, output_for
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class Recorder:
             return
         for name in ("x", "v"):
             if name in self._bars:
-                first = 0 if name == "x" else 3
+                first = 0 if name == "x" else AT_V
                 self._engine.add_cotangents(bar, self._numbers[k], self._bars[name][k], first)
         if "mass" in self._bars:
             self._engine.add_mass_cotangents(state, slot, bar, self._bars["mass"][k])

@@ -31,6 +31,10 @@ __all__ = [
     "ADJOINT_FIELD",
     "AT_C",
     "AT_F",
+    "AT_FRAME_GAP",
+    "AT_FRAME_ROTATION",
+    "AT_FRAME_SPIN",
+    "AT_FRAME_VELOCITY",
     "AT_V",
     "BASES",
     "BLOCK",
@@ -65,8 +69,9 @@ CHUNKS = 8
 """Private grids per environment on the CPU: a constant, because the order of summation follows from it."""
 
 FRAME_ADJOINT = 25
-"""Adjoint entries per manipulator and substep: centre (3), velocity (3), rotation (9), its rate (9), gap
-(1)."""
+AT_FRAME_VELOCITY, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_GAP = 3, 6, 15, 24
+"""Adjoint entries per manipulator and substep, and where they begin: centre (3), velocity (3), rotation (9),
+its rate (9), gap (1)."""
 
 MANIPULATOR = 18
 """Numbers that say what a manipulator is like, for :meth:`Storage.put_manipulators`; its size is first."""
@@ -168,8 +173,8 @@ class Storage:
         self.action_offsets = tuple(sum(self.action_dims[:m]) for m in range(self.manipulators))
         self.actions_per_step = scene.action_dim
         # Consecutive manipulators of one shape share one loop, hence one compiled body.
-        runs = [list(run) for _, run in groupby(range(self.manipulators), key=lambda m: self.shapes[m])]
-        self.shape_ranges = tuple((self.shapes[run[0]], run[0], run[-1] + 1) for run in runs)
+        groups = [list(group) for _, group in groupby(range(self.manipulators), key=self.shapes.__getitem__)]
+        self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)
 
     def moves(self, shape: str) -> bool:
         """Whether manipulators of this shape can move; decided while compiling, as what follows."""

@@ -11,8 +11,9 @@ masses.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
@@ -23,11 +24,25 @@ from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
 from plab.sim.transfer import spline, spline_slope
 
-__all__ = ["EXTRA_MEASURES", "TermPhases"]
+__all__ = ["EXTRA_MEASURES", "LossTerm", "TermPhases"]
 
 EXTRA_MEASURES = 2
 """Measures of a state after its terms: the largest mass of a node, and the fault: the number of the substep
 in which the state broke, from 1 on, or 0."""
+
+
+class LossTerm(Protocol):
+    """What every term is asked for, whatever its kind; :mod:`plab.losses.term` says what it means."""
+
+    name: str
+    label: str
+    unit: str
+    weight: float
+    weighted: bool
+
+    def attach(self, sim: Any) -> None: ...
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None: ...
 
 
 class TermPhases(Storage):
@@ -43,12 +58,12 @@ class TermPhases(Storage):
     """
 
     shares: int
-    terms: tuple[Any, ...] = ()
+    terms: tuple[LossTerm, ...] = ()
     node_terms: tuple[tuple[int, int, Any], ...] = ()
     particle_terms: tuple[tuple[int, int, Any], ...] = ()
     distance_terms: tuple[tuple[int, int, Any], ...] = ()
 
-    def attach(self, terms: Sequence[Any]) -> None:
+    def attach(self, terms: Sequence[LossTerm]) -> None:
         """Take over the terms, before the first kernel is compiled.
 
         Args:

@@ -18,7 +18,7 @@ from plab.locks import held
 from plab.results import ResultsError, Row, row_count
 from plab.results.files import opened, split_archive
 from plab.results.hdf5 import attributes, columns, numbers
-from plab.results.loading import places, readable_rows
+from plab.results.loading import readable_rows, sources_of
 from plab.results.schema import parse_member
 from plab.tally import MOST_RUNS
 
@@ -153,7 +153,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
-    begun = [key for root in places(source) for key in _begun(root)]
+    begun = [key for root in sources_of(source) for key in _begun(root)]
     keys = _expected(fitting, begun, chosen, missing)
     runs = {key: Run(*key) for key in keys}
     others = 0

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from plab.errors import ArgumentError
+from plab.errors import ArgumentError, tell
 from plab.status.survey import STATES, Survey
 
 __all__ = ["duration", "show", "watch"]
@@ -75,7 +75,7 @@ def show(found: Survey) -> None:
         text = "further run(s) in the results, of other names or other settings"
         console.print(f"{found.others} {text}", highlight=False)
     for error in found.unreadable:
-        console.print(f"left out: {error}", highlight=False, markup=False)
+        tell(f"left out: {error}")
 
 
 def _sums(found: Survey) -> list[str]:

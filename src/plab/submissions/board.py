@@ -46,7 +46,7 @@ class Point:
     """A score that was reached after so many environment steps, in a task and a variant; ``exact`` is that in
     float64, or NaN."""
 
-    place: tuple[str, str]
+    configuration: tuple[str, str]
     steps: int
     score: float
     exact: float = math.nan
@@ -135,15 +135,14 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
-            for place, line in _handed_in(path, tuple(overrides)):
-                tables[place].append(line)
+            for table, line in _handed_in(path, tuple(overrides)):
+                tables[table].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    for place, line in _own():
-        tables[place].append(line)
-    places = [*_USUAL, *(place for place in _RARE if tables[place])]
+    for table, line in _own():
+        tables[table].append(line)
     sections = []
-    for kind, terms in places:
+    for kind, terms in (*_USUAL, *(table for table in _RARE if tables[table])):
         title, targets = _SETS[kind]
         if terms != "plab":
             title += " on its terms" if kind == "authors" else " on the authors' terms"
@@ -169,8 +168,8 @@ def _line(card: Card, track: str, status: str, kind: str, points: Sequence[Point
     exact = [point.exact for point in best.values()]
     tasks = []
     for task in suite_tasks():
-        own = [point.score for place, point in best.items() if place[0] == task]
-        count = sum(place[0] == task for place in expected)
+        own = [point.score for (name, _), point in best.items() if name == task]
+        count = sum(name == task for name, _ in expected)
         tasks.append(sum(own) / count if own else None)
     return Line(
         card,
@@ -191,9 +190,9 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
     """Return the best point of each configuration within a budget."""
     found: dict[tuple[str, str], Point] = {}
     for point in points:
-        best = found.get(point.place)
+        best = found.get(point.configuration)
         if point.steps <= limit and (best is None or point.score > best.score):
-            found[point.place] = point
+            found[point.configuration] = point
     return found
 
 
@@ -201,25 +200,25 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
 
 
 @functools.cache
-def _composed(place: Configuration, overrides: tuple[str, ...]) -> Config:
-    return place.config(overrides)
+def _composed(configuration: Configuration, overrides: tuple[str, ...]) -> Config:
+    return configuration.config(overrides)
 
 
 @functools.cache
-def _digests(place: Configuration, overrides: tuple[str, ...]) -> Digests:
-    return Digests.of(_composed(place, overrides))
+def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Digests:
+    return Digests.of(_composed(configuration, overrides))
 
 
 def _stranger(submission: Submission, overrides: tuple[str, ...]) -> str | None:
     """Return the name of a configuration that is another one here, None if there is none."""
     for entry in submission.entries:
-        place = entry.configuration
+        configuration = entry.configuration
         # The scene is the same, and the authors' files need not be here.
-        known = _digests(replace(place, targets="suite"), overrides)
+        known = _digests(replace(configuration, targets="suite"), overrides)
         if entry.digests.scene != known.scene:
-            return f"the scene of {place.name}"
-        if place.targets == "suite" and entry.digests.target != known.target:
-            return f"the target of {place.name}"
+            return f"the scene of {configuration.name}"
+        if configuration.targets == "suite" and entry.digests.target != known.target:
+            return f"the target of {configuration.name}"
     return None
 
 
@@ -251,8 +250,8 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[s
         own, score = entry.configuration, scores.get("float32", entry.score)
         point = Point((own.task, own.variant), entry.steps, score, scores.get("float64", math.nan))
         tables["unseen" if own.unseen else own.targets, own.terms].append(point)
-    for place, points in tables.items():
-        yield place, _line(submission.card, submission.track, status, place[0], points)
+    for table, points in tables.items():
+        yield table, _line(submission.card, submission.track, status, table[0], points)
 
 
 # -------------------------------------------------------------------------------------------- first entries
@@ -267,10 +266,10 @@ def _own() -> tuple[tuple[tuple[str, str], Line], ...]:
         "targets": ("authors", "plab"),
         "release": ("authors", "release"),
     }
-    for name, place in archives.items():
+    for name, table in archives.items():
         for card, runs in _runs(name):
-            points = [Point(_place(row), steps_to_best(row), row.values["score_best"]) for row in runs]
-            found.append((place, _line(card, "plans", "own runs", place[0], points)))
+            points = [Point(_which(row), steps_to_best(row), row.values["score_best"]) for row in runs]
+            found.append((table, _line(card, "plans", "own runs", table[0], points)))
     return tuple(found)
 
 
@@ -294,7 +293,7 @@ def _of_today(config: Mapping[str, Any]) -> bool:
     return config["task"]["target"] == config_dict(today)["task"]["target"]
 
 
-def _place(row: Row) -> tuple[str, str]:
+def _which(row: Row) -> tuple[str, str]:
     return row.values["task"], row.values["variant"]
 
 
@@ -310,7 +309,7 @@ def _paper() -> Section:
         card = replace(PAPER, name=look.label, gradient=gradient)
         lines.append(_line(card, "plans" if gradient else "policies", "printed", "authors", points))
     for card, runs in _runs("release"):
-        points = [Point(_place(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
+        points = [Point(_which(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
         lines.append(_line(card, "plans", "own runs", "authors", points))
     protocol = (
         f"{_ORIGIN['release']}; the authors' target files. The score is that of the last iteration as it was "

@@ -54,15 +54,14 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
             finished = (row for row in rows if row.values["status"] == "finished")
             groups += [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
         for path, entries in groups:
-            for place in {entry.configuration for entry in entries}:
-                if place in found:
-                    raise SubmissionError(
-                        f"{path} and {found[place][0]} are both of {place.name}: submit one training of each"
-                    )
-                found[place] = path, [entry for entry in entries if entry.configuration == place]
+            for configuration in {entry.configuration for entry in entries}:
+                if configuration in found:
+                    both, name = f"{path} and {found[configuration][0]}", configuration.name
+                    raise SubmissionError(f"{both} are both of {name}: submit one training of each")
+                found[configuration] = path, [e for e in entries if e.configuration == configuration]
     if not found:
         raise SubmissionError("there is nothing to submit: no episode has ended, or no finished run fits")
-    return [entry for place in sorted(found) for entry in found[place][1]]
+    return [entry for configuration in sorted(found) for entry in found[configuration][1]]
 
 
 def _of_run(row: Row) -> Entry:
@@ -110,8 +109,8 @@ def from_policies(
         cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
         played = play_policy(cfgs, load(name, files[name]), str(path), "float32")
         for cfg, one in zip(cfgs, played, strict=True):
-            place = configuration_of(cfg)
+            configuration = configuration_of(cfg)
             if one.failure:
-                raise SubmissionError(f"{place.name}: the simulation broke off, {one.failure}")
-            entries.append(Entry(place, Digests.of(cfg), steps, one.score, policy=name))
+                raise SubmissionError(f"{configuration.name}: the simulation broke off, {one.failure}")
+            entries.append(Entry(configuration, Digests.of(cfg), steps, one.score, policy=name))
     return entries, files

@@ -87,9 +87,9 @@ def verify(
     # Each group is what one simulator can play.
     alike: dict[Any, list[int]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
-        place = entry.configuration
+        configuration = entry.configuration
         if run_policies or not entry.policy:
-            alike[place.task, place.targets, place.terms, entry.policy].append(number)
+            alike[configuration.task, configuration.targets, configuration.terms, entry.policy].append(number)
     policies = {name: load(name, submission.policies[name]) for *_, name in alike if name}
     # Going from one precision to the other starts Taichi anew.
     for precision in precisions:
@@ -117,15 +117,15 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
     found: dict[Configuration, Config] = {}
     digests: dict[Configuration, Digests] = {}
     for entry in submission.entries:
-        place = entry.configuration
-        if place not in found:
-            found[place] = place.config(overrides)
-            digests[place] = Digests.of(found[place])
+        configuration = entry.configuration
+        if configuration not in found:
+            found[configuration] = configuration.config(overrides)
+            digests[configuration] = Digests.of(found[configuration])
         for part in ("scene", "target"):
-            if getattr(entry.digests, part) != getattr(digests[place], part):
+            if getattr(entry.digests, part) != getattr(digests[configuration], part):
                 raise SubmissionError(
-                    f"{submission.path}: the {part} of {place.name} is another one than here: give the "
-                    f"overrides that it was made with, or use its plab ({submission.plab}, this is "
+                    f"{submission.path}: the {part} of {configuration.name} is another one than here: give "
+                    f"the overrides that it was made with, or use its plab ({submission.plab}, this is "
                     f"{plab.__version__})"
                 )
     return found

@@ -4,6 +4,6 @@ K3D-jupyter, which draws with three.js, is optional: ``pip install 'plab[view]'`
 details.
 """
 
-from plab.view.inline import View, show
+from plab.view.inline import Viewer, show
 
-__all__ = ["View", "show"]
+__all__ = ["Viewer", "show"]

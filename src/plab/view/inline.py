@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
     from plab.config import Config
 
-__all__ = ["View", "show"]
+__all__ = ["Viewer", "show"]
 
 _HEIGHT = 480
 
 
 @dataclass(frozen=True)
-class View:
+class Viewer:
     """A rollout in 3-D; a notebook whose cell ends with it shows the viewer.
 
     Attributes:
@@ -47,7 +47,7 @@ def show(
     *,
     every: int | None = None,
     height: int = _HEIGHT,
-) -> View:
+) -> Viewer:
     """Simulate a rollout in the hard contact model, and return it for a notebook to show in 3-D.
 
     Beside simulators that are there already it runs on their device and in their precision, whatever the
@@ -84,4 +84,4 @@ def show(
         sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
         cfg = dataclasses.replace(cfg, sim=sim)
     rollout = recording.record_with_motion(cfg, actions)
-    return View(page(rollout, every), rollout.score, height)
+    return Viewer(page(rollout, every), rollout.score, height)
