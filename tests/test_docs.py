@@ -201,11 +201,27 @@ def test_pages_for_users_are_short():
     assert sum(map(words, USERS)) <= 16_000, {page.name: words(page) for page in USERS}
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *USERS], ids=lambda page: page.stem)
+DIARY = re.compile(
+    r"\b(earlier|formerly|previously|now|nowadays|no longer|at first|(another|that) day|that time|before this"
+    r"|since (then|that|the (last|previous))|(?<!is )(?<!are )(?<!be )used to|aims? (was|were)|we tried)\b",
+    re.IGNORECASE,
+)
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "reports").glob("*.py")), ids=lambda path: path.stem)
+def test_notebooks_say_what_holds(notebook):
+    text = re.findall(r"^# (?!%%).*", notebook.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [match[0] for match in DIARY.finditer("\n".join(text))] == []
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", ROOT / "src" / "plab" / "examples" / "README.md", *USERS],
+    ids=lambda page: "-".join((*page.relative_to(ROOT).parts[:-1], page.stem)),
+)
 def test_pages_for_users_say_what_holds(page):
     text = page.read_text(encoding="utf-8")
-    diary = r"\b(earlier|formerly|now|nowadays|(another|that) day|that time|aims? (was|were)|we tried)\b"
-    assert [match[0] for match in re.finditer(diary, text, re.IGNORECASE)] == []
+    assert [match[0] for match in DIARY.finditer(" ".join(text.split()))] == []
     # A page opens with what its reader can do with it: words, before any table, picture or command.
     title, _, rest = text.partition("\n")
     assert title.startswith("# ")

@@ -7,12 +7,13 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from plab.config import load_config
+from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
 from same_runs import stopped_at
@@ -22,6 +23,7 @@ DOCS = ROOT / "docs"
 SRC = ROOT / "src"
 METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
+SMALL = ("sim.grid_size=32", "sim.substeps=10", "sim.dt=2e-4", "sim.particles_scale=0.05")
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 # Run in a copy of plab that has the disc: the gradient must be what differences are.
@@ -66,18 +68,75 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
-def run_page(page: str) -> dict[str, Any]:
+def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
+    code = "\n".join(blocks(page, "python"))
+    for old, new in changes:
+        assert old in code
+        code = code.replace(old, new)
     names: dict[str, Any] = {}
-    exec("\n".join(blocks(page, "python")), names)
+    exec(code, names)
     return names
 
 
 # -------------------------------------------------------------------------------------------- run as they are
 
 
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What a page composes is coarse, unless it says otherwise, and on the CPU; the folder is empty."""
+
+    def coarse(overrides: Sequence[str] = (), config_dir: str | None = None) -> Config:
+        words = [word for word in overrides if word != "sim.device=cuda"]
+        given = {word.partition("=")[0] for word in words}
+        less = (word for word in SMALL if word.partition("=")[0] not in given)
+        return load_config([*words, *less], config_dir)
+
+    monkeypatch.chdir(tmp_path)
+    for module in ("plab.config", "plab.envs.core"):
+        monkeypatch.setattr(f"{module}.load_config", coarse)
+
+
 @pytest.mark.physics
 def test_quick_start():
     assert run_page("index.md")["result"].gradient.shape == (4, 10, 6)
+
+
+@pytest.mark.physics
+@pytest.mark.usefixtures("small")
+def test_readme():
+    names = run_page("../README.md")
+    assert names["result"].gradient.shape == (4, 10, 6) and names["envs"].num_envs == 64
+
+
+@pytest.mark.physics
+@pytest.mark.usefixtures("small")
+def test_environments():
+    """With four environments instead of 64 or 16, and one update of the agent."""
+    fewer = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
+    fewer += [("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200")]
+    names = run_page("environments.md", *fewer)
+    assert names["info"]["score"] >= 0.0
+    assert names["infos"]["final_info"]["score"].shape == (4,)
+    assert names["model"].num_timesteps == 200
+    assert names["done"].reward.shape == (4,) and names["done"].truncated
+
+
+@pytest.mark.physics
+@pytest.mark.usefixtures("small")
+def test_results(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    run_config(load_config(["task=Move", *SMALL, "sim.horizon=5", "method.iterations=2", "progress=false"]))
+    names = run_page("results.md")
+    assert len(names["table"]) == 1 and names["table"]["task.yield_stress"].notna().all()
+    assert len(names["run"].iterations) == 2
+
+
+@pytest.mark.physics
+@pytest.mark.usefixtures("small")
+def test_rendering():
+    pytest.importorskip("k3d")
+    pytest.importorskip("pyvista")
+    assert run_page("rendering.md")["picture"].shape == (360, 480, 3)
 
 
 # -------------------------------------------------------------------------------------------- own method
