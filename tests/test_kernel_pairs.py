@@ -13,8 +13,8 @@ import taichi as ti
 
 import suite
 from plab.scene import Scene
+from plab.sim.cpu_bitcode import address_of
 from plab.sim.cpu_phases import CpuPhases
-from plab.sim.cpu_stencils import address_of
 from plab.sim.cuda_threads import ThreadPhases
 from plab.sim.runtime import start_runtime
 from plab.sim.skips import Skips
@@ -59,7 +59,7 @@ class Tiles(CpuPhases):
         self._gather(state, address_of(state))
 
     def scatter_adjoint_all(self, state: ti.Ndarray, bar: ti.Ndarray) -> None:
-        self._scatter_adjoint(state, bar, address_of(bar))
+        self._scatter_adjoint(state, address_of(state), bar, address_of(bar))
 
     def gather_adjoint_all(self, state: ti.Ndarray, bar: ti.Ndarray) -> None:
         self._gather_adjoint(state, address_of(state), bar, address_of(bar))
@@ -78,11 +78,15 @@ class Tiles(CpuPhases):
 
     @ti.kernel
     def _scatter_adjoint(
-        self, state: ti.types.ndarray(ndim=1), bar: ti.types.ndarray(ndim=1), bar_at: ti.u64
+        self,
+        state: ti.types.ndarray(ndim=1),
+        state_at: ti.u64,
+        bar: ti.types.ndarray(ndim=1),
+        bar_at: ti.u64,
     ):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.scatter_chunk_adjoint(state, 0, 1, bar, bar_at, e, c, 2)
+                self.scatter_chunk_adjoint(state, state_at, 0, 1, bar, bar_at, e, c, 2)
 
     @ti.kernel
     def _gather_adjoint(

@@ -1,33 +1,21 @@
-"""The bitcode of plab.sim.cpu_stencils: sums over a particle's 27 nodes, for LLVM.
+"""Sums over a particle's 27 nodes, for LLVM.
 
 What Taichi emits for these sums looks up where fields begin after each store, takes a node at a time and
 never fuses a product with a sum. Here three nodes that are neighbours along z are one row of twelve numbers,
-in a vector of eight and one of four. ``make bitcode`` writes a file for each platform, whose data layouts
-differ; their names end in a digest, since Taichi's cache knows bitcode by the name of its file.
+in a vector of eight and one of four.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
 from typing import Any
 
-import llvmlite.binding as llvm
 from llvmlite import ir
 
 from plab.sim.storage import ADJOINT_FIELD, AT_C, AT_V, LANES, MOMENTUM_FIELD, OFFSETS, SLOPES, WEIGHTS
 
 LANE = LANES["cpu"]
-
-X86 = "p270:32:32-p271:32:32-p272:64:64-i64:64-f80:128-n8:16:32:64-S128"
-LAYOUTS = {
-    "linux-x86_64": f"e-m:e-{X86}",
-    "win32-amd64": f"e-m:w-{X86}",
-    "darwin-x86_64": f"e-m:o-{X86}",
-    "darwin-arm64": "e-m:o-i64:64-i128:128-n32:64-S128",
-}
-"""Data layouts of the platforms that Taichi has wheels for."""
 
 WORD = ir.IntType(64)
 
@@ -78,6 +66,35 @@ class Code:
 
     def mul(self, a: ir.Value, b: ir.Value) -> ir.Value:
         return self._b.fmul(a, b, flags=("contract",))
+
+    def div(self, a: ir.Value, b: ir.Value) -> ir.Value:
+        return self._b.fdiv(a, b)
+
+    def minus(self, a: ir.Value) -> ir.Value:
+        return self._b.fneg(a)
+
+    def root(self, a: ir.Value) -> ir.Value:
+        """Square roots of a vector."""
+        kind = ir.FunctionType(a.type, [a.type])
+        name = f"llvm.sqrt.v{LANE}{'f32' if isinstance(self.real, ir.FloatType) else 'f64'}"
+        known = self._b.module.globals.get(name)
+        return self._b.call(known or ir.Function(self._b.module, kind, name), [a])
+
+    def constant(self, number: float) -> ir.Value:
+        """A number in all lanes."""
+        return ir.Constant(ir.VectorType(self.real, LANE), [self.real(number)] * LANE)
+
+    def below(self, a: ir.Value, b: ir.Value, *, equal: bool = False) -> ir.Value:
+        """Where a number is less than another, or as large; nowhere where one is NaN."""
+        return self._b.fcmp_ordered("<=" if equal else "<", a, b)
+
+    def chosen(self, where: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
+        return self._b.select(where, a, b)
+
+    def all_of(self, *conditions: ir.Value) -> ir.Value:
+        """1 if all lanes meet all conditions, else 0."""
+        bits = self._b.bitcast(reduce(self._b.and_, conditions), ir.IntType(LANE))
+        return self._b.uitofp(self._b.icmp_unsigned("==", bits, ir.IntType(LANE)(2**LANE - 1)), self.real)
 
     def dot(self, a: Sequence[ir.Value], b: Sequence[ir.Value]) -> ir.Value:
         return reduce(self.add, map(self.mul, a, b))
@@ -347,20 +364,5 @@ def copy(module: ir.Module, name: str, real: ir.Type) -> None:
     code.end()
 
 
-def bitcode(layout: str) -> bytes:
-    """All functions for a data layout."""
-    module = ir.Module("stencils")
-    module.data_layout = layout
-    for real, ending in ((ir.FloatType(), "f32"), (ir.DoubleType(), "f64")):
-        for make in (scatter, gather, gather_adjoint, copy):
-            make(module, f"{make.__name__}_{ending}", real)
-    text = str(module).replace('target triple = "unknown-unknown-unknown"\n', "")
-    parsed = llvm.parse_assembly(text)
-    parsed.verify()
-    return parsed.as_bitcode()
-
-
-def files() -> dict[str, bytes]:
-    """Names of all files, and what is in them."""
-    made = {platform: bitcode(layout) for platform, layout in LAYOUTS.items()}
-    return {f"{name}-{hashlib.sha256(code).hexdigest()[:8]}.bc": code for name, code in made.items()}
+STENCILS = (scatter, gather, gather_adjoint, copy)
+"""What makes the functions, named as these."""

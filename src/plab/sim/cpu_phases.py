@@ -140,7 +140,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
 
     @ti.func
     def scatter_chunk_adjoint(
-        self, state: ti.template(), before, after, bar: ti.template(), bar_at, e, c, stamp
+        self, state: ti.template(), state_at, before, after, bar: ti.template(), bar_at, e, c, stamp
     ):
         """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
@@ -153,7 +153,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             entry = self.tile_entry(0, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
             at_strains = self.bounded(grid_index * STRAINS)
-            self.material_tile(state, ti.u64(0), source, target, entry9, e, at_strains, False)
+            self.material_tile(state, state_at, source, target, entry9, e, at_strains, False)
             self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
             self.adjoint_tile(state, source, target, bar, entry, at)
@@ -204,7 +204,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                 node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle_adjoint(state_at, source, target, bar_at, entry, entry9, lane, node, at)
             self.material_tile_adjoint(
-                state, source, bar, bar_at, entry, entry9, e, self.bounded(grid_index * STRAINS)
+                state, state_at, source, bar, bar_at, entry, entry9, e, self.bounded(grid_index * STRAINS)
             )
 
     # -- poses --------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ addresses of arrays of states.
 
 import taichi as ti
 
-from plab.sim.cpu_stencils import gather, gather_adjoint, scatter
+from plab.sim.cpu_bitcode import gather, gather_adjoint, scatter
 from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import (
     ADJOINT_FIELD,

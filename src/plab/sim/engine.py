@@ -8,8 +8,8 @@ is one launch over all environments.
 
 import taichi as ti
 
+from plab.sim.cpu_bitcode import address_of
 from plab.sim.cpu_phases import BLOCK_NODES, CpuPhases
-from plab.sim.cpu_stencils import address_of
 from plab.sim.storage import STATE
 from plab.sim.teams import TeamChoice
 from plab.sim.tensors import Array
@@ -218,7 +218,9 @@ class CpuEngine(CpuPhases):
                         before, now = slot + s, stamp + 1 + back
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.scatter_chunk_adjoint(state, before, before + 1, bar, bar_at, e, c, now)
+                                self.scatter_chunk_adjoint(
+                                    state, state_at, before, before + 1, bar, bar_at, e, c, now
+                                )
                             self.barrier(team, size)
                             if rank == 0:
                                 self.collect_blocks(e, now)

@@ -1,9 +1,8 @@
 """3x3 algebra on tuples of components, for scalars and for lanes alike.
 
 A matrix is a tuple of 9 components in row-major order, a symmetric one a tuple of 6: (00, 11, 22, 01, 02,
-12). A component is a scalar on CUDA (one particle per thread) and a ``ti.Vector`` of lanes on the CPU (one
-tile of particles): LLVM turns operations on such vectors into SIMD instructions, which it does not do for a
-loop over particles.
+12). A component is a scalar on CUDA (one particle per thread) and a vector of lanes on the CPU (one tile of
+particles).
 """
 
 import taichi as ti

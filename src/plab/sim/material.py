@@ -15,9 +15,8 @@ rounding: :mod:`plab.sim.series` has the coefficients of the polynomials in ``Z 
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
 parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.series.Series`.
 
-The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed, and
-so that each part is small enough for LLVM to vectorise. Components are scalars or lanes, see
-:mod:`plab.sim.linalg`.
+The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed.
+Components are scalars on CUDA; for the CPU ``tools/material.py`` calls these functions with lanes.
 """
 
 import taichi as ti

@@ -49,6 +49,14 @@ __all__ = [
     "STATE_MASK",
     "STENCILS",
     "STRAINS",
+    "STRAIN_BARS",
+    "STRAIN_D",
+    "STRAIN_D_BAR",
+    "STRAIN_G_BAR",
+    "STRAIN_PARAMETERS",
+    "STRAIN_SCALARS",
+    "STRAIN_W",
+    "STRAIN_Z",
     "WEIGHTS",
     "Storage",
 ]
@@ -101,7 +109,12 @@ BASES = 8
 """Lane vectors of integers per chunk for the base nodes of one tile; 2 are used."""
 
 STRAINS = 56
-"""Lane vectors per chunk for the intermediate results of one tile's material update; 49 are used."""
+"""Lane vectors per chunk for the intermediate results of one tile's material update; 52 are used."""
+
+STRAIN_D, STRAIN_W, STRAIN_Z, STRAIN_SCALARS = 9, 15, 21, 27
+STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS = 31, 37, 40, 49
+"""Entries of a tile among these, named as in :mod:`plab.sim.material`: G is first; scalars are J, c2, a1,
+a2; bars those of k, c2, J; parameters mu, lambda and the yield strain."""
 
 LANES = {"cpu": 8, "cuda": 32}
 

@@ -6,32 +6,32 @@ from pathlib import Path
 
 import pytest
 
-from plab.sim import cpu_stencils
+from plab.sim import cpu_bitcode
 
 
 def test_bitcode_is_that_of_its_source(monkeypatch) -> None:
     pytest.importorskip("llvmlite", reason="no llvmlite of that LLVM for this Python")
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "tools")
-    import stencils
+    import bitcode
 
-    folder = Path(cpu_stencils.__file__).parent / "stencils"
-    assert stencils.files() == {path.name: path.read_bytes() for path in folder.iterdir()}
+    folder = Path(cpu_bitcode.__file__).parent / "bitcode"
+    assert bitcode.files() == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_environments_share_a_copy_which_is_that_of_the_package(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "cache"))
-    copied = Path(cpu_stencils._file())
-    original = Path(cpu_stencils.__file__).parent / "stencils" / copied.name
+    copied = Path(cpu_bitcode._file())
+    original = Path(cpu_bitcode.__file__).parent / "bitcode" / copied.name
     assert copied.parent == tmp_path / "cache" and copied.read_bytes() == original.read_bytes()
     copied.write_bytes(b"of somebody else")
-    assert Path(cpu_stencils._file()).read_bytes() == original.read_bytes()
+    assert Path(cpu_bitcode._file()).read_bytes() == original.read_bytes()
     assert [path.name for path in copied.parent.iterdir()] == [copied.name]
     (tmp_path / "file").touch()
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "file"))
-    assert cpu_stencils._file() == str(original)
+    assert cpu_bitcode._file() == str(original)
 
 
 def test_a_platform_without_bitcode_is_told(monkeypatch) -> None:
     monkeypatch.setattr(sys, "platform", "sunos5")
     with pytest.raises(ImportError, match="plab's simulator has no code for sunos5-"):
-        cpu_stencils._file()
+        cpu_bitcode._file()

@@ -1,0 +1,253 @@
+"""The material of a tile of particles for LLVM: what :mod:`plab.sim.material` computes, lanes in vectors.
+
+The functions of that module take components of any kind, so here they are called with LLVM's vectors, which
+write down the instructions that they meet. Products and sums may be fused, which Taichi does not let LLVM do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from llvmlite import ir
+from stencils import LANE, Code
+
+from plab.sim import linalg, material, series
+from plab.sim.storage import (
+    AT_C,
+    AT_F,
+    STRAIN_BARS,
+    STRAIN_D,
+    STRAIN_D_BAR,
+    STRAIN_G_BAR,
+    STRAIN_PARAMETERS,
+    STRAIN_SCALARS,
+    STRAIN_W,
+    STRAIN_Z,
+)
+
+__all__ = ["MATERIAL"]
+
+
+class Lanes:
+    """A vector of lanes: operators write an instruction each."""
+
+    def __init__(self, code: Code, value: ir.Value) -> None:
+        self.code, self.value = code, value
+
+    def _operation(self, name: str, a: Lanes | float, b: Lanes | float) -> Lanes:
+        values = [one.value if isinstance(one, Lanes) else self.code.constant(one) for one in (a, b)]
+        return Lanes(self.code, getattr(self.code, name)(*values))
+
+    def __add__(self, other: Lanes | float) -> Lanes:
+        return self if _is(other, 0.0) else self._operation("add", self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Lanes | float) -> Lanes:
+        return self._operation("sub", self, other)
+
+    def __rsub__(self, other: Lanes | float) -> Lanes:
+        return self._operation("sub", other, self)
+
+    def __mul__(self, other: Lanes | float) -> Any:
+        # Zeros that only say of which kind a number is.
+        return other if _is(other, 0.0) else self if _is(other, 1.0) else self._operation("mul", self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Lanes | float) -> Lanes:
+        return self._operation("div", self, other)
+
+    def __rtruediv__(self, other: Lanes | float) -> Lanes:
+        return self._operation("div", other, self)
+
+    def __neg__(self) -> Lanes:
+        return Lanes(self.code, self.code.minus(self.value))
+
+    def __lt__(self, other: Lanes | float) -> Lanes:
+        return self._operation("below", self, other)
+
+
+def _is(other: Lanes | float, number: float) -> bool:
+    return not isinstance(other, Lanes) and other == number
+
+
+class Taichi:
+    """What the traced functions use of Taichi."""
+
+    @staticmethod
+    def static(value: Any) -> Any:
+        return value
+
+    @staticmethod
+    def sqrt(a: Lanes) -> Lanes:
+        return Lanes(a.code, a.code.root(a.value))
+
+    @staticmethod
+    def min(a: Lanes, b: float) -> Lanes:
+        return Lanes(a.code, a.code.least(a.value, a.code.constant(b)))
+
+    @staticmethod
+    def select(chosen: Lanes, a: Lanes, b: Lanes | float) -> Lanes:
+        other = b.value if isinstance(b, Lanes) else a.code.constant(b)
+        return Lanes(a.code, a.code.chosen(chosen.value, a.value, other))
+
+
+@contextmanager
+def tracing() -> Iterator[None]:
+    """Let the material's functions be called with lanes."""
+    own: tuple[Any, ...] = (material, series)
+    functions = [one.func for module in (linalg, *own) for one in vars(module).values() if _traceable(one)]
+    taichi = [module.ti for module in own]
+    try:
+        for module in own:
+            module.ti = Taichi
+        for one in functions:
+            one.pyfunc = True
+        yield
+    finally:
+        for module, former in zip(own, taichi, strict=True):
+            module.ti = former
+        for one in functions:
+            one.pyfunc = False
+
+
+def _traceable(one: Any) -> bool:
+    return getattr(one, "_is_taichi_function", False)
+
+
+class Tile:
+    """A tile's entries among the strains, and others' lane vectors."""
+
+    def __init__(self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str) -> None:
+        self.code = Code(module, name, real, f"strains {addresses}", numbers, grid=False)
+        self.series = series.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
+
+    def number(self, name: str) -> Lanes:
+        """A number, the same for all lanes."""
+        return Lanes(self.code, self.code.splat(self.code.args[name], LANE))
+
+    def take(self, first: int, count: int, name: str = "strains") -> list[Lanes]:
+        """Lane vectors from an entry on."""
+        place = self.code.args[name]
+        return [Lanes(self.code, self.code.lane_vector(place, first + k)) for k in range(count)]
+
+    def leave(self, first: int, values: Sequence[Lanes], name: str = "strains") -> None:
+        for k, one in enumerate(values):
+            self.code.put_lane_vector(self.code.args[name], first + k, one.value)
+
+    def strain(self) -> tuple[Any, ...]:
+        """The tile's strain; whether the series serve all lanes is noted."""
+        c, f = self.take(AT_C, 9, "source"), self.take(AT_F, 9, "source")
+        g = material.trial_gradient(c, f, self.number("dt"))
+        j = linalg.det(g)
+        found = material.hencky_strain(g, j, self.series)
+        code = self.code
+        above = code.below(found[3].value, self.number("z_squared_max").value, equal=True)
+        low = code.below(self.number("j_min").value, j.value, equal=True)
+        high = code.below(j.value, self.number("j_max").value, equal=True)
+        code.put("served", code.all_of(above, low, high))
+        return c, g, j, found
+
+    def parameters(self) -> list[Lanes]:
+        return self.take(STRAIN_PARAMETERS, 3)
+
+    def note_yield(self, d: Sequence[Lanes], yield_strain: Lanes) -> None:
+        """Note whether any lane yields."""
+        _q, _det, _norm, k = material.yield_factor(d, yield_strain)
+        rigid = self.code.below(self.code.constant(1.0), k.value, equal=True)
+        self.code.put("rigid", self.code.all_of(rigid))
+
+    def symmetric(self) -> list[Lanes]:
+        """Symmetric part of the adjoint of tau from that of A."""
+        a, half = self.take(0, 9, "affine"), 0.5 * self.number("stress_scale")
+        return [2.0 * half * a[i] for i in (0, 4, 8)] + [
+            half * (a[i] + a[j]) for i, j in ((1, 3), (2, 6), (5, 7))
+        ]
+
+
+def strain(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Strain of a tile whose state is at ``source``: G, d, J and c2 to ``strains``."""
+    tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served")
+    _c, g, j, (c2, _w, _z, _z2, _a1, _a2, d) = tile.strain()
+    tile.leave(0, g)
+    tile.leave(STRAIN_D, d)
+    tile.leave(STRAIN_SCALARS, [j, c2])
+    tile.code.end()
+
+
+def whole_strain(module: ir.Module, name: str, real: ir.Type) -> None:
+    """The same with what its adjoint needs."""
+    tile = Tile(module, name, real, "source", "dt z_squared_max j_min j_max served")
+    _c, g, j, (c2, w, z, _z2, a1, a2, d) = tile.strain()
+    for first, values in ((0, g), (STRAIN_D, d), (STRAIN_W, w), (STRAIN_Z, z)):
+        tile.leave(first, values)
+    tile.leave(STRAIN_SCALARS, [j, c2, a1, a2])
+    tile.code.end()
+
+
+def stress(module: ir.Module, name: str, real: ir.Type) -> None:
+    """A of a tile to ``affine``, from ``strains`` and C in the state at ``source``; ``rigid`` is 1 where
+    nothing yields."""
+    tile = Tile(module, name, real, "source affine", "stress_scale mass rigid")
+    d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
+    tau = material.stress(d, j, c2, mu, lam, limit, tile.series)
+    scale, mass, c = tile.number("stress_scale"), tile.number("mass"), tile.take(AT_C, 9, "source")
+    full = linalg.mat_from_sym(tau)
+    tile.leave(0, [scale * full[i] + mass * c[i] for i in range(9)], "affine")
+    tile.note_yield(d, limit)
+    tile.code.end()
+
+
+def flow(module: ir.Module, name: str, real: ir.Type) -> None:
+    """F of a tile after the substep to the state at ``target``."""
+    tile = Tile(module, name, real, "target", "")
+    f = material.flow(tile.take(STRAIN_D, 6), tile.take(0, 9), tile.parameters()[2], tile.series)
+    tile.leave(AT_F, f, "target")
+    tile.code.end()
+
+
+def stress_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Adjoint of a tile's stress, from that of A in ``affine``; ``rigid`` is 1 where nothing yields."""
+    tile = Tile(module, name, real, "affine", "stress_scale rigid")
+    d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
+    adjoint = material.stress_adjoint
+    d_bar, *bars = adjoint(d, j, c2, tile.symmetric(), mu, lam, limit, tile.series)
+    tile.leave(STRAIN_D_BAR, d_bar)
+    tile.leave(STRAIN_BARS, bars)
+    tile.note_yield(d, limit)
+    tile.code.end()
+
+
+def flow_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Adjoint of a tile's plastic flow, from that of the new F in ``bar``, added to that of the stress."""
+    tile = Tile(module, name, real, "bar", "")
+    d, g, f_bar = tile.take(STRAIN_D, 6), tile.take(0, 9), tile.take(AT_F, 9, "bar")
+    d_bar, k_bar, g_bar = material.flow_adjoint(d, g, f_bar, tile.parameters()[2], tile.series)
+    tile.leave(STRAIN_D_BAR, [a + b for a, b in zip(tile.take(STRAIN_D_BAR, 6), d_bar, strict=True)])
+    tile.leave(STRAIN_BARS, [tile.take(STRAIN_BARS, 1)[0] + k_bar])
+    tile.leave(STRAIN_G_BAR, g_bar)
+    tile.code.end()
+
+
+def strain_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Adjoints of C and F of a tile to ``bar``, from those of d, of what else the stress takes, and of G."""
+    tile = Tile(module, name, real, "source affine bar", "dt mass")
+    z, d, d_bar = (tile.take(first, 6) for first in (STRAIN_Z, STRAIN_D, STRAIN_D_BAR))
+    j, c2, a1, a2 = tile.take(STRAIN_SCALARS, 4)
+    k_bar, c2_bar, j_bar = tile.take(STRAIN_BARS, 3)
+    z_bar = material.log_adjoint(z, a1, a2, d, d_bar, k_bar, tile.parameters()[2], tile.series)
+    c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
+    g, w, g_bar = tile.take(0, 9), tile.take(STRAIN_W, 6), tile.take(STRAIN_G_BAR, 9)
+    adjoint = material.strain_adjoint
+    c_out, f_out = adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, tile.number("dt"))
+    mass, a_bar = tile.number("mass"), tile.take(0, 9, "affine")
+    tile.leave(AT_C, [one + mass * a for one, a in zip(c_out, a_bar, strict=True)], "bar")
+    tile.leave(AT_F, f_out, "bar")
+    tile.code.end()
+
+
+MATERIAL = (strain, whole_strain, stress, flow, stress_adjoint, flow_adjoint, strain_adjoint)
+"""What makes the functions, named as these."""
