@@ -354,8 +354,10 @@ def test_loss_and_gradient_of_torus_are_known(protocol: str, loss: float, norm: 
 @pytest.mark.physics
 @pytest.mark.parametrize(("floor", "breaks_off"), [("release", True), ("plab", False)])
 def test_on_the_releases_floor_a_sphere_can_throw_particles_away(floor: str, breaks_off: bool) -> None:
-    """It is pressed against the floor and pushed into the block: some nodes there have masses close to 0."""
-    cfg = load_config(["task=Assembly", "protocol=release", f"protocol.floor={floor}"])
+    """It is pressed against the floor and pushed into the block: some nodes there have masses close to 0. In
+    float32 rounding decides whether one of them is met, as actions do that differ by 2e-4."""
+    precise = "sim.precision=float64"
+    cfg = load_config(["task=Assembly", "protocol=release", f"protocol.floor={floor}", precise])
     batch = EpisodeBatch([cfg])
     batch.reset()
     actions = np.zeros((30, 1, 6))
