@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 import weakref
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import taichi as ti
+from taichi.lang import _ndarray
 
 from plab.sim.runtime import available_threads, free_abandoned_cache, start_runtime
 
@@ -93,3 +95,17 @@ def test_taichis_own_kernels_forget_the_fields_of_a_runtime_that_has_ended() -> 
     start_runtime("cpu", "float32")
     gc.collect()
     assert gone() is None
+
+
+def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
+    """What Taichi keeps at their addresses by now may be another array, in use."""
+    start_runtime("cpu", "float32")
+    former = ti.ndarray(ti.f32, 3)
+    start_runtime("cpu", "float64")
+    own, freed = ti.ndarray(ti.f64, 3), []
+    runtime = SimpleNamespace(prog=SimpleNamespace(delete_ndarray=freed.append))
+    monkeypatch.setattr(_ndarray, "impl", SimpleNamespace(get_runtime=lambda: runtime))
+    kept = own.arr
+    del former, own
+    gc.collect()
+    assert freed == [kept]

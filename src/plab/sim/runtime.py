@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import taichi as ti
-from taichi.lang import impl
+from taichi.lang import _ndarray, impl
 
 from plab.errors import ArgumentError, PlabError
 
@@ -126,6 +126,7 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
         free_abandoned_cache()
         _start_taichi(device, precision, wanted)
     _forget_arguments()
+    _free_own_arrays_only()
     hasten_tracing()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
@@ -180,6 +181,28 @@ def _forget_arguments() -> None:
     for kernel in getattr(impl.get_runtime(), "kernels", ()):
         if hasattr(kernel, "mapper"):
             kernel.mapper.mapping.clear()
+
+
+def _free_own_arrays_only() -> None:
+    """Let arrays of before Taichi started anew, which are gone, free nothing when Python forgets them: Taichi
+    would free what is at their addresses by now, an array that is in use, perhaps."""
+    kind = _ndarray.ScalarNdarray
+    make, free = kind.__init__, getattr(kind, "__del__", None)
+    if free is None or hasattr(free, "__wrapped__"):
+        return
+
+    @functools.wraps(make)
+    def made(self: Any, *args: Any, **words: Any) -> None:
+        self.start = weakref.ref(impl.get_runtime())
+        make(self, *args, **words)
+
+    @functools.wraps(free)
+    def freed(self: Any) -> None:
+        # Python may have taken the module apart already.
+        if impl is not None and self.start() is impl.get_runtime():
+            free(self)
+
+    kind.__init__, kind.__del__ = made, freed
 
 
 def cuda_available() -> bool:
