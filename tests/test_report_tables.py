@@ -36,6 +36,7 @@ pytestmark = pytest.mark.whole
 
 GOLDEN = Path(__file__).parent / "golden"
 PAGE = Path(__file__).parents[1] / "docs" / "methods.md"
+README = PAGE.parents[1] / "README.md"
 
 
 def score(task: str, variant: str, method: str, seed: int) -> float:
@@ -478,7 +479,7 @@ def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: P
     ],
 )
 def test_agreement_of_the_runs_that_come_with_plab(name: str, rows: dict[str, tuple[str, ...]]) -> None:
-    """What docs/reproduction.md says."""
+    """What README and docs/reproduction.md say."""
     (table,) = agreement(collect(example_archive(name), select([], NAMES)))
     cells = table.cells.set_index("method")
     page = PAGE.with_name("reproduction.md").read_text("utf-8")
@@ -486,6 +487,10 @@ def test_agreement_of_the_runs_that_come_with_plab(name: str, rows: dict[str, tu
         assert tuple(cells.loc[label, ["cells", "correlation", "agree"]]) == row
         assert " of ".join(row[:1] * 2) + f" | {row[1]} | {row[2]} |" in page
     assert ("all RL" in cells.index) == (name == "release")
+    if name == "release":
+        gradient, rl = (cells.loc[label, ["correlation", "cells"]] for label in ("all gradient", "all RL"))
+        said = "correlation is {} over its {} gradient cells, {} over the {} of RL".format(*gradient, *rl)
+        assert said in " ".join(README.read_text("utf-8").split())
 
 
 def test_the_page_of_methods_says_what_the_runs_that_come_with_plab_reached() -> None:
@@ -499,6 +504,9 @@ def test_the_page_of_methods_says_what_the_runs_that_come_with_plab_reached() ->
         means.append(authors.loc[authors["task"] == task, "score"].mean())
         said = ["-" if np.isnan(mean) else f"{mean:.2f}" for mean in means]
         assert cells.split(" | ")[1:] == said, task
+    solved = own[own["method"] == "solve"].groupby("task")["score"].mean()
+    assert (solved.round(2) >= 0.93).sum() == 9
+    assert "scores 0.93 or more on nine of the ten tasks" in README.read_text("utf-8")
 
 
 def test_agreement_is_within_two_deviations_or_a_tenth(tmp_path: Path) -> None:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 from llvmlite import ir
 from stencils import LANE, Code
 
 from plab.sim import linalg, material, series
+from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import (
     AT_C,
     AT_F,
@@ -160,12 +162,9 @@ class Tile:
         rigid = self.code.below(self.code.constant(1.0), k.value, equal=True)
         self.code.put("rigid", self.code.all_of(rigid))
 
-    def symmetric(self) -> list[Lanes]:
-        """Symmetric part of the adjoint of tau from that of A."""
-        a, half = self.take(0, 9, "affine"), 0.5 * self.number("stress_scale")
-        return [2.0 * half * a[i] for i in (0, 4, 8)] + [
-            half * (a[i] + a[j]) for i, j in ((1, 3), (2, 6), (5, 7))
-        ]
+    def law(self, *names: str) -> SimpleNamespace:
+        """What the methods of :class:`plab.sim.particle_phases.ParticlePhases` take for a simulator."""
+        return SimpleNamespace(**{name: self.number(name) for name in names})
 
 
 def strain(module: ir.Module, name: str, real: ir.Type) -> None:
@@ -194,9 +193,8 @@ def stress(module: ir.Module, name: str, real: ir.Type) -> None:
     tile = Tile(module, name, real, "source affine", "stress_scale mass rigid")
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     tau = material.stress(d, j, c2, mu, lam, limit, tile.series)
-    scale, mass, c = tile.number("stress_scale"), tile.number("mass"), tile.take(AT_C, 9, "source")
-    full = linalg.mat_from_sym(tau)
-    tile.leave(0, [scale * full[i] + mass * c[i] for i in range(9)], "affine")
+    law, c = tile.law("stress_scale", "mass"), tile.take(AT_C, 9, "source")
+    tile.leave(0, ParticlePhases.stress_and_momentum.__wrapped__(law, tau, c), "affine")
     tile.note_yield(d, limit)
     tile.code.end()
 
@@ -214,7 +212,9 @@ def stress_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     tile = Tile(module, name, real, "affine", "stress_scale rigid")
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     adjoint = material.stress_adjoint
-    d_bar, *bars = adjoint(d, j, c2, tile.symmetric(), mu, lam, limit, tile.series)
+    law, a_bar = tile.law("stress_scale"), tile.take(0, 9, "affine")
+    tau_bar = ParticlePhases.stress_symmetric.__wrapped__(law, a_bar)
+    d_bar, *bars = adjoint(d, j, c2, tau_bar, mu, lam, limit, tile.series)
     tile.leave(STRAIN_D_BAR, d_bar)
     tile.leave(STRAIN_BARS, bars)
     tile.note_yield(d, limit)

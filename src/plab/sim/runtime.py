@@ -186,20 +186,21 @@ def _forget_arguments() -> None:
 def _free_own_arrays_only() -> None:
     """Let arrays of before Taichi started anew, which are gone, free nothing when Python forgets them: Taichi
     would free what is at their addresses by now, an array that is in use, perhaps."""
-    kind = _ndarray.ScalarNdarray
+    kind, current = _ndarray.ScalarNdarray, impl.get_runtime
     make, free = kind.__init__, getattr(kind, "__del__", None)
     if free is None or hasattr(free, "__wrapped__"):
         return
 
     @functools.wraps(make)
     def made(self: Any, *args: Any, **words: Any) -> None:
-        self.start = weakref.ref(impl.get_runtime())
+        self.start = weakref.ref(current())
         make(self, *args, **words)
 
     @functools.wraps(free)
     def freed(self: Any) -> None:
-        # Python may have taken the module apart already.
-        if impl is not None and self.start() is impl.get_runtime():
+        # There is none when Python has taken Taichi apart, at its own end.
+        runtime = current()
+        if runtime is not None and self.start() is runtime:
             free(self)
 
     kind.__init__, kind.__del__ = made, freed
