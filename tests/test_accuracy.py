@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
-from plab.bench.precision import angle, compare, starts, summary
+from plab.bench.precision import angle
+from plab.cli import bench
 from plab.report.costs import diagrams
 from plab.report.figures import save, style
 from plab.scene import Body
@@ -90,9 +91,14 @@ def test_finer_steps_come_closer_to_the_reference() -> None:
 
 
 @pytest.mark.slow
-def test_float32_is_close_to_float64() -> None:
-    table = pd.DataFrame(compare(starts(["Move"], ["1"], 200)))
+def test_float32_is_close_to_float64(tmp_path: Path) -> None:
+    rows, summary = tmp_path / "rows.csv", tmp_path / "new" / "summary.md"
+    command = ["--task", "Move", "--variant", "1", "--particles", "200", "--csv", str(rows)]
+    assert bench.precision([*command, "--markdown", str(summary)]) == 0
+    table = pd.read_csv(rows, keep_default_na=False)
     assert list(table["actions"]) == ["demonstration", "random"]
     assert (table["failures"] == "").all()
-    assert table["difference"].astype(float).abs().max() < 0.01
-    assert "| Move | random |" in summary(table.to_dict("records"), 200)
+    assert table["difference"].abs().max() < 0.01
+    text = summary.read_text(encoding="utf-8")
+    assert text.startswith("float32 against float64, 200 particles, 50 steps.\n\n| task |")
+    assert "| Move | random |" in text

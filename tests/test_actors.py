@@ -13,7 +13,8 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from plab.bench import unseen
+from plab.bench.unseen import FIRST
+from plab.cli.bench import unseen
 from plab.config import Config, ConfigError, drawn_configs, load_config
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
@@ -169,7 +170,7 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     finished: RunResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = tmp_path / "unseen.csv"
-    assert unseen.main([str(finished.path), "--scenes", "3", "--together", "2", "--csv", str(table)]) == 0
+    assert unseen([str(finished.path), "--scenes", "3", "--together", "2", "--csv", str(table)]) == 0
     (row,) = pd.read_csv(table).to_dict("records")
     drawn = {"shac": "2 drawn scenes", "pods": "3 drawn scenes"}[name_of(finished)]
     assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", drawn, 3)
@@ -182,10 +183,10 @@ def test_it_is_not_tried_in_scenes_that_do_not_fit(
     finished: RunResult, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
     words = [str(finished.path), "--scenes", "3"]
-    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene != unseen.FIRST)
-    assert unseen.main(words) == 0 and "drawn scenes         2 " in capsys.readouterr().out
-    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene == unseen.FIRST)
-    assert unseen.main(words) == 2
+    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene != FIRST)
+    assert unseen(words) == 0 and "drawn scenes         2 " in capsys.readouterr().out
+    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene == FIRST)
+    assert unseen(words) == 2
     assert "1 of 3 scenes fit into a grid of 32: too few" in capsys.readouterr().err
 
 
@@ -212,7 +213,7 @@ def test_older_files_of_policies_are_read(finished: RunResult, tmp_path: Path) -
 )
 def test_what_cannot_be_tried(argv: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
     try:
-        code = unseen.main(argv)
+        code = unseen(argv)
     except SystemExit as stopped:
         code = stopped.code
     assert code == 2 and line in capsys.readouterr().err

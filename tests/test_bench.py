@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import plab
 from plab.bench import bound, everyday, skips, speed, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT, TENSORS
-from plab.cli.tables import measure_table
+from plab.cli import bench
+from plab.cli.tables import measure_table, write_markdown
 from plab.config import build_scene, load_config
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms
@@ -39,7 +41,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 def test_speed_prints_and_writes_complete_rows(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     path = tmp_path / "new" / "speed.csv"
-    assert speed.main([*TINY, "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]) == 0
+    assert bench.speed([*TINY, "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]) == 0
     rows = read(path)
     assert [row["what"] for row in rows] == list(speed.QUICK_KINDS)
     for row in rows:
@@ -56,7 +58,7 @@ def test_only_the_kinds_asked_for_are_timed(tmp_path: Path) -> None:
     """Tensors only on CUDA."""
     path = tmp_path / "speed.csv"
     command = [*TINY, "--quick", "--steps", "2", "--repeats", "1", "--kinds", FORWARD, ROLLOUT, TENSORS]
-    assert speed.main([*command, "--csv", str(path)]) == 0
+    assert bench.speed([*command, "--csv", str(path)]) == 0
     assert [row["what"] for row in read(path)] == [FORWARD, ROLLOUT]
 
 
@@ -65,12 +67,12 @@ def test_a_skip_has_a_row_and_a_changed_result_is_told(
 ) -> None:
     path = tmp_path / "skips.csv"
     command = [*TINY, "--skips", "waiting", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
-    assert speed.main(command) == 0
+    assert bench.speed(command) == 0
     (row,) = read(path)
     assert tuple(row) == skips.COLUMNS
     assert row["equal"] == "True" and float(row["loss_difference"]) == 0.0
     monkeypatch.setattr(skips, "_differences", lambda *_: (0.1, 0.0))
-    assert speed.main(command) == 1
+    assert bench.speed(command) == 1
     assert "results differ by more than rounding: waiting" in capsys.readouterr().err
 
 
@@ -79,11 +81,11 @@ def test_what_needs_more_memory_is_told_and_the_others_are_measured(
 ) -> None:
     path = tmp_path / "some.csv"
     command = [*TINY, "sim.memory_mb=2", "--quick", "--steps", "2", "--repeats", "1", "--csv", str(path)]
-    assert speed.main([*command, "--skips", "adjoints", "waiting"]) == 1
+    assert bench.speed([*command, "--skips", "adjoints", "waiting"]) == 1
     assert [row["skip"] for row in read(path)] == ["waiting"]
     told = capsys.readouterr().err
     assert "not measured: adjoints, 1 environment(s): the gradient of 50 steps needs at least" in told
-    assert speed.main([*command, "--batch", "1", "2", "--kinds", GRADIENT, FORWARD]) == 1
+    assert bench.speed([*command, "--batch", "1", "2", "--kinds", GRADIENT, FORWARD]) == 1
     assert [(row["batch"], row["what"]) for row in read(path)] == [("1", FORWARD), ("2", FORWARD)]
     assert "not measured: forward + backward, 2 environment(s): the gradient of 2" in capsys.readouterr().err
 
@@ -120,7 +122,7 @@ def test_mistakes_are_answered_in_one_line(capsys: pytest.CaptureFixture) -> Non
         (["sim.precision=float16"], "float16"),
         (["--skips", "everything"], "there is no 'everything'; choose from: empty_blocks"),
     ):
-        assert speed.main(command) == 2
+        assert bench.speed(command) == 2
         printed, message = capsys.readouterr()
         assert printed == ""
         assert message.startswith("plab: ") and message.count("\n") == 1 and words in message
@@ -144,7 +146,8 @@ def test_paper_table_is_whole() -> None:
 
 def test_the_paper_table_is_written_to_a_new_folder(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "table.md"
-    speed.write_markdown(path, [dict.fromkeys(speed.PAPER_COLUMNS, 1.0)])
+    row = dict.fromkeys(speed.PAPER_COLUMNS, 1.0)
+    write_markdown(path, bench.HEADING, speed.PAPER_COLUMNS, [row])
     assert path.read_text(encoding="utf-8").endswith("| 1.0 |\n")
 
 
@@ -161,7 +164,7 @@ def test_the_bound_is_what_a_step_moves_at_the_speed_of_a_copy() -> None:
 
 
 def test_a_copy_is_at_most_as_fast_as_memory_can_be(capsys: pytest.CaptureFixture) -> None:
-    assert speed.main(["--limits"]) == 0
+    assert bench.speed(["--limits"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == list(speed.LIMIT_COLUMNS) and len(lines) == 1 + len(bound.FOOTPRINTS)
     # Between a slow disk's speed and that of all registers.
@@ -250,12 +253,12 @@ def test_everyday_things_are_timed_in_turns_with_another_source_tree(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(everyday, "SETTLE", 0.0)
-    own, other, path = Path(everyday.plab.__file__).parents[1], tmp_path / "src", tmp_path / "everyday.csv"
+    own, other, path = Path(plab.__file__).parents[1], tmp_path / "src", tmp_path / "everyday.csv"
     (other / "plab").mkdir(parents=True)
     (other / "plab" / "__init__.py").touch()
     (other / "plab" / "results.py").write_text("def load(folder): pass\n")
     things = ["import plab", "load, first time"]
-    everyday.main(
+    bench.everyday(
         ["--runs", "2", "--repeats", "2", "--against", str(other), "--only", *things, "--csv", str(path)]
     )
     rows = read(path)

@@ -11,7 +11,7 @@ import pytest
 from plab.cli.export import main
 from plab.config import load_config
 from plab.render import graphics
-from plab.render.recording import Recording, record_with_motion
+from plab.render.recording import RecordedRollout, record_with_motion
 
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.files")
@@ -27,7 +27,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording() -> RecordedRollout:
     return record_with_motion(load_config(["task=Assembly", *COARSE]), np.full((3, 6), 0.5))
 
 

@@ -44,6 +44,7 @@ def test_imports_point_one_way(monkeypatch):
     "code",
     [
         "import plab",
+        "import plab.cli.bench",
         "import plab; from plab.config import load_config; load_config(['task=Move'])",
         "from plab.cli.run import main; main(['--help'])",
         "from plab.cli.run import main; main(['--cfg', 'job'])",

@@ -29,7 +29,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from torch.distributions import normal
 
-from plab.bench import rl as bench
+from plab.bench.rl import PARTS
+from plab.cli import bench
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
@@ -42,7 +43,7 @@ from plab.runners.population.agents import Agents
 from plab.runners.population.draws import Block
 from plab.runners.population.population import Population, population_settings
 from plab.runners.population.ppo import PpoAgents
-from plab.runners.population.replay import Replay, Sizes
+from plab.runners.population.replay import ReplayBuffer, Sizes
 from plab.runners.population.runner import PopulationRunner
 from plab.runners.population.sac import SacAgents
 from plab.runners.population.td3 import Td3Agents
@@ -291,19 +292,19 @@ def test_replay_holds_the_latest_transitions_and_goes_on_from_its_file(
     sizes, agents, steps = Sizes(2, 4, 3, 1), 2, 38
     rng, device = np.random.default_rng(0), torch.device("cpu")
 
-    def empty() -> Replay:
-        return Replay(agents, sizes, min(10, buffer_size // 8 + 1), buffer_size // 2, device)
+    def empty() -> ReplayBuffer:
+        return ReplayBuffer(agents, sizes, min(10, buffer_size // 8 + 1), buffer_size // 2, device)
 
     replay, rows = empty(), []
 
-    def add(replay: Replay, now: torch.Tensor | None, step: int) -> torch.Tensor:
+    def add(replay: ReplayBuffer, now: torch.Tensor | None, step: int) -> torch.Tensor:
         drawn = [torch.from_numpy(rng.normal(size=(agents, 2, n)).astype(np.float32)) for n in (3, 3, 1, 1)]
         first = drawn[0] if now is None or step % 4 == 0 else now
         replay.add(first, drawn[2], drawn[3].squeeze(2), drawn[1])
         rows.append(torch.cat([first, drawn[2], drawn[1], drawn[3]], dim=2))
         return drawn[1]
 
-    def check(replay: Replay) -> None:
+    def check(replay: ReplayBuffer) -> None:
         samples = replay.sample(torch.from_numpy(rng.integers(0, 2**62, (agents, 3000))))
         expected = torch.stack(rows[-buffer_size // 2 :])
         for agent in range(agents):
@@ -621,14 +622,14 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
 def test_a_full_disk_ends_its_run_only(tmp_path, lone, method, monkeypatch) -> None:
     alone = lone(method)
     cfgs = configs(tmp_path, method)
-    bad, intact = result_path(cfgs[2]).with_suffix(".replay"), Replay.write
+    bad, intact = result_path(cfgs[2]).with_suffix(".replay"), ReplayBuffer.write
 
-    def write(self: Replay, agent: int, path: Path) -> None:
+    def write(self: ReplayBuffer, agent: int, path: Path) -> None:
         if path == bad:
             raise ResultsError(f"cannot write the replay buffer {path}: No space left on device")
         intact(self, agent, path)
 
-    monkeypatch.setattr(Replay, "write", write)
+    monkeypatch.setattr(ReplayBuffer, "write", write)
     ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "finished", "refused"]
     for k in (0, 1):
@@ -696,10 +697,10 @@ def test_losses_of_each_agent_are_logged(tmp_path: Path, method: str) -> None:
 def test_benchmark_measures_every_part(tmp_path: Path) -> None:
     table = tmp_path / "agents.csv"
     words = [*COARSE[:6], "method.hidden=[8]", "--methods", "ppo", "sac", "--agents", "2", "--envs", "1"]
-    assert bench.main([*words, "--batches", "1", "--csv", str(table)]) == 0
+    assert bench.rl([*words, "--batches", "1", "--csv", str(table)]) == 0
     rows = pd.read_csv(table)
     assert rows["method"].tolist() == ["ppo", "sac"] and set(rows["agents"]) == {2}
-    assert (rows[["steps_per_s", *(f"{part}_ms" for part in bench.PARTS)]] > 0).all(axis=None)
+    assert (rows[["steps_per_s", *(f"{part}_ms" for part in PARTS)]] > 0).all(axis=None)
     # A replay buffer of 10,000 episodes of four steps: five observations each, four actions and rewards.
     observed = EpisodeBatch([configs(tmp_path, "sac")[0]]).observation_space.shape[0]
     expected = [0.0, 10_000 * 4 * (5 * observed + 4 * 7) / 1e6]

@@ -20,7 +20,8 @@ import torch
 from gymnasium.spaces import Box
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from plab.bench import rl as bench
+from plab.bench.rl import PARTS
+from plab.cli import bench
 from plab.config import Config, ConfigError, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
@@ -547,10 +548,10 @@ def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
 def test_benchmark_measures_every_part(tmp_path: Path, capsys) -> None:
     table = tmp_path / "rl.csv"
     overrides = COARSE[:-4]
-    bench.main([*overrides, "--methods", "sac", "--envs", "2", "--batches", "1", "--csv", str(table)])
+    bench.rl([*overrides, "--methods", "sac", "--envs", "2", "--batches", "1", "--csv", str(table)])
     (row,) = pd.read_csv(table).to_dict("records")
     assert (row["method"], row["num_envs"]) == ("sac", 2)
-    parts = [row[f"{part}_ms"] for part in bench.PARTS]
+    parts = [row[f"{part}_ms"] for part in PARTS]
     assert min(parts) > 0
     # Of 4 steps of 2 environments.
     assert sum(parts) == pytest.approx(2 / row["steps_per_s"] * 1e3, rel=0.05)

@@ -14,9 +14,7 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab.bench import accuracy, everyday, precision, release, rl, speed, stability
-from plab.bench import results as bench_results
-from plab.cli import demonstrations, export, render, report, results, run, status, targets, view
+from plab.cli import bench, demonstrations, export, render, report, results, run, status, targets, view
 from plab.cli.command import command_line
 from plab.render import graphics
 from plab.results import ResultsError
@@ -43,8 +41,10 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 
 def name_of(value: object) -> str:
-    """Name of a parameter: of words what they are, of a command line its module."""
-    return " ".join(value) if isinstance(value, list) else str(getattr(value, "__module__", value))
+    """Name of a parameter: of words what they are, of a command line its module and function."""
+    if callable(value):
+        return f"{value.__module__}.{value.__name__}"
+    return " ".join(value) if isinstance(value, list) else str(value)
 
 
 IMPOSSIBLE = (
@@ -150,40 +150,40 @@ TOOLS = [
     (demonstrations.main, ["--markdown", "."]),
     (demonstrations.main, ["--task", "Move", "method.lr=3"]),
     (demonstrations.main, ["--task", "Move", "seed=3"]),
-    (speed.main, ["--task", "Nope"]),
-    (speed.main, ["seed=[1"]),
-    (speed.main, ["--device", "gpu"]),
-    (speed.main, ["--precision", "half"]),
-    (speed.main, ["--paper", "--limits"]),
-    (speed.main, ["--kinds", "nothing"]),
-    *((speed.main, [flag, "0"]) for flag in ("--batch", "--steps", "--repeats", "--particles", "--grids")),
-    (speed.main, ["--csv", "."]),
-    (precision.main, ["--task", "Nope"]),
-    (precision.main, ["--task", "Move", "--variant", "9"]),
-    (precision.main, ["--particles", "0"]),
-    (precision.main, ["--markdown", "."]),
-    (release.main, ["--choice", "nothing"]),
-    (release.main, ["--particles", "-1"]),
-    *((entry, ["--particles", "1"]) for entry in (precision.main, release.main, stability.main)),
-    (bench_results.main, ["--runs", "0"]),
-    (bench_results.main, ["--rows", "-1"]),
-    (bench_results.main, ["--csv", "."]),
-    *((everyday.main, [flag, "0"]) for flag in ("--runs", "--rows", "--repeats")),
-    (everyday.main, ["--only", "nothing"]),
-    (everyday.main, ["--against", "nowhere"]),
-    (everyday.main, ["--csv", "."]),
-    (rl.main, ["--methods", "adam"]),
-    (rl.main, ["--envs", "0"]),
-    (rl.main, ["--batches", "0"]),
-    (rl.main, ["task=Nope"]),
-    (stability.main, ["--quick", "--family", "nothing"]),
-    (stability.main, ["--precision", "half"]),
-    (stability.main, ["--horizon", "0"]),
-    (stability.main, ["--particles", "x"]),
-    (stability.main, ["--gradients", "."]),
-    (accuracy.main, ["--task", "Table"]),
-    (accuracy.main, ["--device", "gpu"]),
-    (accuracy.main, ["--particles", "0"]),
+    (bench.speed, ["--task", "Nope"]),
+    (bench.speed, ["seed=[1"]),
+    (bench.speed, ["--device", "gpu"]),
+    (bench.speed, ["--precision", "half"]),
+    (bench.speed, ["--paper", "--limits"]),
+    (bench.speed, ["--kinds", "nothing"]),
+    *((bench.speed, [flag, "0"]) for flag in ("--batch", "--steps", "--repeats", "--particles", "--grids")),
+    (bench.speed, ["--csv", "."]),
+    (bench.precision, ["--task", "Nope"]),
+    (bench.precision, ["--task", "Move", "--variant", "9"]),
+    (bench.precision, ["--particles", "0"]),
+    (bench.precision, ["--markdown", "."]),
+    (bench.release, ["--choice", "nothing"]),
+    (bench.release, ["--particles", "-1"]),
+    *((entry, ["--particles", "1"]) for entry in (bench.precision, bench.release, bench.stability)),
+    (bench.results, ["--runs", "0"]),
+    (bench.results, ["--rows", "-1"]),
+    (bench.results, ["--csv", "."]),
+    *((bench.everyday, [flag, "0"]) for flag in ("--runs", "--rows", "--repeats")),
+    (bench.everyday, ["--only", "nothing"]),
+    (bench.everyday, ["--against", "nowhere"]),
+    (bench.everyday, ["--csv", "."]),
+    (bench.rl, ["--methods", "adam"]),
+    (bench.rl, ["--envs", "0"]),
+    (bench.rl, ["--batches", "0"]),
+    (bench.rl, ["task=Nope"]),
+    (bench.stability, ["--quick", "--family", "nothing"]),
+    (bench.stability, ["--precision", "half"]),
+    (bench.stability, ["--horizon", "0"]),
+    (bench.stability, ["--particles", "x"]),
+    (bench.stability, ["--gradients", "."]),
+    (bench.accuracy, ["--task", "Table"]),
+    (bench.accuracy, ["--device", "gpu"]),
+    (bench.accuracy, ["--particles", "0"]),
 ]
 
 SAID = {
@@ -216,7 +216,7 @@ SAID = {
 
 
 def test_they_differ():
-    assert len({(entry.__module__, tuple(argv)) for entry, argv in TOOLS}) == len(TOOLS)
+    assert len({(entry, *argv) for entry, argv in TOOLS}) == len(TOOLS)
     assert SAID.keys() <= {(entry, *argv) for entry, argv in TOOLS}
 
 
@@ -238,8 +238,8 @@ def test_results_where_none_can_be_written(refused, tmp_path):
         ["tables", "--results", "results", "--out", "file/tables"], report.main
     )
     assert "file is no folder" in refused(["--task", "Rope", "--csv", "file/a.csv"], targets.main)
-    assert "file is no folder" in refused(["--csv", "file/a.csv"], speed.main)
-    assert "cannot write" in refused(["--output", "file/accuracy"], accuracy.main)
+    assert "file is no folder" in refused(["--csv", "file/a.csv"], bench.speed)
+    assert "cannot write" in refused(["--output", "file/accuracy"], bench.accuracy)
     assert "file is no folder" in refused(["task=Rope", "--output", "file/a.png"], render.main)
     assert "file is no folder" in refused(["--contact-sheet", "file/a.png"], render.main)
     assert "file is no folder" in refused(["task=Rope", "--output", "file/a.html"], view.main)
@@ -301,7 +301,7 @@ def test_bad_invocations_as_processes(tmp_path, module, argv):
         (status.main, ["--missing-runs"], "missing"),
         (results.main, ["scores", "--descendign"], "descending"),
         (render.main, ["task=Rope", "--film-strp", "a.jpg"], "film-strip"),
-        (stability.main, ["--qiuck"], "quick"),
+        (bench.stability, ["--qiuck"], "quick"),
     ],
 )
 def test_an_unknown_flag_is_answered_by_those_that_there_are(capsys, entry, argv, flag):
@@ -341,14 +341,14 @@ UNWRITABLE = [
     (export.main, ["task=Rope", "--output", "closed"]),
     (targets.main, ["--task", "Rope", "--csv", "closed/a.csv"]),
     (demonstrations.main, ["--task", "Move", "--markdown", "closed/a.md"]),
-    (speed.main, ["--csv", "closed/new/a.csv"]),
-    (precision.main, ["--markdown", "closed/a.md"]),
-    (release.main, ["--csv", "closed/a.csv"]),
-    (bench_results.main, ["--csv", "closed/a.csv"]),
-    (everyday.main, ["--csv", "closed/a.csv"]),
-    (rl.main, ["--csv", "closed/a.csv"]),
-    (stability.main, ["--gradients", "closed/a.csv"]),
-    (accuracy.main, ["--output", "closed/new"]),
+    (bench.speed, ["--csv", "closed/new/a.csv"]),
+    (bench.precision, ["--markdown", "closed/a.md"]),
+    (bench.release, ["--csv", "closed/a.csv"]),
+    (bench.results, ["--csv", "closed/a.csv"]),
+    (bench.everyday, ["--csv", "closed/a.csv"]),
+    (bench.rl, ["--csv", "closed/a.csv"]),
+    (bench.stability, ["--gradients", "closed/a.csv"]),
+    (bench.accuracy, ["--output", "closed/new"]),
 ]
 
 
@@ -364,7 +364,7 @@ def test_folders_that_may_not_be_written_to(told, tmp_path, closed, entry, argv)
 @pytest.mark.parametrize(
     ("entry", "argv"),
     [
-        (speed.main, ["--csv", "locked/a.csv"]),
+        (bench.speed, ["--csv", "locked/a.csv"]),
         (render.main, ["task=Rope", "--output", "locked/new/a.png"]),
     ],
     ids=name_of,

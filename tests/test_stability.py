@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from plab.bench.common_scene import PLACES, common_actions, common_scene, own_components
-from plab.bench.stability import QUICK, main, run_cases, run_refusals, write_norms
+from plab.bench.stability import QUICK, run_cases, run_refusals
 from plab.bench.stress_cases import Plan, bang_bang_actions, refusals, stress_cases
+from plab.cli import bench
 from plab.config import build_scene, load_config
 from plab.scene import SceneError
 
@@ -74,7 +75,7 @@ def test_few_particles_survive(tmp_path: Path) -> None:
     assert len(rows) == 4
     assert {row["outcome"] for row in rows} == {"survived"}
     path = tmp_path / "new" / "norms.csv"
-    write_norms(rows, path)
+    bench._write_norms(rows, path)
     table = pd.read_csv(path).set_index(["case", "back"])["norm"]
     assert len(table) == 4 * 3 and np.isfinite(table).all()
     for row in rows:
@@ -85,4 +86,4 @@ def test_few_particles_survive(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_every_quick_case_survives() -> None:
-    assert main(["--quick", "--precision", "float32"]) == 0
+    assert bench.stability(["--quick", "--precision", "float32"]) == 0

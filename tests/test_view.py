@@ -26,7 +26,7 @@ from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.render import graphics
-from plab.render.recording import Recording, record, record_with_motion
+from plab.render.recording import RecordedRollout, record, record_with_motion
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.sim import Simulator
 from plab.view import Viewer, show
@@ -51,7 +51,7 @@ def in_an_empty_folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording() -> RecordedRollout:
     return record(load_config(["task=Rope", *COARSE]), ACTIONS)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -22,7 +23,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-__all__ = ["Report", "Watcher", "forward_to", "show_progress", "show_several", "show_waiting"]
+__all__ = ["Report", "Watcher", "forward_to", "show_line", "show_progress", "show_several", "show_waiting"]
 
 Report = Callable[[int, str], None]
 """Takes the number of steps done and a short text about how it goes."""
@@ -92,6 +93,12 @@ def show_waiting(title: str, compiling: Watcher, *, enabled: bool = True) -> Ite
     """Show on a terminal that something is made ready in the ``with`` block, and what is compiled."""
     with show_progress(title, 0, None, enabled=enabled, compiling=compiling):
         yield
+
+
+def show_line(text: str) -> None:
+    """Say on standard error what is being measured, if somebody watches, in a line that the next replaces."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
 
 
 def _note(progress: Progress, task: TaskID, kernel: str) -> None:

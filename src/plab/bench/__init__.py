@@ -1,1 +1,1 @@
-"""Benchmarks: each prints a table and can write its data."""
+"""Benchmarks: what each measures, in rows; their command lines stand in :mod:`plab.cli.bench`."""

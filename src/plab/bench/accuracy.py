@@ -23,11 +23,9 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import cast
 
 import numpy as np
-import pandas as pd
 
 from plab.bench.common_scene import (
     common_actions,
@@ -37,18 +35,13 @@ from plab.bench.common_scene import (
     own_components,
 )
 from plab.bench.precision import angle
-from plab.cli.arguments import Parser, folder, positive, task_list
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
-from plab.report.costs import diagrams
-from plab.report.figures import save, style
 from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, DEVICES, PRECISIONS, Simulator, Skips
+from plab.sim import CONTACT_MODELS, PRECISIONS, Simulator, Skips
 
-__all__ = ["Setting", "attempts_at", "lattice", "main"]
+__all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Setting", "attempts_at", "lattice", "rows"]
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
 QUICK_TASKS = ("Move", "Rope")
@@ -333,35 +326,7 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
             }
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, run, print, write the table and the diagrams."""
-    parser = Parser("plab.bench.accuracy", __doc__)
-    parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
-    parser.add_argument(
-        "--task",
-        type=task_list,
-        help=f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)",
-    )
-    what = "particles per environment (10000; 1000 with --quick)"
-    parser.add_argument("--particles", type=positive, help=what)
-    parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
-    parser.add_argument("--output", type=folder, default=Path("accuracy"), help="folder of what is written")
-    options = parser.parse_args(argv)
-    tasks = options.task or (QUICK_TASKS if options.quick else TASKS)
-    if unknown := set(tasks) - set(TASKS):
-        parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
-    plan = QUICK if options.quick else Plan()
-    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
-    output = options.output
-    output.mkdir(parents=True, exist_ok=True)
-    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
-    with style():
-        drawings = diagrams(pd.DataFrame(table))
-    save(drawings, output, {"footer": ["python -m plab.bench.accuracy"]})
-    for drawing in drawings:
-        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import accuracy
+
+    sys.exit(accuracy())

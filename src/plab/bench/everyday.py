@@ -20,13 +20,10 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import plab
 from plab.bench.results import SETTLE, write_runs
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table, progress
+from plab.progress import show_line
 
-__all__ = ["COLUMNS", "THINGS", "main", "measure"]
+__all__ = ["COLUMNS", "THINGS", "measure", "rows"]
 
 _LOAD = "from plab.results import load; load('results')"
 _COMPOSE = "from plab.config import load_config; load_config(['task=Move'])"
@@ -49,6 +46,16 @@ COLUMNS = ("what", "source", "cpu_s", "cpu_max_s", "wall_s")
 
 _FRESH = "load, first time"
 """What is measured without a database."""
+
+
+def rows(
+    runs: int, iterations: int, sources: Sequence[Path], repeats: int, things: Sequence[str]
+) -> Iterator[dict[str, object]]:
+    """Make up so many results of so many iterations, and :func:`measure` with them."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_runs(runs, iterations, Path(folder) / "results")
+        time.sleep(SETTLE)
+        yield from measure(Path(folder), sources, repeats, things)
 
 
 def measure(
@@ -78,7 +85,7 @@ def measure(
         taken: dict[Path, list[tuple[float, float]]] = {source: [] for source in sources}
         for turn in range(repeats):
             for source, place in zip(sources, places, strict=True):
-                progress(f"{what}, {turn + 1}/{repeats}")
+                show_line(f"{what}, {turn + 1}/{repeats}")
                 if what == _FRESH:
                     _set_up(folder, place)
                 taken[source].append(_timed(THINGS[what], place, source))
@@ -118,30 +125,7 @@ def _children() -> float:
     return used.ru_utime + used.ru_stime
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, measure, print, write a CSV file if asked to."""
-    parser = Parser("plab.bench.everyday", __doc__)
-    parser.add_argument("--runs", type=positive, default=1000, help="number of result files")
-    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
-    parser.add_argument("--repeats", type=positive, default=3, help="times that each thing is done")
-    parser.add_argument("--only", nargs="+", choices=list(THINGS), default=list(THINGS), help="what to time")
-    parser.add_argument(
-        "--against", type=Path, help="folder of another source tree's packages, to take turns with"
-    )
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    if options.against is not None and not (options.against / "plab" / "__init__.py").is_file():
-        parser.error(f"--against: {options.against} holds no package plab; name a source tree's src")
-    own = Path(plab.__file__).parents[1]
-    sources = [own] if options.against is None else [options.against.resolve(), own]
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        write_runs(options.runs, options.rows, folder / "results")
-        time.sleep(SETTLE)
-        rows = measure(folder, sources, options.repeats, options.only)
-        measure_table(COLUMNS, rows, options.csv, {"what": 18})
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import everyday
+
+    sys.exit(everyday())

@@ -2,6 +2,7 @@
 
     python -m plab.bench.precision --csv precision.csv --markdown precision.md
     python -m plab.bench.precision --particles 10000                     # as many as the tasks have
+    python -m plab.bench.precision --device cuda --deterministic         # float32 whose sums are of integers
 
 prints a row per configuration and kind of actions: the score in both precisions in the hard contact model,
 and how far apart the gradients of the trajectory loss are in the soft one, over 50 steps. All configurations
@@ -11,30 +12,24 @@ share one compiled simulator per precision, see :mod:`plab.bench.common_scene`; 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
-import pandas as pd
 
 from plab.bench.common_scene import common_actions, common_scene, grid_terms, own_components
-from plab.cli.arguments import Parser, positive, task_list, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import markdown, measure_table
 from plab.config import build_scene, load_config
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
-from plab.report.costs import precision_summary
 from plab.scene import Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
 
-__all__ = ["angle", "main"]
+__all__ = ["COLUMNS", "angle", "compare", "starts"]
 
 COLUMNS = (
-    "task", "variant", "actions", "score_float32", "score_float64", "difference", "positions_rms",
+    "task", "variant", "actions", "score_float32", "score_float64", "difference", "positions_rms", "mass_l1",
     "gradient_norm", "norm_ratio", "angle_deg", "failures",
 )  # fmt: skip
 
@@ -97,18 +92,18 @@ def starts(tasks: Sequence[str], variants: Sequence[str], particles: int) -> lis
     return out
 
 
-def run(configurations: Sequence[Start], precision: str, targets: list[np.ndarray] | None) -> Iterator:
+def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim: Any) -> Iterator:
     """Run all configurations in one precision.
 
     Args:
         configurations: The configurations.
-        precision: ``float32`` or ``float64``.
         targets: A mass tensor for each, or None to make them: what the demonstration ends with.
+        sim: Precision, device and whether sums are deterministic, as :class:`plab.sim.Simulator` takes them.
 
     Yields:
         For each configuration its target and an :class:`Outcome` per kind of actions.
     """
-    simulator = Simulator([configurations[0].scene], terms=grid_terms(), precision=precision)
+    simulator = Simulator([configurations[0].scene], terms=grid_terms(), **sim)
     for number, start in enumerate(configurations):
         simulator.set_scenes([start.scene])
         final = {}
@@ -135,19 +130,27 @@ def mass_of(scene: Scene, x: np.ndarray) -> np.ndarray:
     return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor)
 
 
-def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
+def compare(
+    configurations: Sequence[Start], device: str = "cpu", deterministic: bool = False
+) -> Iterator[dict[str, object]]:
     """Run all in both precisions; yields a row of :data:`COLUMNS` per configuration and kind of actions.
 
     The target is what the demonstration ends with in float64: for simulated targets, the task's own.
+
+    Args:
+        configurations: The configurations.
+        device: ``cpu`` or ``cuda``, for both.
+        deterministic: Whether sums in float32 are of integers on CUDA, see ``sim.deterministic``.
     """
-    exact = list(run(configurations, "float64", None))
+    exact = list(run(configurations, None, precision="float64", device=device))
     targets = [target for target, _ in exact]
-    rounded = run(configurations, "float32", targets)
+    rounded = run(configurations, targets, precision="float32", device=device, deterministic=deterministic)
     for start, (target, right), (_, got) in zip(configurations, exact, rounded, strict=True):
         initial = mass_of(start.scene, sample_particles(start.scene))
         for kind in start.actions:
             a, b = got[kind], right[kind]
-            at = [scores(initial, mass_of(start.scene, o.x), target).score for o in (a, b)]
+            masses = [mass_of(start.scene, o.x) for o in (a, b)]
+            at = [scores(initial, mass, target).score for mass in masses]
             norm = np.linalg.norm(b.gradient)
             yield {
                 "task": start.task,
@@ -157,6 +160,7 @@ def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
                 "score_float64": round(at[1], 5),
                 "difference": f"{at[0] - at[1]:.1e}",
                 "positions_rms": f"{np.sqrt(((a.x - b.x) ** 2).sum(axis=1).mean()):.1e}",
+                "mass_l1": f"{np.abs(masses[0] - masses[1]).sum() / masses[1].sum():.1e}",
                 "gradient_norm": f"{norm:.3g}",
                 "norm_ratio": f"{np.linalg.norm(a.gradient) / norm:.6f}",
                 "angle_deg": f"{angle(a.gradient, b.gradient):.2g}",
@@ -164,29 +168,7 @@ def compare(configurations: Sequence[Start]) -> Iterator[dict[str, object]]:
             }
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, run, print, write the files asked for."""
-    parser = Parser("plab.bench.precision", __doc__)
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
-    parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
-    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
-    options = parser.parse_args(argv)
-    configurations = starts(options.task, options.variant, options.particles)
-    rows = measure_table(COLUMNS, compare(configurations), options.csv)
-    if options.markdown is not None:
-        options.markdown.parent.mkdir(parents=True, exist_ok=True)
-        options.markdown.write_text(summary(rows, options.particles), encoding="utf-8")
-
-
-def summary(rows: Sequence[Mapping[str, object]], particles: int) -> str:
-    """Return a table in Markdown of a row per task and kind of actions: the worst and the median."""
-    table = precision_summary(pd.DataFrame(rows))
-    lines = markdown(list(table.columns), table.to_dict("records"))
-    return f"float32 against float64, {particles} particles, 50 steps.\n\n{lines}"
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import precision
+
+    sys.exit(precision())

@@ -28,16 +28,12 @@ import taichi as ti
 
 from plab.bench.common_scene import grid_terms
 from plab.bench.precision import Start, angle, mass_of, starts
-from plab.cli.arguments import Parser, positive, task_list, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table
-from plab.config.suite import suite_tasks
 from plab.objective import TARGET_MASS, scores, target_sdf
 from plab.scene import sample_particles
 from plab.sim import Simulator, Skips, particle_phases
 from plab.sim.spectral import SINGULAR_VALUE_MIN, mapped_values, svd_signed
 
-__all__ = ["CHOICES", "main", "rows"]
+__all__ = ["CHOICES", "COLUMNS", "rows"]
 
 COLUMNS = ("choice", "task", "actions", "score", "score_release", "positions_rms", "norm_ratio", "angle_deg")
 
@@ -195,17 +191,7 @@ def _row(start: Start, kind: str, ours: np.ndarray, theirs: np.ndarray) -> dict[
     return row
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, run, print, write a CSV file if asked to."""
-    parser = Parser("plab.bench.release", __doc__)
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
-    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
-    parser.add_argument("--choice", nargs="+", choices=CHOICES, default=list(CHOICES), help="only these")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    measure_table(COLUMNS, rows(options.task, options.particles, options.choice), options.csv)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import release
+
+    sys.exit(release())

@@ -13,19 +13,15 @@ from __future__ import annotations
 import copy
 import itertools
 import os
-import resource
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table
 from plab.config import load_config
 from plab.config.selection import Selection
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
@@ -39,7 +35,7 @@ from plab.results.query import query, scores
 from plab.results.schema import COLUMNS, loss_columns
 from plab.status import survey
 
-__all__ = ["SETTLE", "main", "synthetic_run", "template", "write_runs"]
+__all__ = ["SETTLE", "measure", "synthetic_run", "template", "write_runs"]
 
 SETTLE = 2.5
 """Seconds to wait after writing: what files hold that have changed just now is not kept."""
@@ -144,59 +140,45 @@ def write_runs(runs: int, rows: int, folder: Path) -> None:
         write(synthetic_run(config, rows=rows), path, compress=False)
 
 
-def _rows(runs: int, rows: int, folder: Path, packed: bool) -> Iterator[dict[str, object]]:
+def measure(runs: int, rows: int, packed: bool) -> Iterator[dict[str, object]]:
     """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
-    results = folder / "results"
-    write_runs(runs, rows, results)
-    time.sleep(SETTLE)
+    with tempfile.TemporaryDirectory() as name:
+        folder, results, every = Path(name), Path(name) / "results", Selection()
+        os.environ["PLAB_CACHE_DIR"] = str(folder / "cache")
+        write_runs(runs, rows, results)
+        time.sleep(SETTLE)
 
-    def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:
-        start = time.perf_counter()
-        count = len(call())
-        seconds = time.perf_counter() - start
-        first.setdefault("seconds", seconds)
-        ratio = round(first["seconds"] / seconds, 1)
-        return {"what": what, "count": count, "seconds": round(seconds, 3), "times_faster": ratio}
+        def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:
+            start = time.perf_counter()
+            count = len(call())
+            seconds = time.perf_counter() - start
+            first.setdefault("seconds", seconds)
+            ratio = round(first["seconds"] / seconds, 1)
+            return {"what": what, "count": count, "seconds": round(seconds, 3), "times_faster": ratio}
 
-    first: dict[str, float] = {}
-    yield timed("first time", lambda: load(results))
-    yield timed("again", lambda: load(results))
-    changed = load(results)["path"].iloc[runs // 2]
-    Path(changed).touch()
-    yield timed("one changed", lambda: load(results))
-    yield timed("with a key", lambda: load(results, keys=["method.family"]))
-    yield timed("without database", lambda: load(results, database=False))
-    yield timed("scores", lambda: scores(results, Selection(), ["method.lr"], ["score"])[0])
-    yield timed("sql", lambda: query(results, "select task, avg(score) from runs group by task")[1])
-    yield timed("plab.status", lambda: survey(results, Selection()).runs)
-    yield timed("tables, first time", lambda: write_tables(collect(results, Selection()), folder / "a", ""))
-    yield timed("tables, again", lambda: write_tables(collect(results, Selection()), folder / "b", ""))
-    if not packed:
-        return
-    archive = folder / "all.plab.zip.xz"
-    yield timed("pack", lambda: range(pack(results, archive).runs))
-    time.sleep(SETTLE)
-    yield timed("archive", lambda: load(archive))
-    yield timed("archive again", lambda: load(archive))
-
-
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, measure, print, write a CSV file if asked to."""
-    parser = Parser("plab.bench.results", __doc__)
-    parser.add_argument("--runs", type=positive, default=5000, help="number of result files")
-    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
-    parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ["PLAB_CACHE_DIR"] = str(Path(folder) / "cache")
-        table = _rows(options.runs, options.rows, Path(folder), options.archive)
-        measure_table(("what", "count", "seconds", "times_faster"), table, options.csv)
-    # Linux counts in KiB, macOS in bytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1024.0)
-    print(f"most memory: {peak:.0f} MiB")
+        first: dict[str, float] = {}
+        yield timed("first time", lambda: load(results))
+        yield timed("again", lambda: load(results))
+        changed = load(results)["path"].iloc[runs // 2]
+        Path(changed).touch()
+        yield timed("one changed", lambda: load(results))
+        yield timed("with a key", lambda: load(results, keys=["method.family"]))
+        yield timed("without database", lambda: load(results, database=False))
+        yield timed("scores", lambda: scores(results, every, ["method.lr"], ["score"])[0])
+        yield timed("sql", lambda: query(results, "select task, avg(score) from runs group by task")[1])
+        yield timed("plab.status", lambda: survey(results, every).runs)
+        yield timed("tables, first time", lambda: write_tables(collect(results, every), folder / "a", ""))
+        yield timed("tables, again", lambda: write_tables(collect(results, every), folder / "b", ""))
+        if not packed:
+            return
+        archive = folder / "all.plab.zip.xz"
+        yield timed("pack", lambda: range(pack(results, archive).runs))
+        time.sleep(SETTLE)
+        yield timed("archive", lambda: load(archive))
+        yield timed("archive again", lambda: load(archive))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import results
+
+    sys.exit(results())

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,19 +30,15 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
-from plab.families import FAMILIES
 from plab.runners.environments import torch_settings
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.population import Population, population_settings
 from plab.runners.rl_trainer import Trainer
 
-__all__ = ["main", "measure", "measure_population"]
+__all__ = ["COLUMNS", "PARTS", "POPULATION", "measure", "measure_population", "rows"]
 
 SIMULATOR_PARTS = (("step", "simulate"), ("measure", "judge"), ("observe", "observe"), ("poses", "observe"))
 """Methods of the simulator, and the parts that they are of."""
@@ -58,6 +54,16 @@ POPULATION = (
 CUDA what torch has at most, on the CPU its replay buffer."""
 
 COLUMNS = ("task", "device", "method", "num_envs", "threads", "steps_per_s", *(f"{p}_ms" for p in PARTS))
+
+
+def rows(
+    overrides: Sequence[str], trainings: Iterable[tuple[int | None, int, str]], batches: int
+) -> Iterator[dict[str, object]]:
+    """Measure batches of trainings, given by the number of agents, None without a population, the number of
+    environments and the method; yield a row of :data:`POPULATION` or :data:`COLUMNS` for each."""
+    for agents, num_envs, method in trainings:
+        cfg = _config(overrides, method, num_envs, batches, whole=agents is not None)
+        yield measure(cfg, batches) if agents is None else measure_population(cfg, agents, batches)
 
 
 def measure(cfg: Config, batches: int) -> dict[str, object]:
@@ -189,7 +195,7 @@ def _synchronise() -> None:
         torch.cuda.synchronize()
 
 
-def _config(overrides: list[str], method: str, num_envs: int, batches: int, *, whole: bool = False) -> Config:
+def _config(overrides: Sequence[str], method: str, num_envs: int, batches: int, *, whole: bool) -> Config:
     """Return a training of a few batches of episodes, or of all, each followed by its share of updates."""
     cfg = load_config([*overrides, f"method={method}", f"method.num_envs={num_envs}"])
     own = cfg.method_as(RlConfig)
@@ -205,33 +211,7 @@ def _config(overrides: list[str], method: str, num_envs: int, batches: int, *, w
     return cfg
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, measure, print, write a CSV file if asked to."""
-    parser = Parser("plab.bench.rl", __doc__)
-    parser.add_argument(
-        "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
-    )
-    methods = tuple(FAMILIES["rl"].rules)
-    parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
-    parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
-    parser.add_argument("--agents", type=positive, nargs="+", help="numbers of agents of populations")
-    parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_intermixed_args(argv)
-    overrides, batches = options.overrides, options.batches
-    kinds = [(num_envs, method) for num_envs in options.envs for method in options.methods]
-    if options.agents:
-        rows = (
-            measure_population(_config(overrides, method, num_envs, batches, whole=True), agents, batches)
-            for agents in options.agents
-            for num_envs, method in kinds
-        )
-        measure_table(POPULATION, rows, options.csv)
-        return
-    table = (measure(_config(overrides, method, num_envs, batches), batches) for num_envs, method in kinds)
-    measure_table(COLUMNS, table, options.csv)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import rl
+
+    sys.exit(rl())

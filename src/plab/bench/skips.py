@@ -13,9 +13,9 @@ from typing import cast
 import numpy as np
 
 from plab.bench.workload import FORWARD, GRADIENT, REWARD, WARM_UP, Workload, build
-from plab.cli.tables import progress
 from plab.config import ConfigError, load_config
 from plab.errors import pick
+from plab.progress import show_line
 from plab.sim import Skips
 
 __all__ = ["CASES", "COLUMNS", "Case", "cases_for", "rows"]
@@ -105,12 +105,12 @@ def rows(
     for case in cases:
         cfg = load_config([*case.overrides, *overrides])
         length = cfg.sim.horizon if case.from_start else steps
-        progress(f"{case.skip}: building two simulators")
+        show_line(f"{case.skip}: building two simulators")
         with_it = build(cfg, batch, length, from_start=case.from_start)
         start, skips = with_it.simulator.state(), Skips(**{case.skip: False})
         without = build(cfg, batch, length, from_start=case.from_start, start=start, skips=skips)
         for kind in case.kinds[: 1 if quick else None]:
-            progress(f"{case.skip}: {kind}, {batch} environment(s) on {cfg.sim.device}")
+            show_line(f"{case.skip}: {kind}, {batch} environment(s) on {cfg.sim.device}")
             try:
                 yield _row(case, with_it, without, kind, repeats)
             except MemoryError as error:

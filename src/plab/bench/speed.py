@@ -14,20 +14,17 @@ Rows are printed as they come, and written to --csv. docs/benchmarks.md explains
 
 from __future__ import annotations
 
-import argparse
 import gc
+import itertools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from plab.bench import skips
 from plab.bench.bound import FOOTPRINTS, bandwidth, least_ms, traffic
 from plab.bench.workload import (
     FORWARD,
     GRADIENT,
-    KINDS,
     REWARD,
     TENSORS,
     build,
@@ -35,16 +32,12 @@ from plab.bench.workload import (
     restart_peak_rss,
     time_calls,
 )
-from plab.cli.arguments import Parser, positive, task_list, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import markdown, measure_table, progress
 from plab.config import Config, load_config
-from plab.config.suite import suite_tasks
-from plab.errors import tell
+from plab.progress import show_line
 from plab.report.reference import paper_table
 from plab.sim.storage import BLOCK
 
-__all__ = ["COLUMNS", "main", "rows", "write_markdown"]
+__all__ = ["COLUMNS", "all_rows", "limit_rows", "paper_row", "rows", "scaling_rows"]
 
 COLUMNS = (
     "task", "device", "precision", "batch", "what", "first_s", "median_ms", "min_ms", "max_ms",
@@ -71,18 +64,6 @@ PAPER_COLUMNS = (
     "task", "device", "precision", "batch", "forward_ms", "forward_paper_ms", "forward_ratio", "gradient_ms",
     "gradient_paper_ms", "gradient_ratio",
 )  # fmt: skip
-
-HEADING = """\
-# Time per environment step
-
-Milliseconds per environment step and environment, measured with `python -m plab.bench.speed --paper`, beside
-what the PlasticineLab paper gives for a GTX 1080 Ti, and the paper's divided by ours. The forward pass
-includes loss and reward.
-
-"""
-
-WIDE = {"what": max(map(len, KINDS)), "skip": 18, "device": 6, "batch": 5}
-"""Widths of columns whose entries are not as long as most."""
 
 QUICK_KINDS = (FORWARD, GRADIENT)
 
@@ -116,7 +97,7 @@ def rows(
     for kind in kinds:
         if kind == TENSORS and simulator.device == "cpu":
             continue
-        progress(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
+        show_line(f"{cfg.task.name}, {cfg.sim.device}, {cfg.sim.precision}, {batch} environment(s): {kind}")
         try:
             timing = time_calls(load.call(kind), repeats)
         except MemoryError as error:
@@ -144,45 +125,44 @@ def rows(
         }
 
 
-def _all_rows(options: argparse.Namespace, refused: list[str]) -> Iterator[dict[str, object]]:
-    """Rows of the plain benchmark, precision by precision: Taichi starts anew for each."""
-    for precision in options.precision or [None]:
-        chosen = [*options.overrides, *([f"sim.precision={precision}"] if precision else [])]
-        first = load_config([*chosen, *_task(options.task[0] if options.task else None)])
-        speeds = _speeds(first.sim.device)
-        for task in options.task or [None]:
-            for batch in options.batch:
-                gc.collect()
-                cfg = load_config([*chosen, *_task(task)])
-                how = (options.steps, options.repeats, options.kinds)
-                yield from rows(cfg, batch, *how, speeds, refused)
-
-
-def _task(name: str | None) -> list[str]:
-    return [f"task={name}"] if name else []
+def all_rows(
+    overrides: Sequence[str],
+    tasks: Sequence[list[str]],
+    batches: Sequence[int],
+    how: tuple[int, int, Sequence[str]],
+    refused: list[str],
+) -> Iterator[dict[str, object]]:
+    """Measure tasks, overrides each, and batch sizes in one precision: Taichi starts anew for each. What the
+    three of ``how`` and ``refused`` are, :func:`rows` says."""
+    speeds = _speeds(load_config([*overrides, *tasks[0]]).sim.device)
+    for task, batch in itertools.product(tasks, batches):
+        gc.collect()
+        yield from rows(load_config([*overrides, *task]), batch, *how, speeds, refused)
 
 
 def _speeds(device: str) -> tuple[float, ...]:
-    progress(f"how fast the machine copies memory, {device}")
+    show_line(f"how fast the machine copies memory, {device}")
     speeds = bandwidth(device)
     gc.collect()
     return speeds
 
 
-def _limit_rows(options: argparse.Namespace) -> Iterator[dict[str, object]]:
-    device = load_config(options.overrides).sim.device
+def limit_rows(overrides: Sequence[str]) -> Iterator[dict[str, object]]:
+    """Measure how fast the machine copies memory; yield a row per size of what is copied."""
+    device = load_config(overrides).sim.device
     for footprint, speed in zip(FOOTPRINTS, _speeds(device), strict=True):
         yield {"device": device, "copied_mb": round(footprint / 1e6), "gb_per_s": round(speed / 1e9, 1)}
 
 
-def _scaling_rows(
-    overrides: Sequence[str], particles: int, grid: int, kinds: Sequence[str], repeats: int
+def scaling_rows(
+    overrides: Sequence[str], size: tuple[int, int], kinds: Sequence[str], repeats: int
 ) -> Iterator[dict[str, object]]:
-    """Measure the same body with a number of particles and grid nodes per axis; yield a row per kind.
+    """Measure the same body with a number of grid nodes per axis and of particles; yield a row per kind.
 
     Per particle the time should not grow at all, and what a finer grid adds should go with the nodes that
     hold mass, not with all: ``blocks`` is the number of blocks of 4^3 nodes that hold mass at the start.
     """
+    grid, particles = size
     whole = sum(body.particles for body in load_config(overrides).task.bodies.values())
     changes = (
         f"sim.particles_scale={particles / whole}",
@@ -190,7 +170,7 @@ def _scaling_rows(
         f"sim.dt={FINEST_DT * min(1.0, 64 / grid)}",
     )
     cfg = load_config([*overrides, *changes])
-    progress(f"{particles} particles, {grid}^3 grid")
+    show_line(f"{particles} particles, {grid}^3 grid")
     load = build(cfg, 1, SCALING_STEPS, from_start=True)
     simulator = load.simulator
     simulator.reset()
@@ -218,13 +198,11 @@ def _scaling_rows(
         }
 
 
-def _paper_row(
-    task: str, overrides: Sequence[str], batch: int, steps: int, repeats: int
-) -> dict[str, object]:
+def paper_row(task: str, overrides: Sequence[str], batch: int, steps: int, repeats: int) -> dict[str, object]:
     """Return a task's milliseconds per environment step of one environment beside the paper's."""
     paper = paper_table("timing").set_index("task")
     cfg = load_config([*overrides, f"task={task}"])
-    progress(f"{task} on {cfg.sim.device}")
+    show_line(f"{task} on {cfg.sim.device}")
     load = build(cfg, batch, steps)
     row: dict[str, object] = {
         "task": cfg.task.name,
@@ -244,117 +222,7 @@ def _paper_row(
     return row
 
 
-def write_markdown(path: Path, table: Sequence[Mapping[str, object]]) -> None:
-    """Write the rows of ``--paper`` as a page for the documentation."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(HEADING + markdown(PAPER_COLUMNS, table), encoding="utf-8")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser("plab.bench.speed", __doc__)
-    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
-    parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
-    parser.add_argument("--device", help="the same as sim.device=...")
-    parser.add_argument("--precision", nargs="+", help="precisions, one after the other")
-    parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
-    parser.add_argument("--steps", type=positive, help="environment steps per rollout")
-    parser.add_argument("--repeats", type=positive, help="timed rollouts")
-    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), help="what is timed")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
-    parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
-    modes = parser.add_mutually_exclusive_group()
-    modes.add_argument("--skips", nargs="*", metavar="SKIP", help="rows with one skip off; all, or these")
-    modes.add_argument("--scaling", action="store_true", help="rows for numbers of particles and grids")
-    modes.add_argument("--paper", action="store_true", help="the paper's table beside ours")
-    modes.add_argument("--limits", action="store_true", help="how fast the machine copies memory")
-    parser.add_argument("--particles", type=positive, nargs="+", help="--scaling: numbers of particles")
-    parser.add_argument("--grids", type=positive, nargs="+", help="--scaling: nodes per axis")
-    return parser
-
-
-def _options(argv: Sequence[str] | None) -> argparse.Namespace:
-    options = _parser().parse_intermixed_args(argv)
-    if options.device:
-        options.overrides = [*options.overrides, f"sim.device={options.device}"]
-    given = [override.partition("=")[0] for override in options.overrides]
-    if not options.task and "task" not in given:
-        options.task = list(suite_tasks()) if options.paper else ["Move"]
-    quick = options.quick
-    options.steps = options.steps or (5 if quick else 10)
-    options.repeats = options.repeats or (3 if quick else 7)
-    options.kinds = options.kinds or (QUICK_KINDS if quick else tuple(KINDS))
-    options.particles = options.particles or PARTICLES[: 2 if quick else None]
-    options.grids = options.grids or GRIDS[: 2 if quick else None]
-    return options
-
-
-def _run(options: argparse.Namespace) -> int:
-    overrides = [*options.overrides, *(f"sim.precision={p}" for p in (options.precision or ())[:1])]
-    refused: list[str] = []
-    if options.limits:
-        measure_table(LIMIT_COLUMNS, _limit_rows(options), options.csv)
-    elif options.skips is not None:
-        return _run_skips(options, overrides)
-    elif options.scaling:
-        chosen = [*overrides, *_task(options.task[0] if options.task else None)]
-        kinds = QUICK_KINDS[:1] if options.quick else QUICK_KINDS
-        table = (
-            row
-            for grid in options.grids
-            for count in options.particles
-            for row in _scaling_rows(chosen, count, grid, kinds, options.repeats)
-        )
-        measure_table(SCALING_COLUMNS, table, options.csv, WIDE)
-    elif options.paper:
-        measured = (
-            _paper_row(task, overrides, batch, options.steps, options.repeats)
-            for batch in options.batch
-            for task in options.task
-        )
-        done = measure_table(PAPER_COLUMNS, measured, options.csv, {"task": 10})
-        if options.markdown is not None:
-            write_markdown(options.markdown, done)
-    else:
-        measure_table(COLUMNS, _all_rows(options, refused), options.csv, WIDE)
-    return _not_measured(refused)
-
-
-def _not_measured(refused: Sequence[str]) -> int:
-    """Say what needs more memory than there may be; the exit code."""
-    for line in refused:
-        tell(f"not measured: {line}")
-    return 1 if refused else 0
-
-
-def _run_skips(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    cases = skips.cases_for(load_config(overrides).sim.device, options.skips)
-    how = (options.steps, options.repeats, options.quick)
-    refused: list[str] = []
-    rows = (row for batch in options.batch for row in skips.rows(cases, overrides, batch, *how, refused))
-    table = measure_table(skips.COLUMNS, rows, options.csv, WIDE)
-    code = _not_measured(refused)
-    if broken := [str(row["skip"]) for row in table if not row["equal"]]:
-        cuda = table[0]["device"] == "cuda" and table[0]["precision"] == "float32"
-        again = "; sums on CUDA vary from run to run: see whether --precision float64 says so, too"
-        tell(f"results differ by more than rounding: {', '.join(broken)}{again if cuda else ''}")
-    return 1 if broken else code
-
-
-@command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, measure, print, and write a CSV file if asked to.
-
-    Args:
-        argv: Arguments after the program's name; those of the process by default.
-
-    Returns:
-        Exit code: 0, 1 if a skip changes results or a row needs too much memory, 2 for a mistake of the
-        user's.
-    """
-    options = _options(argv)
-    return _run(options)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import speed
+
+    sys.exit(speed())

@@ -14,40 +14,26 @@ in time, and drawn into a PNG of the same name.
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import cast
 
 import numpy as np
-import pandas as pd
 
-from plab.bench.stress_cases import Case, Plan, refusals, stress_cases
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table, print_table, write_csv
-from plab.config import ConfigError
+from plab.bench.stress_cases import Case, Plan, refusals
 from plab.config.suite import suite_tasks
-from plab.errors import tell
 from plab.losses import make_terms
-from plab.report.figures import legend, log_axis, single, style
 from plab.scene import SceneError
-from plab.sim import PRECISIONS, SimulationError, Simulator
+from plab.sim import SimulationError, Simulator
 
-__all__ = ["main", "run_cases", "run_refusals", "write_norms"]
+__all__ = ["COLUMNS", "FULL", "QUICK", "REFUSAL", "run_cases", "run_refusals"]
 
 BATCH = 12
 """Environments simulated together."""
 
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
-
-LABELLED = 12
-"""With more cases than this a figure of norms has no legend: colours repeat."""
 
 REFUSAL = "refusal"
 """Family of the scenes that are to be refused."""
@@ -196,85 +182,7 @@ def _speeds(simulator: Simulator, cases: Sequence[Case]) -> np.ndarray:
     return fastest[: len(cases)]
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> int:
-    """Parse the command line, run, print, write a CSV file if asked to; return the exit code."""
-    parser = Parser("plab.bench.stability", __doc__)
-    parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
-    parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
-    parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
-    parser.add_argument("--horizon", type=positive, help="environment steps of the long horizon (1000)")
-    parser.add_argument("--family", nargs="+", help="only these families of cases")
-    parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
-    what = "file for the gradient's norm per step back in time"
-    parser.add_argument("--gradients", type=to_write, help=what)
-    options = parser.parse_args(argv)
-    cases = _cases(options)
-    rows = itertools.chain.from_iterable(run_cases(cases, precision) for precision in options.precision)
-    refused = run_refusals() if not options.family or REFUSAL in options.family else ()
-    table = measure_table(COLUMNS, itertools.chain(rows, refused), options.csv)
-    if options.gradients is not None:
-        write_norms(table, options.gradients)
-    return _summarise(pd.DataFrame(table))
-
-
-def _cases(options: argparse.Namespace) -> list[Case]:
-    """Return the cases that are asked for."""
-    plan = QUICK if options.quick else FULL
-    plan = replace(plan, particles=options.particles or plan.particles)
-    plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
-    cases = stress_cases(plan)
-    families = list(dict.fromkeys([case.family for case in cases] + [REFUSAL]))
-    if unknown := set(options.family or ()) - set(families):
-        raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
-    return [case for case in cases if not options.family or case.family in options.family]
-
-
-def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
-    """Write, and draw, the norm of the gradient for each step back in time.
-
-    Args:
-        rows: What :func:`run_cases` yields; others are left out.
-        path: CSV file; the drawing is a PNG of the same name.
-    """
-    parts = [
-        (row["precision"], row["family"], row["case"], norms[::-1])
-        for row in rows
-        if (norms := cast("np.ndarray | None", row.get("norms"))) is not None
-    ]
-    if not parts:
-        tell("no case has a gradient")
-        return
-    table = [(*which, back, norm) for *which, norms in parts for back, norm in enumerate(norms)]
-    write_csv(path, [("precision", "family", "case", "back", "norm"), *table], digits=6)
-    with style():
-        figure, panel = single(7.0, 4.0)
-        colours: dict[str, str] = {}
-        for precision, _family, case, norms in parts:
-            label = None if case in colours else str(case)
-            colour = colours.setdefault(str(case), f"C{len(colours) % 10}")
-            # Steps that nothing depends on have no place on a log scale.
-            norms = np.where(norms > 0, norms, np.nan)
-            panel.plot(norms, "-" if precision == "float32" else ":", color=colour, label=label)
-        panel.set_xlabel("environment steps back from the end")
-        panel.set_title("solid: float32, dotted: float64", loc="right")
-        log_axis(panel, "norm of a step's gradient", vertical=True)
-        if len(colours) <= LABELLED:
-            legend(figure, columns=3)
-        figure.savefig(path.with_suffix(".png"))
-    print(path.with_suffix(".png"))
-
-
-def _summarise(table: pd.DataFrame) -> int:
-    """Print how many cases of each family survived; return the exit code."""
-    table["survived"] = table["outcome"].isin(["survived", "refused"])
-    groups = table.groupby(["precision", "family"], sort=False, as_index=False)["survived"]
-    rows = groups.agg(["size", "sum"]).itertuples(index=False, name=None)
-    total = ("", "all", len(table), table["survived"].sum())
-    print()
-    print_table(("precision", "family", "cases", "survived"), [*rows, total])
-    return 0 if table["survived"].all() else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import stability
+
+    sys.exit(stability())

@@ -15,9 +15,6 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from plab.cli.arguments import Parser, positive, sources_and_words, to_write
-from plab.cli.command import command_line
-from plab.cli.tables import measure_table
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
@@ -26,7 +23,7 @@ from plab.problem import fits
 from plab.results import read
 from plab.runners.policy import Policy, load_policy
 
-__all__ = ["FIRST", "main", "rows", "scores_of"]
+__all__ = ["COLUMNS", "FIRST", "rows", "scores_of"]
 
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
 
@@ -84,23 +81,7 @@ def rows(
         yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
 
 
-@command_line
-def main(argv: Sequence[str] | None = None) -> None:
-    """Parse the command line, run, print, write a CSV file if asked to."""
-    parser = Parser("plab.bench.unseen", __doc__)
-    parser.add_argument("what", nargs="+", metavar="RESULT | KEY=VALUE", help="keys are those of plab.run")
-    parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="so many scenes")
-    parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    paths, words = sources_and_words(options.what)
-    if not paths:
-        parser.error("name the result file of a run that has trained a policy")
-    if options.scenes < 2:
-        parser.error("--scenes has to be at least 2: one score has no interval")
-    widths = {"policy": max(map(len, paths)), "trained_on": 17}
-    measure_table(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from plab.cli.bench import unseen
+
+    sys.exit(unseen())

@@ -19,7 +19,7 @@ import numpy as np
 
 from plab.cli.arguments import Parser, refuse_task, results_source, task_list, to_write
 from plab.cli.command import command_line
-from plab.cli.tables import markdown, print_table
+from plab.cli.tables import print_table, write_markdown
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
@@ -32,7 +32,7 @@ from plab.results.loading import Row, readable_rows
 from plab.targets import EPISODE_STEPS
 from plab.targets.scripted import DECIMALS
 
-__all__ = ["Replay", "main", "replay"]
+__all__ = ["ReplayedDemonstration", "main", "replay"]
 
 HEADING = """\
 # Demonstrations
@@ -45,7 +45,7 @@ plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayedDemonstration:
     """A demonstration, actions of shape [T, A], what they reach in the hard contact model, and what doing
     nothing reaches."""
 
@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     _show(rows, args.markdown)
 
 
-def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[Replay]:
+def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
     """Replay actions, shape [T, A] each, of configurations that fit into one batch, and an episode without
     motion, which takes the place of actions that are None."""
     problem = Problem(cfgs)
@@ -91,7 +91,7 @@ def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list
     tried = np.stack([still if item is None else item for item in actions])
     reached = problem.rollout(tried, gradient=False).scores
     idle = problem.rollout(np.zeros_like(tried), gradient=False).scores
-    return [Replay(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
+    return [ReplayedDemonstration(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
 
 
 def _found(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
@@ -118,7 +118,7 @@ def _require_own_resolution(cfg: Config) -> None:
         raise ConfigError(why)
 
 
-def _row(item: Replay) -> dict[str, object]:
+def _row(item: ReplayedDemonstration) -> dict[str, object]:
     moving = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0)
     return {
         "task": item.cfg.task.name,
@@ -137,13 +137,11 @@ def _show(rows: Sequence[dict[str, object]], path: Path | None) -> None:
     shown = [{k: f"{v:.3f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows]
     print_table(list(shown[0]), [list(row.values()) for row in shown])
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         by_task: dict[object, dict[str, object]] = {}
         for row in shown:
             line = by_task.setdefault(row["task"], {"task": row["task"], "target": row["target"]})
             line[str(row["variant"])] = row["score"]
-        table = markdown(("task", "target", *SUITE_VARIANTS), by_task.values())
-        path.write_text(HEADING + table, encoding="utf-8")
+        write_markdown(path, HEADING, ("task", "target", *SUITE_VARIANTS), by_task.values())
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:

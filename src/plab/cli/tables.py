@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["markdown", "measure_table", "print_table", "progress", "write_csv"]
+__all__ = ["measure_table", "print_table", "write_csv", "write_markdown"]
 
 _NUMBER = re.compile(r"([-+]?(\d[\d,]*(\.\d+)?(e[-+]\d+)?|inf))?")
 
@@ -34,10 +34,13 @@ def measure_table(
     Returns:
         The rows.
     """
+    # Imported here: Rich, which it loads, is of no use to other tables.
+    from plab.progress import show_line
+
     least = [max(len(name), (widths or {}).get(name, 8)) for name in columns]
 
     def show(values: Iterable[object]) -> None:
-        progress("")
+        show_line("")
         shown = (f"{value!s:>{width}s}" for value, width in zip(values, least, strict=True))
         print("  ".join(shown), flush=True)
 
@@ -107,14 +110,11 @@ def _text(value: Any, digits: int) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else " ".join(str(value).split())
 
 
-def markdown(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
-    """Return a table in Markdown; numbers as they are."""
+def write_markdown(
+    path: Path, heading: str, columns: Sequence[str], rows: Iterable[Mapping[str, object]]
+) -> None:
+    """Write a heading and a table in Markdown, numbers as they are; the folder is made if need be."""
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(str(row[name]) for name in columns) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
-
-
-def progress(text: str) -> None:
-    """Say on standard error what is being measured, if somebody watches, in a line that the next replaces."""
-    if sys.stderr.isatty():
-        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(heading + "\n".join(lines) + "\n", encoding="utf-8")

@@ -14,7 +14,7 @@ import pyvista as pv
 
 from plab.progress import show_progress
 from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, surface_mesh, target_mesh
-from plab.render.recording import Recording
+from plab.render.recording import RecordedRollout
 from plab.render.renderer import BODY_COLORS
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
@@ -25,7 +25,7 @@ Things = Callable[[int], Mapping[str, pv.PolyData]]
 """Gives what there is at a step, by name."""
 
 
-def write_vtk(recording: Recording, folder: Path, every: int = 1) -> None:
+def write_vtk(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     """Write a rollout as VTK XML files and an index of each series over time [s], which ParaView opens.
 
     Writes ``particles.pvd`` with :func:`quantities`, ``plasticine.pvd`` and ``manipulators.pvd``, with the
@@ -53,7 +53,7 @@ def write_vtk(recording: Recording, folder: Path, every: int = 1) -> None:
         target.save(folder / "target.vtp")
 
 
-def write_ply(recording: Recording, folder: Path, every: int = 1) -> None:
+def write_ply(recording: RecordedRollout, folder: Path, every: int = 1) -> None:
     """Write surfaces as PLY files with colours, for Blender.
 
     Writes ``plasticine_0000.ply`` and ``manipulators_0000.ply`` for each frame, and ``target.ply``.
@@ -73,7 +73,7 @@ def write_ply(recording: Recording, folder: Path, every: int = 1) -> None:
 
 
 def _frames(
-    recording: Recording, every: int, things: Callable[[Recording], Things]
+    recording: RecordedRollout, every: int, things: Callable[[RecordedRollout], Things]
 ) -> Iterator[tuple[int, Mapping[str, pv.PolyData]]]:
     """Yield steps and what there is at them, by name."""
     last = len(recording.x) - 1
@@ -93,7 +93,7 @@ def _save_ply(mesh: pv.PolyData, numbers: np.ndarray, palette: Sequence[str], pa
 # ----------------------------------------------------------------------------------------------------- things
 
 
-def _vtk_things(recording: Recording) -> Things:
+def _vtk_things(recording: RecordedRollout) -> Things:
     surfaces = _surfaces(recording)
 
     def at(step: int) -> Mapping[str, pv.PolyData]:
@@ -105,7 +105,7 @@ def _vtk_things(recording: Recording) -> Things:
     return at
 
 
-def quantities(recording: Recording, step: int) -> dict[str, np.ndarray]:
+def quantities(recording: RecordedRollout, step: int) -> dict[str, np.ndarray]:
     """Return what the particles of a recording with motion have, at a step.
 
     Returns:
@@ -132,7 +132,7 @@ def quantities(recording: Recording, step: int) -> dict[str, np.ndarray]:
     }
 
 
-def _surfaces(recording: Recording) -> Things:
+def _surfaces(recording: RecordedRollout) -> Things:
     scene = recording.scene
     bodies = list(zip(body_slices(scene), body_surfaces(scene), strict=True))
     parts = [
@@ -160,7 +160,7 @@ def _merged(meshes: Sequence[pv.PolyData], numbers: Sequence[int], name: str) ->
     return pv.merge(meshes, merge_points=False)
 
 
-def _target(recording: Recording) -> pv.PolyData | None:
+def _target(recording: RecordedRollout) -> pv.PolyData | None:
     """Return the target's surface, if there is a target."""
     mass = recording.target_mass
     return None if mass is None else target_mesh(recording.scene, mass)

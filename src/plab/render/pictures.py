@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from plab.render.camera import Camera, scene_camera
 from plab.render.graphics import RenderError
-from plab.render.recording import Recording
+from plab.render.recording import RecordedRollout
 from plab.render.renderer import INK, PAPER, Renderer
 
 __all__ = [
@@ -53,7 +53,7 @@ def check_output(path: Path) -> None:
         raise RenderError("MP4 needs imageio-ffmpeg, which is not installed: pip install 'plab[render]'")
 
 
-def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1) -> None:
+def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: int = 1) -> None:
     """Write a recording: a strip as PNG, a film as GIF or MP4.
 
     Args:
@@ -71,7 +71,7 @@ def save(recording: Recording, path: Path, size: tuple[int, int], every: int = 1
 
 
 def save_set(
-    recordings: Mapping[str, Recording], folder: Path, size: tuple[int, int], filmed: Collection[str]
+    recordings: Mapping[str, RecordedRollout], folder: Path, size: tuple[int, int], filmed: Collection[str]
 ) -> None:
     """Write what several rollouts of one configuration look like, all seen by the same camera.
 
@@ -107,7 +107,9 @@ def _save_webp(picture: np.ndarray, path: Path) -> None:
     Image.fromarray(picture).save(path, quality=86)
 
 
-def save_contact_sheet(rows: Mapping[str, Sequence[Recording]], path: Path, size: tuple[int, int]) -> None:
+def save_contact_sheet(
+    rows: Mapping[str, Sequence[RecordedRollout]], path: Path, size: tuple[int, int]
+) -> None:
     """Write one picture of many tasks as PNG.
 
     Args:
@@ -135,13 +137,13 @@ def save_contact_sheet(rows: Mapping[str, Sequence[Recording]], path: Path, size
         image.save(path, optimize=True)
 
 
-def _start_and_target(recording: Recording, size: tuple[int, int]) -> Image.Image:
+def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> Image.Image:
     with closing(Renderer(recording.scene, recording.target_mass, size)) as renderer:
         start = renderer.frame(recording.x[0], recording.poses[0])
         return Image.fromarray(np.concatenate([start, renderer.target(recording.poses[0])], axis=1))
 
 
-def save_film_strip(recordings: Sequence[Recording], path: Path, size: tuple[int, int]) -> None:
+def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tuple[int, int]) -> None:
     """Write one picture of many rollouts as JPEG: of each some frames, at equal distances in time.
 
     Args:
@@ -171,7 +173,7 @@ def save_film_strip(recordings: Sequence[Recording], path: Path, size: tuple[int
         sheet.save(path, quality=_STRIP_QUALITY, optimize=True)
 
 
-def _camera(recording: Recording, size: tuple[int, int]) -> Camera:
+def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
     """Return the camera that sees a whole rollout."""
     x, poses = recording.x[[0, -1]], recording.poses[::5]
     return scene_camera(recording.scene, recording.target_mass, size, x, poses)
@@ -190,7 +192,7 @@ def _writing(path: Path) -> Iterator[None]:
 # ---------------------------------------------------------------------------------------------------- formats
 
 
-def _save_png(recording: Recording, renderer: Renderer, _every: int, path: Path) -> None:
+def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path: Path) -> None:
     """Write start, target and end, side by side, with captions."""
     first, last, steps = recording.poses[0], recording.poses[-1], len(recording.x) - 1
     panels = [
@@ -208,7 +210,7 @@ def _save_png(recording: Recording, renderer: Renderer, _every: int, path: Path)
     sheet.save(path, optimize=True)
 
 
-def _save_gif(recording: Recording, renderer: Renderer, every: int, path: Path) -> None:
+def _save_gif(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     frames = list(_frames(recording, renderer, every))
     # One palette for all: what does not change then costs nothing.
     palette = _palette([frames[0], frames[len(frames) // 2], frames[-1]], _FILM_COLORS)
@@ -217,7 +219,7 @@ def _save_gif(recording: Recording, renderer: Renderer, every: int, path: Path) 
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
 
 
-def _save_mp4(recording: Recording, renderer: Renderer, every: int, path: Path) -> None:
+def _save_mp4(recording: RecordedRollout, renderer: Renderer, every: int, path: Path) -> None:
     import imageio_ffmpeg
 
     writer = imageio_ffmpeg.write_frames(
@@ -234,7 +236,7 @@ def _save_mp4(recording: Recording, renderer: Renderer, every: int, path: Path) 
 _WRITERS = {".png": _save_png, ".gif": _save_gif, ".mp4": _save_mp4}
 
 
-def _frames(recording: Recording, renderer: Renderer, every: int) -> Iterator[np.ndarray]:
+def _frames(recording: RecordedRollout, renderer: Renderer, every: int) -> Iterator[np.ndarray]:
     last = len(recording.x) - 1
     for step in [*range(0, last, every), last]:
         yield renderer.frame(recording.x[step], recording.poses[step])

@@ -25,7 +25,7 @@ from plab.sim import Simulator, State
 from plab.targets import TargetError
 
 __all__ = [
-    "Recording",
+    "RecordedRollout",
     "demonstration",
     "record",
     "record_all",
@@ -41,7 +41,7 @@ Section = TypeVar("Section")
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedRollout:
     """A rollout in the hard contact model.
 
     Attributes:
@@ -149,18 +149,18 @@ def demonstration(cfg: Config) -> np.ndarray:
     return actions
 
 
-def record(cfg: Config, actions: np.ndarray) -> Recording:
+def record(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """Run actions in [-1, 1], shape [T, A], from the initial state of a configuration."""
     return record_all([cfg], actions[None])[0]
 
 
-def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = True) -> list[Recording]:
+def record_all(cfgs: Sequence[Config], actions: np.ndarray, *, scored: bool = True) -> list[RecordedRollout]:
     """Run actions in [-1, 1], shape [batch, T, A], in as many configurations of one kind of scene; their
     scores are worked out if ``scored``."""
     return _recordings(cfgs, Problem(cfgs), actions, scored=scored)
 
 
-def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
+def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
     """Run actions as :func:`record` does, and keep velocities and deformation gradients.
 
     A target that cannot be made here, such as one whose file is elsewhere, is left out, and a line says so.
@@ -175,7 +175,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
         return recording
     scenes = build_scenes([cfg])
     states = list(_states(build_simulator(scenes, cfg), actions[None]))
-    return Recording(
+    return RecordedRollout(
         task=cfg.task.name,
         variant=cfg.variant,
         scene=scenes[0],
@@ -185,7 +185,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> Recording:
     )
 
 
-def starts(cfgs: Sequence[Config]) -> list[Recording]:
+def starts(cfgs: Sequence[Config]) -> list[RecordedRollout]:
     """Return recordings of no step, of configurations of one kind of scene."""
     problem = Problem(cfgs)
     return _recordings(cfgs, problem, np.zeros((len(cfgs), 0, problem.simulator.action_dim)))
@@ -208,7 +208,7 @@ def _recordings(
     *,
     motion: bool = False,
     scored: bool = True,
-) -> list[Recording]:
+) -> list[RecordedRollout]:
     """Return recordings of actions, shape [batch, T, A], in all environments of a problem."""
     states, scores = [], []
     for state in _states(problem.simulator, actions):
@@ -216,7 +216,7 @@ def _recordings(
         if scored:
             scores.append(_scores(problem))
     return [
-        Recording(
+        RecordedRollout(
             task=cfg.task.name,
             variant=cfg.variant,
             scene=problem.scenes[number],

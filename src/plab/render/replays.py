@@ -94,7 +94,7 @@ def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
     return groups
 
 
-def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.Recording]:
+def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.RecordedRollout]:
     """Replay all runs of one task; those of the same settings share a simulator."""
     alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
     for folder, files in group.items():
@@ -103,7 +103,7 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.Recording]:
             sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
             kind = json.dumps([*sections, actions.shape])
             alike[kind].append(((folder, name), cfg, actions))
-    made: dict[tuple[Path, str], recording.Recording] = {}
+    made: dict[tuple[Path, str], recording.RecordedRollout] = {}
     for cases in alike.values():
         names = [name for name, _, _ in cases]
         actions = np.stack([actions for _, _, actions in cases])

@@ -24,7 +24,7 @@ from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submis
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
 from plab.targets.store import PHYSICS_VERSION
 
-__all__ = ["Board", "Line", "Section", "board"]
+__all__ = ["Board", "BoardTable", "Line", "board"]
 
 PAPER = Card(
     name="",
@@ -79,7 +79,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Section:
+class BoardTable:
     """A table: all its numbers are of one protocol and one set of targets.
 
     Attributes:
@@ -99,7 +99,7 @@ class Section:
 class Board:
     """All tables, and why some files are in none of them."""
 
-    sections: tuple[Section, ...]
+    sections: tuple[BoardTable, ...]
     left_out: tuple[str, ...]
 
 
@@ -148,7 +148,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
             title += " on its terms" if kind == "authors" else " on the authors' terms"
         protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
         lines = _best_first(tables[kind, terms])
-        sections.append(Section(title, protocol, len(_expected(kind)), lines))
+        sections.append(BoardTable(title, protocol, len(_expected(kind)), lines))
     return Board((*sections, _paper()), tuple(left_out))
 
 
@@ -297,7 +297,7 @@ def _which(row: Row) -> tuple[str, str]:
     return row.values["task"], row.values["variant"]
 
 
-def _paper() -> Section:
+def _paper() -> BoardTable:
     """Return the paper's table, with plab's runs that were judged as it does."""
     table = paper_table("iou_per_configuration")
     lines = []
@@ -317,4 +317,4 @@ def _paper() -> Section:
         f"{PAPER_SEED_COUNT} seeds in the paper, of one seed of plab's runs. Nothing handed in is judged "
         "like this, so that these numbers compare with those of no other table."
     )
-    return Section("The paper's table", protocol, len(_expected("authors")), _best_first(lines))
+    return BoardTable("The paper's table", protocol, len(_expected("authors")), _best_first(lines))

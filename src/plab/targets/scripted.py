@@ -20,6 +20,7 @@ from plab.targets.recipe import EPISODE_STEPS, TargetError
 
 __all__ = [
     "DECIMALS",
+    "ActionTrack",
     "CarryTarget",
     "DentTarget",
     "DrawTarget",
@@ -28,7 +29,6 @@ __all__ = [
     "PushTarget",
     "RollTarget",
     "Script",
-    "Track",
 ]
 
 DRAWS = 200
@@ -45,7 +45,7 @@ class _TooLong(Exception):
     """A way that does not fit into an episode."""
 
 
-class Track:
+class ActionTrack:
     """The actions of one manipulator, built up way by way."""
 
     def __init__(self, manipulator: Manipulator) -> None:
@@ -106,7 +106,7 @@ class Script(ABC):
             raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
         rng = np.random.default_rng(self.seed)
         for _ in range(DRAWS):
-            tracks = [Track(m) for m in scene.manipulators if m.action_dim]
+            tracks = [ActionTrack(m) for m in scene.manipulators if m.action_dim]
             try:
                 self.plan(scene, tracks, rng)
                 return np.concatenate([track.actions() for track in tracks], axis=1)
@@ -117,7 +117,7 @@ class Script(ABC):
         )
 
     @abstractmethod
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """Draw one way for each manipulator that can move."""
 
 
@@ -133,7 +133,7 @@ class PressTarget(Script):
     offset: list[float]
     depth: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
@@ -161,7 +161,7 @@ class DrawTarget(Script):
     margin: float
     depth: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
@@ -201,7 +201,7 @@ class DentTarget(Script):
     azimuth: list[float]
     depth: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
@@ -238,7 +238,7 @@ class RollTarget(Script):
     depth: list[float]
     yaw: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
@@ -268,7 +268,7 @@ class LiftTarget(Script):
     x: list[float]
     z: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         (track, *_) = tracks
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
@@ -292,7 +292,7 @@ class CarryTarget(Script):
     squeeze: list[float]
     press: list[float]
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         base, cargo = scene.bodies[0], scene.bodies[-1]
         tools = [m for m in scene.manipulators if m.action_dim]
@@ -328,7 +328,7 @@ class PushTarget(Script):
     distance: list[float]
     steps: int
 
-    def plan(self, scene: Scene, tracks: list[Track], rng: np.random.Generator) -> None:
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         """See :meth:`Script.plan`."""
         if not 0 < self.legs <= len(scene.bodies):
             raise TargetError(f"target.legs must be in 1 .. {len(scene.bodies)}, not {self.legs}")

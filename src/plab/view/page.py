@@ -17,7 +17,7 @@ from jinja2 import Environment, StrictUndefined
 
 from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, target_mesh
 from plab.render.camera import scene_camera
-from plab.render.recording import Recording
+from plab.render.recording import RecordedRollout
 from plab.render.renderer import BODY_COLORS, INK, PAPER
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices
@@ -37,7 +37,7 @@ _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt")
 
 
-def page(recording: Recording, every: int | None = None) -> str:
+def page(recording: RecordedRollout, every: int | None = None) -> str:
     """Return a page that plays a rollout, below 10 MB whatever its length.
 
     Positions are rounded to 16 bits per domain unit. Of very many particles every second or third is shown.
@@ -82,7 +82,7 @@ def page(recording: Recording, every: int | None = None) -> str:
     return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
 
 
-def _bodies(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
+def _bodies(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
     """Yield the particles of each body."""
     scene = recording.scene
     stride = -(-len(steps) * scene.particle_count // _POSITIONS)
@@ -98,7 +98,7 @@ def _bodies(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
         )
 
 
-def _manipulators(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
+def _manipulators(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
     """Yield the parts of the manipulators."""
     for number, manipulator in enumerate(recording.scene.manipulators):
         for part in manipulator_parts(manipulator):
@@ -109,7 +109,7 @@ def _manipulators(recording: Recording, steps: Sequence[int]) -> Iterator[Any]:
             yield mesh
 
 
-def _ghost(recording: Recording) -> Iterator[Any]:
+def _ghost(recording: RecordedRollout) -> Iterator[Any]:
     """Yield the target, if there is one."""
     if recording.target_mass is not None:
         mesh = _mesh(target_mesh(recording.scene, recording.target_mass), TARGET_COLOR, "target")
@@ -145,7 +145,7 @@ def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
     )
 
 
-def _with_bar(snapshot: str, recording: Recording, camera: Sequence[float], groups: set[str]) -> str:
+def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float], groups: set[str]) -> str:
     """Return K3D-jupyter's page with a title, the bar, and the licences of what is in it."""
     scores = recording.scores
     content = {

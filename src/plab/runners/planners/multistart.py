@@ -15,7 +15,7 @@ from torch import Tensor
 
 from plab.config import MultistartConfig
 from plab.runners.model_state import alike, moments
-from plab.runners.planners.planner import Asking, Planner, Request, Start
+from plab.runners.planners.planner import Asking, CandidateStart, Planner, Request
 
 __all__ = ["Multistart"]
 
@@ -25,7 +25,7 @@ class Multistart(Planner):
 
     method: MultistartConfig
 
-    def __init__(self, method: MultistartConfig, start: Start) -> None:
+    def __init__(self, method: MultistartConfig, start: CandidateStart) -> None:
         """Make places for the candidates."""
         super().__init__(method, start)
         zeros = torch.zeros((method.population, *start.shape), dtype=torch.float64, device=start.device)

@@ -28,7 +28,16 @@ from plab.runners.runner import Runner, Step, Track
 from plab.scene import Scene
 from plab.sim.memory import batch_limit
 
-__all__ = ["Answer", "Asking", "Planner", "PlannerRunner", "Request", "Shown", "Start", "make_planner"]
+__all__ = [
+    "Answer",
+    "Asking",
+    "CandidateStart",
+    "Planner",
+    "PlannerRunner",
+    "Preview",
+    "Request",
+    "make_planner",
+]
 
 
 @dataclass(frozen=True)
@@ -72,17 +81,17 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Preview:
     """What an iteration is told by: actions in [-1, 1], shape [T, A], and what they are measured by."""
 
     actions: Tensor
     measures: dict[str, float]
 
 
-Asking: TypeAlias = Generator[Request, Answer, Shown]
+Asking: TypeAlias = Generator[Request, Answer, Preview]
 
 
-class Start:
+class CandidateStart:
     """Where a run's candidates start from.
 
     Attributes:
@@ -116,7 +125,7 @@ class Planner(ABC):
         iteration: Number of the iteration that is next.
     """
 
-    def __init__(self, method: PlannerConfig, start: Start) -> None:
+    def __init__(self, method: PlannerConfig, start: CandidateStart) -> None:
         """Take note of what to do; nothing is drawn yet."""
         self.method, self.start = method, start
         self.memory: dict[str, Tensor] = {}
@@ -152,13 +161,13 @@ class Planner(ABC):
         self.iteration += 1
         return shown
 
-    def show(self, actions: Tensor, answer: Answer) -> Shown:
+    def show(self, actions: Tensor, answer: Answer) -> Preview:
         """Return the best of some candidates, by what they gave in the hard contact model."""
         cost = answer.cost("score")
         best = int(cost.argmin())
         if "champion" not in self.memory or bool(cost[best] < self.memory["cost"]):
             self.memory |= {"champion": actions[best].clone(), "cost": cost[best].clone()}
-        return Shown(actions[best], {name: float(values[best]) for name, values in answer.measures.items()})
+        return Preview(actions[best], {name: float(values[best]) for name, values in answer.measures.items()})
 
     def state(self) -> dict[str, Any]:
         """Return everything that the next iterations depend on, as arrays and numbers."""
@@ -188,7 +197,7 @@ class Planner(ABC):
         return {"champion": self.start.shape, "cost": ()}
 
 
-def make_planner(method: MethodConfig, start: Start) -> Any:
+def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
     """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
     return family(method.family).rule(getattr(method, "algorithm"), type)(method, start)  # noqa: B009
 
@@ -220,7 +229,7 @@ class PlannerRunner(Runner):
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the run's planner, as the file knows it if it does."""
         number = track.number
-        start = Start(self.problem.scenes[number], self.problem.target_mass[number], self._device)
+        start = CandidateStart(self.problem.scenes[number], self.problem.target_mass[number], self._device)
         self._planners[number] = make_planner(track.cfg.method, start)
         if state is not None:
             self._planners[number].restore(state)
@@ -235,7 +244,7 @@ class PlannerRunner(Runner):
         spent = {track: {False: 0, True: 0} for track in tracks}
         asking = {track: self._planners[track.number].plan(self._random(track)) for track in tracks}
         pending = {track: next(walk) for track, walk in asking.items()}
-        shown: dict[Track, Shown] = {}
+        shown: dict[Track, Preview] = {}
         while pending:
             first = next(iter(pending.values()))
             together = {track: request for track, request in pending.items() if _alike(request, first)}

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from plab.config import StagesConfig
-from plab.runners.planners.planner import Asking, Planner, Start, make_planner
+from plab.runners.planners.planner import Asking, CandidateStart, Planner, make_planner
 
 __all__ = ["Stages"]
 
@@ -23,7 +23,7 @@ __all__ = ["Stages"]
 class Stages:
     """Does what a planner does, by the stage that it is in."""
 
-    def __init__(self, method: StagesConfig, start: Start) -> None:
+    def __init__(self, method: StagesConfig, start: CandidateStart) -> None:
         """Stand before the first stage."""
         self._methods, self._start = list(method.stages.values()), start
         self._enter(0)

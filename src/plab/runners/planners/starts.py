@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from plab.scene import MANIPULATOR_SHAPES, ROLL_RADIUS, Manipulator, Scene, sample_particles
-from plab.targets.scripted import Track
+from plab.targets.scripted import ActionTrack
 
 __all__ = ["ContactStarts", "support"]
 
@@ -115,7 +115,7 @@ class ContactStarts:
         for tool in self._tools:
             k = rng.choice(len(points), p=lengths**2 / (lengths**2).sum())
             direction = ways[k] / lengths[k]
-            track = Track(tool)
+            track = ActionTrack(tool)
             track.go(_action(tool, self._to_touch(tool, points[body == body[k]], points[k], direction)))
             left = max(1, int((self._scene.horizon - len(track)) * rng.uniform(0.5, 1.0)))
             track.go(_action(tool, rng.uniform(*OVERSHOOT) * ways[k]), left)
@@ -128,7 +128,7 @@ class ContactStarts:
         press, tracks = rng.uniform(*PRESS), []
         for tool in self._tools:
             own = points[body == self._owner(tool)]
-            track = Track(tool)
+            track = ActionTrack(tool)
             if not MANIPULATOR_SHAPES[tool.shape].grips:
                 offset = own.mean(0) - np.asarray(tool.position)
                 direction = offset / np.linalg.norm(offset)
@@ -163,7 +163,7 @@ class ContactStarts:
         place = np.clip(met - support(tool, direction) * direction, tool.lower_bound, tool.upper_bound)
         return place - np.asarray(tool.position)
 
-    def _actions(self, tracks: Sequence[Track]) -> np.ndarray:
+    def _actions(self, tracks: Sequence[ActionTrack]) -> np.ndarray:
         return np.concatenate([track.first(self._scene.horizon) for track in tracks], axis=1)
 
 

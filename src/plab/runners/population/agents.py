@@ -17,7 +17,7 @@ from plab.families import family
 from plab.runners.population.draws import Block, Draws
 from plab.runners.population.graphs import CapturedUpdate
 from plab.runners.population.networks import Networks, fill, flat
-from plab.runners.population.replay import Replay, Sizes
+from plab.runners.population.replay import ReplayBuffer, Sizes
 from plab.runners.rl_models import Spaces, model_kind, total_steps
 
 __all__ = ["Agents", "OffPolicyAgents", "first_policy", "trained_policy"]
@@ -181,7 +181,7 @@ class OffPolicyAgents(Agents):
         super().__init__(cfgs, spaces, device)
         window = max(self.method.buffer_size // self.sizes.envs, 1)
         capacity = self.sizes.capacity(self.method, self.total_steps)
-        self.replay = Replay(self.count, self.sizes, capacity, window, device)
+        self.replay = ReplayBuffer(self.count, self.sizes, capacity, window, device)
         explored = self.sizes.envs, self.sizes.actions
         self._anything = self._block(self.draws.uniform, *explored)
         self._noise = self._block(self.draws.normal, *explored)

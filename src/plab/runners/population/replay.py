@@ -15,7 +15,7 @@ from plab.config import OffPolicyConfig
 from plab.results import ResultsError
 from plab.results.files import cause
 
-__all__ = ["Replay", "Samples", "Sizes", "require_file"]
+__all__ = ["ReplayBuffer", "Samples", "Sizes", "require_file"]
 
 
 class Sizes(NamedTuple):
@@ -48,7 +48,7 @@ class Samples(NamedTuple):
     rewards: Tensor
 
 
-class Replay:
+class ReplayBuffer:
     """The transitions of K agents that stand at the same step; each observation is stored once.
 
     Attributes:

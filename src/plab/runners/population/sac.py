@@ -67,8 +67,8 @@ class SacAgents(OffPolicyAgents):
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets from some transitions, see
-        :meth:`plab.runners.population.replay.Replay.sample`, with standard normal noise of the actions and
-        of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
+        :meth:`plab.runners.population.replay.ReplayBuffer.sample`, with standard normal noise of the actions
+        and of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)
         own_actions, log_prob = self._drawn(observations, noise)

@@ -62,7 +62,7 @@ class Td3Agents(OffPolicyAgents):
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update the critics from some transitions, see
-        :meth:`plab.runners.population.replay.Replay.sample`, with standard normal noise of the target
+        :meth:`plab.runners.population.replay.ReplayBuffer.sample`, with standard normal noise of the target
         policy, shape [agent, row, action]; losses of shape [1, agent]."""
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
