@@ -86,7 +86,7 @@ build: $(VENV)/.dev.stamp
 	$(BIN)/python -m build
 	PYTHON=$(BIN)/python tools/check_wheel.sh
 
-# What sim/cuda_global.py and sim/cpu_bitcode.py call, as LLVM's bitcode.
+# What sim/cuda_bitcode.py and sim/cpu_bitcode.py call.
 bitcode: $(VENV)/.dev.stamp
 	$(BIN)/python tools/bitcode.py
 

@@ -1,20 +1,21 @@
-"""Write the bitcode that Taichi links into its kernels: what is assembled of src/plab/sim/cuda_global.ll, and
-for CPUs what tools/stencils.py and tools/material.py make.
+"""Write the bitcode that Taichi links into its kernels: for CUDA what is assembled of tools/cuda_global.ll
+and what tools/particle.py makes, for CPUs what tools/stencils.py and tools/material.py make.
 
-CPUs have a file for each platform, whose data layouts differ; their names end in a digest, since Taichi's
-cache knows bitcode by the name of its file.
+CPUs have a file for each platform, whose data layouts differ. Names end in a digest, since Taichi's cache
+knows bitcode by the name of its file.
 """
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import llvmlite.binding as llvm
 from llvmlite import ir
 from material import MATERIAL, tracing
+from particle import PARTICLE
 from stencils import STENCILS
 
-SIM = Path(__file__).parents[1] / "src/plab/sim"
-SOURCE = SIM / "cuda_global.ll"
+FOLDER = Path(__file__).parents[1] / "src/plab/sim/bitcode"
 
 X86 = "p270:32:32-p271:32:32-p272:64:64-i64:64-f80:128-n8:16:32:64-S128"
 LAYOUTS = {
@@ -26,33 +27,33 @@ LAYOUTS = {
 """Data layouts of the platforms that Taichi has wheels for."""
 
 
-def bitcode(layout: str) -> bytes:
-    """All functions for a data layout."""
+def assembled(makers: Iterable, layout: str = "") -> llvm.ModuleRef:
+    """What makes functions, made for both precisions, for a data layout."""
     module = ir.Module("plab")
     module.data_layout = layout
     with tracing():
         for real, ending in ((ir.FloatType(), "f32"), (ir.DoubleType(), "f64")):
-            for make in (*STENCILS, *MATERIAL):
+            for make in makers:
                 make(module, f"{make.__name__}_{ending}", real)
-    text = str(module).replace('target triple = "unknown-unknown-unknown"\n', "")
-    parsed = llvm.parse_assembly(text)
-    parsed.verify()
-    return parsed.as_bitcode()
+    return llvm.parse_assembly(str(module).replace('target triple = "unknown-unknown-unknown"\n', ""))
 
 
 def files() -> dict[str, bytes]:
     """Names of all files, and what is in them."""
-    made = {platform: bitcode(layout) for platform, layout in LAYOUTS.items()}
-    return {f"{name}-{hashlib.sha256(code).hexdigest()[:8]}.bc": code for name, code in made.items()}
+    modules = {name: assembled((*STENCILS, *MATERIAL), layout) for name, layout in LAYOUTS.items()}
+    source = Path(__file__).with_name("cuda_global.ll").read_text(encoding="utf-8")
+    modules["cuda"] = llvm.parse_assembly(source)
+    modules["cuda"].link_in(assembled(PARTICLE))
+    made = {}
+    for name, module in modules.items():
+        module.verify()
+        code = module.as_bitcode()
+        made[f"{name}-{hashlib.sha256(code).hexdigest()[:8]}.bc"] = code
+    return made
 
 
 if __name__ == "__main__":
-    module = llvm.parse_assembly(SOURCE.read_text(encoding="utf-8"))
-    module.verify()
-    SOURCE.with_suffix(".bc").write_bytes(module.as_bitcode())
-    made = files()
-    (SIM / "bitcode").mkdir(exist_ok=True)
-    for old in (SIM / "bitcode").glob("*.bc"):
+    for old in FOLDER.glob("*.bc"):
         old.unlink()
-    for name, code in made.items():
-        (SIM / "bitcode" / name).write_bytes(code)
+    for name, code in files().items():
+        (FOLDER / name).write_bytes(code)

@@ -1,7 +1,8 @@
 """The material of a tile of particles for LLVM: what :mod:`plab.sim.material` computes, lanes in vectors.
 
-The functions of that module take components of any kind, so here they are called with LLVM's vectors, which
-write down the instructions that they meet. Products and sums may be fused, which Taichi does not let LLVM do.
+The functions of that module take components of any kind, so here they are called with LLVM's numbers, which
+write down the instructions that they meet. Products and sums may be fused, which Taichi does not let LLVM do
+on CPUs.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from plab.sim.storage import (
     STRAIN_Z,
 )
 
-__all__ = ["MATERIAL"]
+__all__ = ["MATERIAL", "Lanes", "series_of", "served", "tracing"]
 
 
 class Lanes:
-    """A vector of lanes: operators write an instruction each."""
+    """A vector of lanes, or one number: operators write an instruction each."""
 
     def __init__(self, code: Code, value: ir.Value) -> None:
         self.code, self.value = code, value
@@ -120,12 +121,26 @@ def _traceable(one: Any) -> bool:
     return getattr(one, "_is_taichi_function", False)
 
 
+def series_of(real: ir.Type) -> series.Series:
+    """The series of a precision."""
+    return series.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
+
+
+def served(one: Any, j: Lanes, z_squared: Lanes) -> ir.Value:
+    """Whether the series serve J and |Z|^2, in all lanes."""
+    code = one.code
+    above = code.below(z_squared.value, one.number("z_squared_max").value, equal=True)
+    low = code.below(one.number("j_min").value, j.value, equal=True)
+    high = code.below(j.value, one.number("j_max").value, equal=True)
+    return code.all_of(above, low, high)
+
+
 class Tile:
     """A tile's entries among the strains, and others' lane vectors."""
 
     def __init__(self, module: ir.Module, name: str, real: ir.Type, addresses: str, numbers: str) -> None:
         self.code = Code(module, name, real, f"strains {addresses}", numbers, grid=False)
-        self.series = series.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
+        self.series = series_of(real)
 
     def number(self, name: str) -> Lanes:
         """A number, the same for all lanes."""
@@ -146,11 +161,7 @@ class Tile:
         g = material.trial_gradient(c, f, self.number("dt"))
         j = linalg.det(g)
         found = material.hencky_strain(g, j, self.series)
-        code = self.code
-        above = code.below(found[3].value, self.number("z_squared_max").value, equal=True)
-        low = code.below(self.number("j_min").value, j.value, equal=True)
-        high = code.below(j.value, self.number("j_max").value, equal=True)
-        code.put("served", code.all_of(above, low, high))
+        self.code.put("served", served(self, j, found[3]))
         return c, g, j, found
 
     def parameters(self) -> list[Lanes]:

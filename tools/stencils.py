@@ -74,9 +74,10 @@ class Code:
         return self._b.fneg(a)
 
     def root(self, a: ir.Value) -> ir.Value:
-        """Square roots of a vector."""
+        """Square roots."""
         kind = ir.FunctionType(a.type, [a.type])
-        name = f"llvm.sqrt.v{LANE}{'f32' if isinstance(self.real, ir.FloatType) else 'f64'}"
+        wide = f"v{LANE}" if isinstance(a.type, ir.VectorType) else ""
+        name = f"llvm.sqrt.{wide}{'f32' if isinstance(self.real, ir.FloatType) else 'f64'}"
         known = self._b.module.globals.get(name)
         return self._b.call(known or ir.Function(self._b.module, kind, name), [a])
 

@@ -5,19 +5,13 @@ It takes addresses: of a node in a grid, of one particle's number in the first o
 tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
 """
 
-import os
 import platform
 import sys
-from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import taichi as ti
 from taichi.lang.impl import get_runtime
-from taichi.lang.source_builder import SourceBuilder
 
-from plab.cache import cache_dir
+from plab.sim.bitcode import Bitcode
 
 __all__ = [
     "address_of",
@@ -34,33 +28,7 @@ __all__ = [
 ]
 
 
-def _file() -> str:
-    """Return where this platform's bitcode is: a copy in plab's cache folder, if that can be written to.
-    Taichi knows compiled kernels by that place, which is then the same for all environments and checkouts."""
-    name = f"{sys.platform}-{platform.machine().lower()}"
-    for path in (Path(__file__).parent / "bitcode").glob(f"{name}-*.bc"):
-        code = path.read_bytes()
-        # RuntimeError: there is no home.
-        with suppress(OSError, RuntimeError):
-            copied = cache_dir() / path.name
-            if not copied.exists() or copied.read_bytes() != code:
-                copied.parent.mkdir(parents=True, exist_ok=True)
-                own = copied.with_name(f"{path.name}.{os.getpid()}")
-                own.write_bytes(code)
-                own.replace(copied)
-            return str(copied)
-        return str(path)
-    raise ImportError(f"plab's simulator has no code for {name}: `make bitcode` has to learn its data layout")
-
-
-_BITCODE = SourceBuilder()
-_BITCODE.bc, _BITCODE.mode = _file(), "bc"
-
-
-def _function(name: str, real: Any) -> Callable[..., None]:
-    """Return one of the bitcode's functions, for numbers of a type."""
-    found: Callable[..., None] = getattr(_BITCODE, f"{name}_{'f32' if real == ti.f32 else 'f64'}")
-    return found
+_function = Bitcode(f"{sys.platform}-{platform.machine().lower()}")
 
 
 def address_of(array: ti.Ndarray) -> int:

@@ -11,20 +11,8 @@ from typing import Any
 
 import taichi as ti
 
+from plab.sim.cuda_bitcode import gather_sums, particle, particle_adjoint
 from plab.sim.cuda_order import OrderPhases
-from plab.sim.linalg import det
-from plab.sim.material import (
-    flow,
-    flow_adjoint,
-    hencky_strain,
-    log_adjoint,
-    parameter_adjoint,
-    strain_adjoint,
-    stress,
-    stress_adjoint,
-    trial_gradient,
-    yield_factor,
-)
 from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7, with_unit_rotation
 from plab.sim.shapes import signed_distance
@@ -91,58 +79,6 @@ class CudaPhases(OrderPhases, PosePhases):
         return m0, mx, my, mz
 
     @ti.func
-    def moments_adjoint(
-        self,
-        velocity: ti.template(),
-        momentum_bar: ti.template(),
-        node,
-        w: ti.template(),
-        dw: ti.template(),
-        q: ti.template(),
-        h: ti.template(),
-    ):
-        """What a particle's adjoint needs of the grid, in registers: moments of momentum_bar as in
-        :meth:`moments`, and the sum over nodes of grad_f w (momentum_bar . q + velocity . h), a 3-vector.
-
-        ``q`` and ``h`` are the affine fields that are scattered, of the momentum with the mass at the end,
-        and of the velocity's adjoint with 0 there: value at the base node and increments along x, y, z.
-        """
-        m0 = ti.Vector([0.0, 0.0, 0.0, 0.0])
-        mx = m0
-        my = m0
-        mz = m0
-        slope = w[0] * 0.0
-        for i in ti.static(range(3)):
-            for j in ti.static(range(3)):
-                row = node + (i * self.axis + j) * self.axis
-                qj = q[0] + float(i) * q[1] + float(j) * q[2]
-                hj = h[0] + float(i) * h[1] + float(j) * h[2]
-                along = w[0][0] * 0.0
-                across = w[0][0] * 0.0
-                s0 = m0 * 0.0
-                s1 = m0 * 0.0
-                for k in ti.static(range(3)):
-                    p = self.node4(momentum_bar, row + k)
-                    chi = p.dot(qj + float(k) * q[3]) + self.node4(velocity, row + k).dot(
-                        hj + float(k) * h[3]
-                    )
-                    across += w[k][2] * chi
-                    along += dw[k][2] * chi
-                    wp = w[k][2] * p
-                    s0 += wp
-                    if ti.static(k > 0):
-                        s1 += float(k) * wp
-                wij = w[i][0] * w[j][1]
-                slope += ti.Vector([dw[i][0] * w[j][1] * across, w[i][0] * dw[j][1] * across, wij * along])
-                m0 += wij * s0
-                mz += wij * s1
-                if ti.static(i > 0):
-                    mx += (float(i) * wij) * s0
-                if ti.static(j > 0):
-                    my += (float(j) * wij) * s0
-        return m0, mx, my, mz, slope
-
-    @ti.func
     def gather_particle(self, state: ti.template(), source, target, lane, e, time):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         x = self.vector(state, source, lane)
@@ -166,7 +102,9 @@ class CudaPhases(OrderPhases, PosePhases):
         w = spline(fx)
         dw = spline_slope(fx)
         node = e * self.nodes + self.linear(base)
-        m0, mx, my, mz, slope = self.moments_adjoint(self.velocity, self.momentum_bar, node, w, dw, q, h)
+        velocity = self.node_address(self.velocity, node)
+        momentum = self.node_address(self.momentum_bar, node)
+        m0, mx, my, mz, slope = gather_sums(self.real, velocity, momentum, self.axis, w, dw, q, h)
         c_bar = self.load(bar, target + AT_C, lane, 9)
         return self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, fx, m0, mx, my, mz, slope)
 
@@ -248,29 +186,26 @@ class CudaPhases(OrderPhases, PosePhases):
     # -- material ------------------------------------------------------------------------------------
 
     @ti.func
+    def material_numbers(self, p: ti.template()):
+        """What bitcode takes of the material with a particle's parameters."""
+        # Return mapping's factor is 1 at most.
+        bound = ti.static(1.0 if self.skips.flow else 2.0)
+        most, low, high = self.series.z_squared_max, self.series.j_min, self.series.j_max
+        return [p[0], p[1], p[2], self.dt, self.stress_scale, self.mass, most, low, high, bound]
+
+    @ti.func
     def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle; returns A, row by row."""
         out = ti.Vector.zero(self.real, 9)
-        p = self.parameters_of_particle(e, source, lane)
+        numbers = self.material_numbers(self.parameters_of_particle(e, source, lane))
         c = self.load(state, source + AT_C, lane, 9)
         f = self.load(state, source + AT_F, lane, 9)
-        g = trial_gradient(c, f, self.dt)
-        j = det(g)
-        c2, _w, _z, z2, _a1, _a2, d = hencky_strain(g, j, self.series)
-        _q, _det, _norm, k = yield_factor(d, p[2])
-        if self.served(z2, j):
-            tau = stress(d, j, c2, p[0], p[1], p[2], self.series)
-            a = self.stress_and_momentum(tau, c)
+        a, f_new, served = particle(self.real, c, f, numbers)
+        if served:
             for i in ti.static(range(9)):
                 out[i] = a[i]
-            if ti.static(update):
-                if self.flows(k):
-                    f_new = flow(d, g, p[2], self.series)
-                    for i in ti.static(range(9)):
-                        state[target + AT_F + i][lane] = f_new[i]
-                else:
-                    for i in ti.static(range(9)):
-                        state[target + AT_F + i][lane] = g[i]
+                if ti.static(update):
+                    state[target + AT_F + i][lane] = f_new[i]
         else:
             out = self.spectral_material(state, source, target, lane, e, update)
         return out
@@ -280,34 +215,19 @@ class CudaPhases(OrderPhases, PosePhases):
         self, state: ti.template(), source, bar: ti.template(), target, a_bar: ti.template(), lane, e
     ):
         """:meth:`material_tile_adjoint` for one particle, given the adjoint of A."""
-        p = self.parameters_of_particle(e, source, lane)
+        numbers = self.material_numbers(self.parameters_of_particle(e, source, lane))
         c = self.load(state, source + AT_C, lane, 9)
         f = self.load(state, source + AT_F, lane, 9)
-        g_bar = self.load(bar, target + AT_F, lane, 9)
-        g = trial_gradient(c, f, self.dt)
-        j = det(g)
-        c2, w, z, z2, a1, a2, d = hencky_strain(g, j, self.series)
-        if self.served(z2, j):
-            tau_bar = self.stress_symmetric(a_bar)
-            d_bar, k_bar, c2_bar, j_bar = stress_adjoint(d, j, c2, tau_bar, p[0], p[1], p[2], self.series)
-            _q, _det, _norm, k = yield_factor(d, p[2])
-            if self.flows(k):
-                d_flow, k_flow, g_flow = flow_adjoint(d, g, g_bar, p[2], self.series)
-                k_bar += k_flow
-                for i in ti.static(range(6)):
-                    d_bar[i] += d_flow[i]
-                for i in ti.static(range(9)):
-                    g_bar[i] = g_flow[i]
+        f_bar = self.load(bar, target + AT_F, lane, 9)
+        c_out, f_out, p_bar, served = particle_adjoint(self.real, c, f, a_bar, f_bar, numbers)
+        if served:
             if ti.static(self.full_gradient):
-                mu_bar, lam_bar, yield_bar = parameter_adjoint(d, j, c2, tau_bar, k_bar, p[2], self.series)
                 if ti.static(self.mixed):
-                    self.accumulate_particle(e, source, lane, mu_bar, lam_bar, yield_bar)
+                    self.accumulate_particle(e, source, lane, p_bar[0], p_bar[1], p_bar[2])
                 else:
-                    self.accumulate_material(e, mu_bar, lam_bar, yield_bar)
-            z_bar = log_adjoint(z, a1, a2, d, d_bar, k_bar, p[2], self.series)
-            c_out, f_out = strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, self.dt)
+                    self.accumulate_material(e, p_bar[0], p_bar[1], p_bar[2])
             for i in ti.static(range(9)):
-                bar[target + AT_C + i][lane] = c_out[i] + self.mass * a_bar[i]
+                bar[target + AT_C + i][lane] = c_out[i]
                 bar[target + AT_F + i][lane] = f_out[i]
         else:
             self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)

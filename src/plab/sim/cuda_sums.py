@@ -10,7 +10,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.cuda_global import add_f32, add_f64, add_i64
+from plab.sim.cuda_bitcode import add_f32, add_f64, add_i64
 from plab.sim.storage import Storage
 
 __all__ = ["SumPhases"]
@@ -48,7 +48,7 @@ class SumPhases(Storage):
     adjoint_bound: ti.Field
 
     def scattered_grid(self, nodes: int) -> ti.Field:
-        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_node` adds to it."""
+        """Allocate a grid of 4-vectors that particles scatter to: :meth:`add_to_grid` adds to it."""
         return ti.Vector.field(4, ti.i64 if self.deterministic else self.real, shape=nodes)
 
     def sums(self, count: int) -> ti.Field:
@@ -96,21 +96,25 @@ class SumPhases(Storage):
 
     # -- grids --------------------------------------------------------------------------------------
 
+    @property
+    def node_bytes(self) -> int:
+        """Bytes of a node of a grid that is scattered to."""
+        return 16 if self.real == ti.f32 and not self.deterministic else 32
+
     @ti.func
-    def add_to_node(self, first, node, component, value, scale: ti.template()):
-        """Add to a component of a grid that is scattered to, whose ``first`` number is at an address.
+    def add_to_grid(self, corner, number, component, value, scale: ti.template()):
+        """Add to a number of a grid that is scattered to, counted from that at an address, ``corner``.
 
         ``scale`` is a 4-vector of how many of the components' units make 1, as :meth:`momentum_scale` and
         :meth:`adjoint_scale` return them.
         """
-        # In 64 bits: 32 count the nodes of many environments, but not their numbers.
-        place = 4 * ti.cast(node, ti.u64) + ti.cast(component, ti.u64)
+        place = ti.cast(ti.cast(number, ti.u32), ti.u64)
         if ti.static(self.deterministic):
-            add_i64(first + 8 * place, value * ti.select(component == 3, scale[3], scale[0]))
+            add_i64(corner + 8 * place, value * ti.select(component == 3, scale[3], scale[0]))
         elif ti.static(self.real == ti.f32):
-            add_f32(first + 4 * place, value)
+            add_f32(corner + 4 * place, value)
         else:
-            add_f64(first + 8 * place, value)
+            add_f64(corner + 8 * place, value)
 
     @ti.func
     def momentum_scale(self, power: ti.template()):

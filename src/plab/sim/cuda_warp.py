@@ -10,7 +10,7 @@ import taichi as ti
 
 from plab.sim.cuda_sums import SumPhases
 from plab.sim.grid_phases import GridPhases
-from plab.sim.particle_phases import ParticlePhases
+from plab.sim.particle_phases import SIZES, ParticlePhases
 from plab.sim.storage import BLOCK_BITS
 from plab.sim.term_phases import TermPhases
 
@@ -106,6 +106,11 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         return out
 
     @ti.func
+    def node_address(self, grid: ti.template(), node):
+        """Address of a node of a gathered grid."""
+        return ti.get_addr(grid, 0) + ti.static(4 * SIZES[self.real]) * ti.cast(node, ti.u64)
+
+    @ti.func
     def node_slope(self, grid: ti.template(), node):
         """The last component at a node of a gathered grid."""
         out = ti.cast(0.0, self.real)
@@ -153,7 +158,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     def take_nodes(self, grid: ti.template(), shared: ti.template(), w, e, block, r, unit: ti.template()):
         """Read and clear 32 nodes, one for each lane of a warp, through ``WARP_BLOCK * NODE_STRIDE`` numbers
         of shared memory; the warp's numbers ``r`` in the block follow each other from a multiple of 32.
-        ``unit`` has the units of the components, see :meth:`add_to_node`."""
+        ``unit`` has the units of the components, see :meth:`add_to_grid`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
         for turn in ti.static(range(4)):
@@ -275,39 +280,41 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         warp must take part. The field's fourth component is the same at all nodes.
 
         What each lane's particle gives goes to shared memory, ``rows`` for ``BLOCK_WARPS * WARP_NUMBERS``
-        numbers. Then the lanes are the 27 nodes of a run's stencil, and each sums what the run's particles
-        give to its node. The sums change lanes once more, so that neighbours add neighbouring numbers to the
-        grid: the device takes up to 8 of them at once. ``heads`` and ``taking`` are those of :meth:`heads_of`
-        for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_node`. If ``folded``, nodes are
-        those of :meth:`folded_node`; ``folds`` has a bit for each axis along which the base node is the
-        first.
+        numbers. Then the lanes are the components of the nine columns of a run's stencil, and each sums what
+        the run's particles give to its three nodes. The sums change lanes once more, so that neighbours add
+        neighbouring numbers to the grid: the device takes up to 8 of them at once. ``heads`` and ``taking``
+        are those of :meth:`heads_of` for the base nodes, ``node``; ``scale`` is that of :meth:`add_to_grid`.
+        If ``folded``, nodes are those of :meth:`folded_node`; ``folds`` has a bit for each axis along which
+        the base node is the first.
         """
         lane = q % WARP
         corner = ti.cast(q % WARP_BLOCK // WARP * WARP_NUMBERS, ti.i32)
         width = ti.static(len(components))
         sloping = ti.static([c for c in components if c < 3])
-        plane = ti.static(width + 2 * len(sloping))
+        last = ti.static(3 * len(sloping))
+        plane = ti.static(last + (1 if 3 in components else 0))
         own = within(corner + lane * ROW_STRIDE)
         for i in ti.static(range(3)):
-            for c in ti.static(range(width)):
-                value = field[0][components[c]]
-                if ti.static(i > 0 and components[c] < 3):
-                    value += float(i) * field[1][components[c]]
-                rows[own + plane * i + c] = w[i][0] * value
-            for c in ti.static(range(len(sloping))):
-                rows[own + plane * i + width + 2 * c] = w[i][0] * field[2][sloping[c]]
-                rows[own + plane * i + width + 2 * c + 1] = w[i][0] * field[3][sloping[c]]
+            for c in ti.static(sloping):
+                rows[own + plane * i + 3 * c] = w[i][0] * (field[0][c] + float(i) * field[1][c])
+                rows[own + plane * i + 3 * c + 1] = w[i][0] * field[2][c]
+                rows[own + plane * i + 3 * c + 2] = w[i][0] * field[3][c]
+            if ti.static(3 in components):
+                rows[own + plane * i + last] = w[i][0] * field[0][3]
             for j in ti.static(range(3)):
                 rows[own + 3 * plane + 3 * i + j] = w[i][1] * w[j][2]
         self.wait_for_warp()
-        # Lanes beyond the last node do as that does.
+        # A lane is a column of three nodes along z with one of three components, and one of these nodes with
+        # the fourth component. Lanes beyond the last do as that does.
         place = ti.cast(ti.min(lane, 26), ti.u32)
-        i, j, k = place // 9, place // 3 % 3, place % 3
-        y, z = ti.cast(j, self.real), ti.cast(k, self.real)
-        from_plane = corner + plane * ti.cast(i, ti.i32)
-        from_share = corner + 3 * plane + ti.cast(3 * j + k, ti.i32)
+        i, j = ti.cast(place // 9, ti.i32), ti.cast(place // 3 % 3, ti.i32)
+        k = ti.cast(place % 3, ti.i32)
+        y = ti.cast(j, self.real)
+        from_plane = corner + plane * i
+        from_field = from_plane + 3 * k
+        from_share = corner + 3 * plane + 3 * j
         sums = corner + WARP * ROW_STRIDE
-        to = within(sums + ti.cast(place, ti.i32) * width)
+        column = 9 * i + 3 * j
         first = ti.get_addr(grid, 0)
         rest = heads
         while rest != 0:
@@ -315,19 +322,32 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
             rest &= rest - 1
             if rest != 0:
                 end = self.lowest_bit(rest)
-            total = ti.Vector.zero(self.real, width)
+            total = ti.Vector.zero(self.real, 4)
             for p in range(begin, end):
-                share = rows[within(from_share + p * ROW_STRIDE)]
-                at = within(from_plane + p * ROW_STRIDE)
-                for c in ti.static(range(width)):
-                    value = rows[at + c]
-                    if ti.static(components[c] < 3):
-                        value += y * rows[at + width + 2 * c] + z * rows[at + width + 2 * c + 1]
-                    total[c] += share * value
-            for c in ti.static(range(width)):
-                rows[to + c] = total[c]
+                row = p * ROW_STRIDE
+                at = within(from_share + row)
+                shares = ti.Vector([rows[at], rows[at + 1], rows[at + 2]])
+                if ti.static(len(sloping) > 0):
+                    at = within(from_field + row)
+                    value = rows[at] + y * rows[at + 1]
+                    slope = rows[at + 2]
+                    total[0] += shares[0] * value
+                    value += slope
+                    total[1] += shares[1] * value
+                    value += slope
+                    total[2] += shares[2] * value
+                if ti.static(3 in components):
+                    share = ti.select(k == 0, shares[0], ti.select(k == 1, shares[1], shares[2]))
+                    total[3] += share * rows[within(from_plane + row) + last]
+            if ti.static(len(sloping) > 0):
+                for c in ti.static(range(3)):
+                    rows[within(sums + (column + c) * width + k)] = total[c]
+            if ti.static(3 in components):
+                rows[within(sums + (column + k) * width + width - 1)] = total[3]
             self.wait_for_warp()
             head = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), node, begin)
+            # In 64 bits: 32 count the nodes of many environments, but not their numbers.
+            base = first + ti.static(self.node_bytes) * ti.cast(head, ti.u64)
             least = ti.Vector([0, 0, 0])
             if ti.static(folded):
                 bits = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), folds, begin)
@@ -341,5 +361,5 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                         offset = ti.max(offset, least)
                     component = ti.static(components[0]) + number % width
                     share = rows[within(sums + number)]
-                    self.add_to_node(first, head + self.linear(offset), component, share, scale)
+                    self.add_to_grid(base, 4 * self.linear(offset) + component, component, share, scale)
             self.wait_for_warp()

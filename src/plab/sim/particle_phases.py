@@ -3,11 +3,18 @@ adjoints."""
 
 import taichi as ti
 
-from plab.sim.spectral import spectral_parameter_adjoint, spectral_return_map, spectral_return_map_adjoint
+from plab.sim.spectral import (
+    product,
+    product_nt,
+    product_tn,
+    spectral_parameter_adjoint,
+    spectral_return_map,
+    spectral_return_map_adjoint,
+)
 from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
 
-__all__ = ["ParticlePhases"]
+__all__ = ["SIZES", "ParticlePhases"]
 
 SIZES = {ti.f32: 4, ti.f64: 8}
 """Bytes of a number."""
@@ -176,7 +183,7 @@ class ParticlePhases(Storage):
         p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + AT_C, lane, 9))
         f = as_matrix(self.load(state, source + AT_F, lane, 9))
-        f_new, tau = spectral_return_map(f + self.dt * (c @ f), p[0], p[1], p[2])
+        f_new, tau = spectral_return_map(f + self.dt * product(c, f), p[0], p[1], p[2])
         out = ti.Vector.zero(self.real, 9)
         for i in ti.static(range(9)):
             if ti.static(update):
@@ -204,7 +211,7 @@ class ParticlePhases(Storage):
         a_bar = as_matrix(a_bar9)
         tau_bar = (0.5 * self.stress_scale) * (a_bar + a_bar.transpose())
         tiny = ti.static(3e-3 if self.real == ti.f32 else 1e-5)
-        g = f + self.dt * (c @ f)
+        g = f + self.dt * product(c, f)
         g_bar = spectral_return_map_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2], tiny)
         if ti.static(self.full_gradient):
             mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
@@ -212,8 +219,8 @@ class ParticlePhases(Storage):
                 self.accumulate_particle(grid_index, target, lane, mu_bar, lam_bar, yield_bar)
             else:
                 self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
-        c_bar = self.dt * (g_bar @ f.transpose()) + self.mass * a_bar
-        f_bar = g_bar + self.dt * (c.transpose() @ g_bar)
+        c_bar = self.dt * product_nt(g_bar, f) + self.mass * a_bar
+        f_bar = g_bar + self.dt * product_tn(c, g_bar)
         for i in ti.static(range(9)):
             bar[target + AT_C + i][lane] = c_bar[i // 3, i % 3]
             bar[target + AT_F + i][lane] = f_bar[i // 3, i % 3]

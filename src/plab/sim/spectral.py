@@ -13,6 +13,9 @@ from plab.sim.material import NORM_SHIFT
 
 __all__ = [
     "SINGULAR_VALUE_MIN",
+    "product",
+    "product_nt",
+    "product_tn",
     "spectral_parameter_adjoint",
     "spectral_return_map",
     "spectral_return_map_adjoint",
@@ -21,6 +24,40 @@ __all__ = [
 
 SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
+
+
+# Taichi's own products of matrices take it several times as long to compile.
+
+
+@ti.func
+def product(a: ti.template(), b: ti.template()):
+    """A B."""
+    return ti.Matrix(
+        [[a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] for j in range(3)] for i in range(3)]
+    )
+
+
+@ti.func
+def product_tn(a: ti.template(), b: ti.template()):
+    """A^T B."""
+    return ti.Matrix(
+        [[a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j] for j in range(3)] for i in range(3)]
+    )
+
+
+@ti.func
+def product_nt(a: ti.template(), b: ti.template()):
+    """A B^T."""
+    return ti.Matrix(
+        [[a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] for j in range(3)] for i in range(3)]
+    )
+
+
+@ti.func
+def composed(u: ti.template(), s: ti.template(), v: ti.template()):
+    """U diag(s) V^T."""
+    scaled = ti.Matrix([[u[i, j] * s[j] for j in range(3)] for i in range(3)])
+    return product_nt(scaled, v)
 
 
 @ti.func
@@ -124,9 +161,8 @@ def spectral_return_map(f_trial, mu, lam, yield_strain):
     g, t, _e, k, _n = mapped_values(s, mu, lam, yield_strain)
     f_new = f_trial
     if k < 1.0:
-        f_new = u @ ti.Matrix([[g[0], 0.0, 0.0], [0.0, g[1], 0.0], [0.0, 0.0, g[2]]]) @ v.transpose()
-    tau = u @ ti.Matrix([[t[0], 0.0, 0.0], [0.0, t[1], 0.0], [0.0, 0.0, t[2]]]) @ u.transpose()
-    return f_new, tau
+        f_new = composed(u, g, v)
+    return f_new, composed(u, t, u)
 
 
 @ti.func
@@ -136,8 +172,8 @@ def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_stra
     limit."""
     u, s, v = svd_signed(f_trial)
     g, _t, e, k, n = mapped_values(s, mu, lam, yield_strain)
-    p = u.transpose() @ f_new_bar @ v
-    q = u.transpose() @ tau_bar @ u
+    left, right = product_tn(u, f_new_bar), product_tn(u, tau_bar)
+    p, q = product(left, v), product(right, u)
     j = g[0] * g[1] * g[2]
     jp = lam * (2.0 * j - 1.0) * j
     mean = (e[0] + e[1] + e[2]) / 3.0
@@ -176,7 +212,8 @@ def spectral_return_map_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_stra
         skew = 0.5 * (p[a, b] - p[b, a]) * (g[a] + g[b]) / total + q[a, b] * t_over
         x[a, b] = sym + skew
         x[b, a] = sym - skew
-    return u @ x @ v.transpose()
+    turned = product(u, x)
+    return product_nt(turned, v)
 
 
 @ti.func
@@ -184,8 +221,8 @@ def spectral_parameter_adjoint(f_trial, f_new_bar, tau_bar, mu, lam, yield_strai
     """Adjoints of mu, lambda and yield strain under :func:`spectral_return_map`."""
     u, s, v = svd_signed(f_trial)
     g, _t, e, k, n = mapped_values(s, mu, lam, yield_strain)
-    p = u.transpose() @ f_new_bar @ v
-    q = u.transpose() @ tau_bar @ u
+    left, right = product_tn(u, f_new_bar), product_tn(u, tau_bar)
+    p, q = product(left, v), product(right, u)
     j = g[0] * g[1] * g[2]
     trace_q = q[0, 0] + q[1, 1] + q[2, 2]
     mean = (e[0] + e[1] + e[2]) / 3.0
