@@ -10,10 +10,16 @@ __all__ = ["group", "pytest_xdist_make_scheduler"]
 TOGETHER = ("tests/verification/",)
 """Folders whose files share a simulator."""
 
+ALONE = ("tests/test_cuda.py", "tests/test_deterministic.py")
+"""Files whose tests make simulators of their own, and take a minute each."""
+
 
 def group(nodeid: str) -> str:
-    """Return what a test shares its process with: its file, or its folder where files share a simulator."""
+    """Return what a test shares its process with: its file, its folder where files share a simulator, or
+    nothing but itself."""
     file = nodeid.partition("::")[0]
+    if file in ALONE:
+        return nodeid
     return next((folder for folder in TOGETHER if file.startswith(folder)), file)
 
 

@@ -25,6 +25,7 @@ from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.results import read, result_path
 from plab.runners import run_batch
+from plab.sweep.gpus import choose
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
 
@@ -120,6 +121,24 @@ def test_processes_that_share_gpus_are_told_apart(tmp_path: Path) -> None:
         shown = [line for line in lines if line.startswith(f"GPU {name} [0/3 runs] ")]
         assert shown and " 2/2, 0:00:00 left, " in shown[-1]
     assert lines[-1] == "3 runs: 3 finished, 0 finished before"
+
+
+def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
+    tasks = ["Move", "Move", "Rope", "Rope", "Writer"]
+    waiting = [[load_config([f"task={task}", f"seed={seed}"])] for seed, task in enumerate(tasks)]
+    had: list[tuple[str, str] | None] = [None, None]
+    taken = []
+    for process in (0, 1, 1, 0, 1):
+        number = choose(waiting, had[process], [had[1 - process]])
+        [cfg] = waiting.pop(number)
+        had[process] = cfg.task.name, cfg.method.family
+        taken.append((process, cfg.seed))
+    # Its own kind first, then one that nobody has, in the order of the sweep.
+    assert taken == [(0, 0), (1, 2), (1, 3), (0, 1), (1, 4)]
+    waiting = [[load_config(["task=Move", "method=sac"])], [load_config(["task=Move"])]]
+    assert choose(waiting, ("Move", "trajectory"), []) == 1
+    assert choose(waiting, None, [("Move", "rl")]) == 1
+    assert choose(waiting, None, [("Move", "rl"), ("Move", "trajectory")]) == 0
 
 
 def test_agents_share_the_memory_of_a_device_that_processes_share(monkeypatch) -> None:

@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, TypeAlias
 
 from plab import runners
 from plab.config import Config
@@ -20,7 +20,10 @@ from plab.reuse import SimulatorCache
 from plab.sweep.carry import Carrier, look_up
 from plab.tally import Outcome
 
-__all__ = ["carry_on", "gpus"]
+__all__ = ["carry_on", "choose", "gpus"]
+
+Kind: TypeAlias = tuple[str, str]
+"""Task and family of methods."""
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 """The variable that tells a process which GPUs it has."""
@@ -49,7 +52,7 @@ def carry_on(names: Sequence[str], per_gpu: int = 1) -> Carrier:
     ]
 
     def carry(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
-        waiting = list(reversed(batches))
+        waiting = list(batches)
         workers = [_Worker(*place) for place in places[: len(batches)]]
         shown = any(cfg.progress for batch in batches for cfg in batch)
         try:
@@ -57,7 +60,8 @@ def carry_on(names: Sequence[str], per_gpu: int = 1) -> Carrier:
                 while waiting or any(worker.batch for worker in workers):
                     for worker in workers:
                         if waiting and not worker.batch:
-                            worker.give(waiting.pop(), progress())
+                            had = [other.kind for other in workers if other is not worker]
+                            worker.give(waiting.pop(choose(waiting, worker.kind, had)), progress())
                     for worker in _heard([worker for worker in workers if worker.batch]):
                         for kind, *content in worker.messages():
                             if kind == "ended":
@@ -71,6 +75,26 @@ def carry_on(names: Sequence[str], per_gpu: int = 1) -> Carrier:
     return carry
 
 
+def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
+    """Return which batch a process takes: the first of the kind it had before, whose simulator it has; else
+    the first of a kind that no other process has; else the first.
+
+    Args:
+        waiting: Batches, at least one.
+        own: What kind this process had before, if any.
+        others: What kinds the others have, or had before.
+    """
+    kinds = [_kind(batch) for batch in waiting]
+    if own in kinds:
+        return kinds.index(own)
+    return next((number for number, kind in enumerate(kinds) if kind not in others), 0)
+
+
+def _kind(batch: Sequence[Config]) -> Kind:
+    """Return what batches have in common that may share a simulator."""
+    return batch[0].task.name, batch[0].method.family
+
+
 class _Worker:
     """A process that carries out batches on a GPU; if it is killed, another takes its place.
 
@@ -78,11 +102,13 @@ class _Worker:
         name: The GPU.
         label: What stands before its progress.
         batch: What it is carrying out, empty if nothing.
+        kind: Of what kind that is, or what it has carried out last.
     """
 
     def __init__(self, name: str, label: str) -> None:
         self.name, self.label = name, label
         self.batch: list[Config] = []
+        self.kind: Kind | None = None
         self._start()
 
     def _start(self) -> None:
@@ -96,7 +122,7 @@ class _Worker:
         """Let it carry out a batch."""
         if not self.process.is_alive():
             self._start()
-        self.batch = batch
+        self.batch, self.kind = batch, _kind(batch)
         self.connection.send((batch, note))
 
     def messages(self) -> Iterator[tuple[Any, ...]]:
