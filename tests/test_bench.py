@@ -221,8 +221,8 @@ def test_skips_change_nothing(usual: Simulator, device: str) -> None:
         np.testing.assert_allclose(results[0].gradient, results[1].gradient, rtol=0, atol=1e-8 * largest)
         np.testing.assert_allclose(usual.state().x, thorough.state().x, rtol=0, atol=1e-12)
     # What the scene is for: the first step has no adjoints of particles, the last ones have.
-    assert 0 < usual._steps_before_contact(STEPS) < STEPS
-    assert thorough._steps_before_contact(STEPS) == 0
+    assert 0 < usual.steps_before_contact(STEPS) < STEPS
+    assert thorough.steps_before_contact(STEPS) == 0
     assert np.abs(results[0].gradient[:, 0]).max() > 0
 
 

@@ -107,8 +107,8 @@ def rows(
         length = cfg.sim.horizon if case.from_start else steps
         show_line(f"{case.skip}: building two simulators")
         with_it = build(cfg, batch, length, from_start=case.from_start)
-        start, skips = with_it.simulator.state(), Skips(**{case.skip: False})
-        without = build(cfg, batch, length, from_start=case.from_start, start=start, skips=skips)
+        skips = Skips(**{case.skip: False})
+        without = build(cfg, batch, length, from_start=case.from_start, like=with_it, skips=skips)
         for kind in case.kinds[: 1 if quick else None]:
             show_line(f"{case.skip}: {kind}, {batch} environment(s) on {cfg.sim.device}")
             try:

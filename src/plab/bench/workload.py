@@ -17,7 +17,7 @@ from plab.config import Config, build_scene
 from plab.demonstrations import known_actions
 from plab.losses import make_terms
 from plab.objective import OBSERVED_PARTICLES, target_sdf
-from plab.sim import Simulator, Skips, State
+from plab.sim import Simulator, Skips
 
 if TYPE_CHECKING:
     import torch
@@ -98,7 +98,7 @@ def build(
     steps: int,
     *,
     from_start: bool = False,
-    start: State | None = None,
+    like: Workload | None = None,
     skips: Skips | None = None,
 ) -> Workload:
     """Build a simulator and put it where the plasticine is being worked on.
@@ -111,7 +111,7 @@ def build(
         steps: Environment steps of a rollout.
         from_start: Start at the scene's own initial state, instead of in the middle of the best actions
             known.
-        start: Initial state, if it was found before.
+        like: Whose initial state and actions are taken, if there are some.
         skips: What is not computed where it is not needed; everything that need not be by default.
 
     Raises:
@@ -135,20 +135,39 @@ def build(
     distance = target_sdf(mass, threshold=SOLID * mass.max())
     shape = (batch, *mass.shape)
     simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(distance, shape))
-    actions = _actions(cfg, batch, scene.action_dim)
-    first = 0
+    actions = _actions(cfg, batch, scene.action_dim) if like is None else like.actions
     begin = time.perf_counter()
     simulator.step(actions[:, 0])
     first_step_s = time.perf_counter() - begin
-    if not from_start:
+    first = 0
+    if not from_start and like is not None:
+        simulator.set_initial_state(like.simulator.state())
+    elif not from_start:
         first = max(0, actions.shape[1] // 2 - steps // 2)
-        if start is None:
-            simulator.reset()
-            for t in range(first):
-                simulator.step(actions[:, t])
-        simulator.set_initial_state(start or simulator.state())
+        simulator.reset()
+        for t in range(first):
+            simulator.step(actions[:, t])
+        first += _until_contact(simulator, actions[:, first:])
+        simulator.set_initial_state(simulator.state())
     chosen = np.arange(first, first + steps) % actions.shape[1]
     return Workload(cfg, simulator, actions[:, chosen], first_step_s)
+
+
+def _until_contact(simulator: Simulator, actions: np.ndarray) -> int:
+    """Go on to the state before a manipulator touches a body, if one does; return the number of steps."""
+    first = state = simulator.state()
+    simulator.set_initial_state(first)
+    simulator.reset()
+    for t in range(actions.shape[1]):
+        simulator.step(actions[:, t])
+        if simulator.steps_before_contact(1) == 0:
+            simulator.set_initial_state(state)
+            simulator.reset()
+            return t
+        state = simulator.state()
+    simulator.set_initial_state(first)
+    simulator.reset()
+    return 0
 
 
 def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:

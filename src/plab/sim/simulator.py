@@ -64,7 +64,7 @@ class Simulator(ForwardSimulator):
         self._tape.forward(array, poses, None if gradient else terms, steps, plan)
         bars = None
         if gradient:
-            bars = self._tape.backward(array, poses, terms, steps, self._steps_before_contact(steps))
+            bars = self._tape.backward(array, poses, terms, steps, self.steps_before_contact(steps))
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), actions)
         failures = broken_terms(values) | broken_states(values[-1, :, -1], self.substeps)
         if strict:
@@ -118,7 +118,7 @@ class Simulator(ForwardSimulator):
 
         def back() -> np.ndarray | torch.Tensor:
             terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
-            before = self._steps_before_contact(steps)
+            before = self.steps_before_contact(steps)
             with self._kept_weights():
                 self._engine.term_weights.fill(0)
                 bars = self._tape.backward(array, poses, terms, steps, before, add=recorder.add)
@@ -182,7 +182,7 @@ class Simulator(ForwardSimulator):
         loop.look(0, self._particles.current, 0)
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
         require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
-        before = self._steps_before_contact(steps)
+        before = self.steps_before_contact(steps)
         with self._kept_weights() as loop.weights:
             self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
         bars = numbers_of(loop.actions_bar, (steps, self.batch, self.action_dim), like)
@@ -246,6 +246,13 @@ class Simulator(ForwardSimulator):
         poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
         return self._particles.unpack(bar.to_numpy(), poses)
 
+    def steps_before_contact(self, steps: int) -> int:
+        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
+        if self._engine.full_gradient or not self._skips.adjoints:
+            return 0
+        touched = self._engine.touched.to_numpy() != 0
+        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
+
     # -- internals ----------------------------------------------------------------------------------
 
     @contextmanager
@@ -269,13 +276,6 @@ class Simulator(ForwardSimulator):
         """Place the manipulators as they are after the last step of a history."""
         shape = steps + 1, self.batch, self.manipulator_count, 8
         self._place(poses.to_numpy()[: int(np.prod(shape))].reshape(shape)[-1])
-
-    def _steps_before_contact(self, steps: int) -> int:
-        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
-        if self._engine.full_gradient or not self._skips.adjoints:
-            return 0
-        touched = self._engine.touched.to_numpy() != 0
-        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
 
     def _require_gradient(self) -> None:
         self._require_runtime()
