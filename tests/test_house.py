@@ -140,6 +140,33 @@ def test_no_expression_is_compiled_again_wherever_it_is_used():
     assert not found
 
 
+def static_and_not(function: ast.FunctionDef) -> set[str]:
+    """Names of a function that ``ti.static`` gives to the compiler, and that are variables, too."""
+    named, variables = set(), set()
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign | ast.AugAssign):
+            static = ast.unparse(node.value).startswith("ti.static(")
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            inside = [one for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)]
+            names = {one.id for one in inside if isinstance(one.ctx, ast.Store)}
+            (named if static else variables).update(names)
+    return named & variables
+
+
+def test_no_variable_is_set_by_what_only_the_compiler_sees():
+    # `mask = 0` and then `mask = ti.static(3)`: what runs has 0.
+    wrong = ast.parse("def f():\n    mask = 0\n    if ti.static(True):\n        mask = ti.static(3)").body[0]
+    assert isinstance(wrong, ast.FunctionDef) and static_and_not(wrong) == {"mask"}
+    trees = {path: ast.parse(path.read_text()) for path in MODULES if path.parent.name in ("sim", "losses")}
+    found = [
+        (path.name, node.name)
+        for path, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and is_kernel(node) and static_and_not(node)
+    ]
+    assert not found
+
+
 def test_the_version_is_semantic_and_in_one_place():
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
     assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -246,7 +246,7 @@ class CudaPhases(OrderPhases, PosePhases):
         """Bit mask of the manipulators whose contact is not zero at a point in substep s."""
         mask = 0
         if ti.static(not self.skips.far_manipulators):
-            mask = ti.static((1 << self.manipulators) - 1)
+            mask = (1 << self.manipulators) - 1
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])

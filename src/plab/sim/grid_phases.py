@@ -73,7 +73,7 @@ class GridPhases(Storage):
         """
         mask = 0
         if ti.static(not self.skips.far_manipulators):
-            mask = ti.static((1 << self.manipulators) - 1)
+            mask = (1 << self.manipulators) - 1
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
