@@ -124,7 +124,7 @@ def test_no_expression_is_compiled_again_wherever_it_is_used():
     for _path, node in nodes:
         if isinstance(node, ast.FunctionDef) and "ti.func" in map(ast.unparse, node.decorator_list):
             functions.setdefault(node.name, []).append(used_again(node))
-    assert any(map(any, functions["gather"])) and not any(map(any, functions["dot_sym"]))
+    assert any(map(any, functions["moments"])) and not any(map(any, functions["node_address"]))
     found = []
     for path, node in nodes:
         if not isinstance(node, ast.Call):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import llvmlite.binding as llvm
 from llvmlite import ir
-from material import MATERIAL, tracing
+from material import MATERIAL
 from particle import PARTICLE
 from stencils import STENCILS
 
@@ -31,10 +31,9 @@ def assembled(makers: Iterable, layout: str = "") -> llvm.ModuleRef:
     """What makes functions, made for both precisions, for a data layout."""
     module = ir.Module("plab")
     module.data_layout = layout
-    with tracing():
-        for real, ending in ((ir.FloatType(), "f32"), (ir.DoubleType(), "f64")):
-            for make in makers:
-                make(module, f"{make.__name__}_{ending}", real)
+    for real, ending in ((ir.FloatType(), "f32"), (ir.DoubleType(), "f64")):
+        for make in makers:
+            make(module, f"{make.__name__}_{ending}", real)
     return llvm.parse_assembly(str(module).replace('target triple = "unknown-unknown-unknown"\n', ""))
 
 

@@ -7,16 +7,14 @@ on CPUs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from types import SimpleNamespace
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from stencils import LANE, Code
 
 from plab.sim import linalg, material, series
-from plab.sim.particle_phases import ParticlePhases
 from plab.sim.storage import (
     AT_C,
     AT_F,
@@ -24,13 +22,14 @@ from plab.sim.storage import (
     STRAIN_D,
     STRAIN_D_BAR,
     STRAIN_G_BAR,
+    STRAIN_PARAMETER_BARS,
     STRAIN_PARAMETERS,
     STRAIN_SCALARS,
     STRAIN_W,
     STRAIN_Z,
 )
 
-__all__ = ["MATERIAL", "Lanes", "series_of", "served", "tracing"]
+__all__ = ["MATERIAL", "Lanes", "series_of", "served"]
 
 
 class Lanes:
@@ -72,53 +71,22 @@ class Lanes:
     def __lt__(self, other: Lanes | float) -> Lanes:
         return self._operation("below", self, other)
 
+    def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Lanes | float) -> Lanes:
+        """What NumPy's functions of numbers do."""
+        if function is np.sqrt:
+            return Lanes(self.code, self.code.root(self.value))
+        return self._operation({np.minimum: "least"}[function], *given)
+
+    def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Lanes:
+        """What :func:`numpy.where` does; no other of NumPy's functions of arrays is known."""
+        assert function is np.where
+        chosen, a, b = given
+        other = b.value if isinstance(b, Lanes) else self.code.constant(b)
+        return Lanes(self.code, self.code.chosen(chosen.value, a.value, other))
+
 
 def _is(other: Lanes | float, number: float) -> bool:
     return not isinstance(other, Lanes) and other == number
-
-
-class Taichi:
-    """What the traced functions use of Taichi."""
-
-    @staticmethod
-    def static(value: Any) -> Any:
-        return value
-
-    @staticmethod
-    def sqrt(a: Lanes) -> Lanes:
-        return Lanes(a.code, a.code.root(a.value))
-
-    @staticmethod
-    def min(a: Lanes, b: float) -> Lanes:
-        return Lanes(a.code, a.code.least(a.value, a.code.constant(b)))
-
-    @staticmethod
-    def select(chosen: Lanes, a: Lanes, b: Lanes | float) -> Lanes:
-        other = b.value if isinstance(b, Lanes) else a.code.constant(b)
-        return Lanes(a.code, a.code.chosen(chosen.value, a.value, other))
-
-
-@contextmanager
-def tracing() -> Iterator[None]:
-    """Let the material's functions be called with lanes."""
-    own: tuple[Any, ...] = (material, series)
-    functions = [one.func for module in (linalg, *own) for one in vars(module).values() if _traceable(one)]
-    taichi = [module.ti for module in own]
-    try:
-        for module in own:
-            module.ti = Taichi
-        for one in functions:
-            one.pyfunc = True
-        yield
-    finally:
-        for module, former in zip(own, taichi, strict=True):
-            module.ti = former
-        for one in functions:
-            one.pyfunc = False
-
-
-def _traceable(one: Any) -> bool:
-    return getattr(one, "_is_taichi_function", False)
 
 
 def series_of(real: ir.Type) -> series.Series:
@@ -173,10 +141,6 @@ class Tile:
         rigid = self.code.below(self.code.constant(1.0), k.value, equal=True)
         self.code.put("rigid", self.code.all_of(rigid))
 
-    def law(self, *names: str) -> SimpleNamespace:
-        """What the methods of :class:`plab.sim.particle_phases.ParticlePhases` take for a simulator."""
-        return SimpleNamespace(**{name: self.number(name) for name in names})
-
 
 def strain(module: ir.Module, name: str, real: ir.Type) -> None:
     """Strain of a tile whose state is at ``source``: G, d, J and c2 to ``strains``."""
@@ -204,8 +168,9 @@ def stress(module: ir.Module, name: str, real: ir.Type) -> None:
     tile = Tile(module, name, real, "source affine", "stress_scale mass rigid")
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     tau = material.stress(d, j, c2, mu, lam, limit, tile.series)
-    law, c = tile.law("stress_scale", "mass"), tile.take(AT_C, 9, "source")
-    tile.leave(0, ParticlePhases.stress_and_momentum.__wrapped__(law, tau, c), "affine")
+    c = tile.take(AT_C, 9, "source")
+    a = material.momentum_matrix(tau, c, tile.number("stress_scale"), tile.number("mass"))
+    tile.leave(0, a, "affine")
     tile.note_yield(d, limit)
     tile.code.end()
 
@@ -223,8 +188,7 @@ def stress_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     tile = Tile(module, name, real, "affine", "stress_scale rigid")
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     adjoint = material.stress_adjoint
-    law, a_bar = tile.law("stress_scale"), tile.take(0, 9, "affine")
-    tau_bar = ParticlePhases.stress_symmetric.__wrapped__(law, a_bar)
+    tau_bar = material.stress_of_momentum(tile.take(0, 9, "affine"), tile.number("stress_scale"))
     d_bar, *bars = adjoint(d, j, c2, tau_bar, mu, lam, limit, tile.series)
     tile.leave(STRAIN_D_BAR, d_bar)
     tile.leave(STRAIN_BARS, bars)
@@ -240,6 +204,16 @@ def flow_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     tile.leave(STRAIN_D_BAR, [a + b for a, b in zip(tile.take(STRAIN_D_BAR, 6), d_bar, strict=True)])
     tile.leave(STRAIN_BARS, [tile.take(STRAIN_BARS, 1)[0] + k_bar])
     tile.leave(STRAIN_G_BAR, g_bar)
+    tile.code.end()
+
+
+def parameter_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
+    """Adjoints of a tile's mu, lambda and yield strain, from those of A in ``affine`` and of k."""
+    tile = Tile(module, name, real, "affine", "stress_scale")
+    d, (j, c2), k_bar = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.take(STRAIN_BARS, 1)[0]
+    tau_bar = material.stress_of_momentum(tile.take(0, 9, "affine"), tile.number("stress_scale"))
+    adjoint = material.parameter_adjoint
+    tile.leave(STRAIN_PARAMETER_BARS, adjoint(d, j, c2, tau_bar, k_bar, tile.parameters()[2], tile.series))
     tile.code.end()
 
 
@@ -260,5 +234,14 @@ def strain_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     tile.code.end()
 
 
-MATERIAL = (strain, whole_strain, stress, flow, stress_adjoint, flow_adjoint, strain_adjoint)
+MATERIAL = (
+    strain,
+    whole_strain,
+    stress,
+    flow,
+    stress_adjoint,
+    flow_adjoint,
+    parameter_adjoint,
+    strain_adjoint,
+)
 """What makes the functions, named as these."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import reduce
-from types import SimpleNamespace
 from typing import Any
 
 from llvmlite import ir
@@ -17,7 +16,6 @@ from material import Lanes, series_of, served
 from stencils import WORD, Code
 
 from plab.sim import linalg, material
-from plab.sim.particle_phases import ParticlePhases
 
 __all__ = ["PARTICLE"]
 
@@ -91,10 +89,6 @@ class Particle:
         for k, one in enumerate(values):
             self.code.put(f"{name}{k}", one.value)
 
-    def law(self) -> SimpleNamespace:
-        """What the methods of :class:`plab.sim.particle_phases.ParticlePhases` take for a simulator."""
-        return SimpleNamespace(stress_scale=self.number("stress_scale"), mass=self.number("mass"))
-
     def strain(self, c: Sequence[Lanes], f: Sequence[Lanes]) -> tuple[Any, ...]:
         """G, J, the strain and whether the series serve it, which is noted."""
         g = material.trial_gradient(c, f, self.number("dt"))
@@ -123,7 +117,7 @@ def particle(module: ir.Module, name: str, real: ir.Type) -> None:
     mu, lam, limit = (one.number(key) for key in ("mu", "lam", "limit"))
     with code.where(fits):
         tau = material.stress(d, j, c2, mu, lam, limit, one.series)
-        one.leave("c", ParticlePhases.stress_and_momentum.__wrapped__(one.law(), tau, c))
+        one.leave("c", material.momentum_matrix(tau, c, one.number("stress_scale"), one.number("mass")))
         one.leave("f", g)
         with code.where(one.flows(d)):
             one.leave("f", material.flow(d, g, limit, one.series))
@@ -138,7 +132,7 @@ def particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     g, j, (c2, w, z, _z2, a1, a2, d), fits = one.strain(c, f)
     mu, lam, limit = (one.number(key) for key in ("mu", "lam", "limit"))
     with code.where(fits):
-        tau_bar = ParticlePhases.stress_symmetric.__wrapped__(one.law(), a_bar)
+        tau_bar = material.stress_of_momentum(a_bar, one.number("stress_scale"))
         adjoint = material.stress_adjoint
         d_bar, k_bar, c2_bar, j_bar = adjoint(d, j, c2, tau_bar, mu, lam, limit, one.series)
         kept = code.variables([x.value for x in (*d_bar, k_bar, *g_bar)])

@@ -20,6 +20,7 @@ __all__ = [
     "flow_adjoint",
     "gather",
     "gather_adjoint",
+    "parameter_adjoint",
     "scatter",
     "strain",
     "strain_adjoint",
@@ -129,6 +130,13 @@ def flow_adjoint(real: ti.template(), strains, bar):
     """Adjoint of a tile's plastic flow, added to that of the stress in ``strains``."""
     s, b = ti.u64(strains), ti.u64(bar)
     ti.static(_function("flow_adjoint", real))(s, b)
+
+
+@ti.func
+def parameter_adjoint(real: ti.template(), strains, affine, stress_scale):
+    """Adjoints of a tile's mu, lambda and yield strain, within ``strains``, from that of A in ``affine``."""
+    s, a, scale = ti.u64(strains), ti.u64(affine), ti.cast(stress_scale, real)
+    ti.static(_function("parameter_adjoint", real))(s, a, scale)
 
 
 @ti.func

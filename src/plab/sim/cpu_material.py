@@ -6,19 +6,18 @@ results there.
 
 import taichi as ti
 
-from plab.sim.cpu_bitcode import copy, flow, flow_adjoint, strain, strain_adjoint, stress, stress_adjoint
-from plab.sim.material import parameter_adjoint
-from plab.sim.particle_phases import ParticlePhases
-from plab.sim.storage import (
-    AT_F,
-    STATE,
-    STRAIN_BARS,
-    STRAIN_D,
-    STRAIN_G_BAR,
-    STRAIN_PARAMETERS,
-    STRAIN_SCALARS,
-    STRAINS,
+from plab.sim.cpu_bitcode import (
+    copy,
+    flow,
+    flow_adjoint,
+    parameter_adjoint,
+    strain,
+    strain_adjoint,
+    stress,
+    stress_adjoint,
 )
+from plab.sim.particle_phases import ParticlePhases
+from plab.sim.storage import AT_F, STATE, STRAIN_G_BAR, STRAIN_PARAMETER_BARS, STRAIN_PARAMETERS, STRAINS
 
 __all__ = ["MaterialTiles"]
 
@@ -85,18 +84,9 @@ class MaterialTiles(ParticlePhases):
     @ti.func
     def parameter_tile_adjoint(self, entry9, at):
         """Add a tile's adjoints of the material's parameters, from ``strains``."""
-        d = [self.strains[at + STRAIN_D + i] for i in range(6)]
-        a_bar = [self.affine[entry9 + i] for i in range(9)]
-        tau_bar = self.stress_symmetric(a_bar)
-        mu_bar, lam_bar, yield_bar = parameter_adjoint(
-            d,
-            self.strains[at + STRAIN_SCALARS],
-            self.strains[at + STRAIN_SCALARS + 1],
-            tau_bar,
-            self.strains[at + STRAIN_BARS],
-            self.strains[at + STRAIN_PARAMETERS + 2],
-            self.series,
-        )
+        affine = self.lane_in(self.affine, entry9, 0)
+        parameter_adjoint(self.real, self.lane_in(self.strains, at, 0), affine, self.stress_scale)
+        mu_bar, lam_bar, yield_bar = [self.strains[at + STRAIN_PARAMETER_BARS + i] for i in range(3)]
         if ti.static(self.mixed):
             for lane in range(self.lanes):
                 self.accumulate_particle(

@@ -1,11 +1,8 @@
-"""3x3 algebra on tuples of components, for scalars and for lanes alike.
+"""3x3 algebra on tuples of components of any kind: numbers, arrays, or what ``make bitcode`` calls it with.
 
 A matrix is a tuple of 9 components in row-major order, a symmetric one a tuple of 6: (00, 11, 22, 01, 02,
-12). A component is a scalar on CUDA (one particle per thread) and a vector of lanes on the CPU (one tile of
-particles).
+12).
 """
-
-import taichi as ti
 
 __all__ = [
     "cofactor_sym",
@@ -26,8 +23,7 @@ __all__ = [
 ]
 
 
-@ti.func
-def mul(a: ti.template(), b: ti.template()):
+def mul(a, b):
     """A B, both full."""
     return (
         a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
@@ -42,8 +38,7 @@ def mul(a: ti.template(), b: ti.template()):
     )
 
 
-@ti.func
-def mul_tn(a: ti.template(), b: ti.template()):
+def mul_tn(a, b):
     """A^T B, both full."""
     return (
         a[0] * b[0] + a[3] * b[3] + a[6] * b[6],
@@ -58,8 +53,7 @@ def mul_tn(a: ti.template(), b: ti.template()):
     )
 
 
-@ti.func
-def mul_nt(a: ti.template(), b: ti.template()):
+def mul_nt(a, b):
     """A B^T, both full."""
     return (
         a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
@@ -74,8 +68,7 @@ def mul_nt(a: ti.template(), b: ti.template()):
     )
 
 
-@ti.func
-def det(a: ti.template()):
+def det(a):
     """Determinant of a full matrix."""
     return (
         a[0] * (a[4] * a[8] - a[5] * a[7])
@@ -84,8 +77,7 @@ def det(a: ti.template()):
     )
 
 
-@ti.func
-def cofactor(a: ti.template()):
+def cofactor(a):
     """d det(A) / dA of a full matrix."""
     return (
         a[4] * a[8] - a[5] * a[7],
@@ -100,8 +92,7 @@ def cofactor(a: ti.template()):
     )
 
 
-@ti.func
-def det_sym(s: ti.template()):
+def det_sym(s):
     """Determinant of a symmetric matrix."""
     return (
         s[0] * (s[1] * s[2] - s[5] * s[5])
@@ -110,8 +101,7 @@ def det_sym(s: ti.template()):
     )
 
 
-@ti.func
-def cofactor_sym(s: ti.template()):
+def cofactor_sym(s):
     """Cofactor matrix of a symmetric matrix: det(S) S^-1, symmetric."""
     return (
         s[1] * s[2] - s[5] * s[5],
@@ -123,16 +113,14 @@ def cofactor_sym(s: ti.template()):
     )
 
 
-@ti.func
-def inverse_sym(s: ti.template()):
+def inverse_sym(s):
     """Inverse of a symmetric matrix."""
     c = cofactor_sym(s)
     r = 1.0 / (s[0] * c[0] + s[3] * c[3] + s[4] * c[4])
     return (r * c[0], r * c[1], r * c[2], r * c[3], r * c[4], r * c[5])
 
 
-@ti.func
-def outer_sym(a: ti.template()):
+def outer_sym(a):
     """A A^T of a full matrix, symmetric."""
     return (
         a[0] * a[0] + a[1] * a[1] + a[2] * a[2],
@@ -144,8 +132,7 @@ def outer_sym(a: ti.template()):
     )
 
 
-@ti.func
-def square_sym(s: ti.template()):
+def square_sym(s):
     """S S of a symmetric matrix, symmetric."""
     return (
         s[0] * s[0] + s[3] * s[3] + s[4] * s[4],
@@ -157,26 +144,22 @@ def square_sym(s: ti.template()):
     )
 
 
-@ti.func
-def dot_sym(a: ti.template(), b: ti.template()):
+def dot_sym(a, b):
     """A : B of two symmetric matrices."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + 2.0 * (a[3] * b[3] + a[4] * b[4] + a[5] * b[5])
 
 
-@ti.func
-def mat_from_sym(s: ti.template()):
+def mat_from_sym(s):
     """The 9 components of a symmetric matrix."""
     return (s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2])
 
 
-@ti.func
-def mul_sym_mat(s: ti.template(), b: ti.template()):
+def mul_sym_mat(s, b):
     """S B with S symmetric, B full."""
     return mul(mat_from_sym(s), b)
 
 
-@ti.func
-def sym_product_twice(a: ti.template(), b: ti.template()):
+def sym_product_twice(a, b):
     """A B + B A of two symmetric matrices, symmetric."""
     return (
         2.0 * (a[0] * b[0] + a[3] * b[3] + a[4] * b[4]),
@@ -188,8 +171,7 @@ def sym_product_twice(a: ti.template(), b: ti.template()):
     )
 
 
-@ti.func
-def sandwich_sym(w: ti.template(), z: ti.template()):
+def sandwich_sym(w, z):
     """W Z W of two symmetric matrices, symmetric."""
     wz = mul(mat_from_sym(w), mat_from_sym(z))
     return (
@@ -202,8 +184,7 @@ def sandwich_sym(w: ti.template(), z: ti.template()):
     )
 
 
-@ti.func
-def sym_of_product(a: ti.template(), b: ti.template()):
+def sym_of_product(a, b):
     """Symmetric part of A B^T, both full."""
     return (
         a[0] * b[0] + a[1] * b[1] + a[2] * b[2],

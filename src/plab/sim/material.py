@@ -16,10 +16,11 @@ Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), `
 parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.series.Series`.
 
 The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed.
-Components are scalars on CUDA; for the CPU ``tools/material.py`` calls these functions with lanes.
+Components are numbers of any kind: NumPy's arrays, say. What the simulator runs is bitcode, which ``make
+bitcode`` writes by calling these functions with what writes an instruction at each operation.
 """
 
-import taichi as ti
+import numpy as np
 
 from plab.sim.linalg import (
     cofactor,
@@ -51,10 +52,12 @@ __all__ = [
     "flow_adjoint",
     "hencky_strain",
     "log_adjoint",
+    "momentum_matrix",
     "parameter_adjoint",
     "strain_adjoint",
     "stress",
     "stress_adjoint",
+    "stress_of_momentum",
     "trial_gradient",
     "yield_factor",
 ]
@@ -63,15 +66,13 @@ NORM_SHIFT = 1e-8
 """Added to |d|^2 under the square root, as in the PlasticineLab release."""
 
 
-@ti.func
-def trial_gradient(c: ti.template(), f: ti.template(), dt):
+def trial_gradient(c, f, dt):
     """(I + dt C) F."""
     cf = mul(c, f)
     return [f[i] + dt * cf[i] for i in range(9)]
 
 
-@ti.func
-def hencky_strain(g: ti.template(), j, series: ti.template()):
+def hencky_strain(g, j, series):
     """Deviatoric Hencky strain d of G, and what its adjoint needs: c2, W = (b + I)^-1 (6), Z (6), |Z|^2, the
     coefficients a1, a2 of Z and Z^2 in d, and d itself."""
     c = inverse_cbrt(j, series.cbrt_steps)
@@ -96,8 +97,7 @@ def hencky_strain(g: ti.template(), j, series: ti.template()):
     return c2, w, z, tr_y, a1, a2, d
 
 
-@ti.func
-def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
+def polynomial_sym(p0, p1, p2, d, d2):
     """p0 I + p1 d + p2 d^2, symmetric."""
     return (
         p0 + p1 * d[0] + p2 * d2[0],
@@ -109,8 +109,7 @@ def polynomial_sym(p0, p1, p2, d: ti.template(), d2: ti.template()):
     )
 
 
-@ti.func
-def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()):
+def stress(d, j, c2, mu, lam, yield_strain, series):
     """Kirchhoff stress (6 components) after return mapping."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     qk = k * k * q
@@ -125,8 +124,25 @@ def stress(d: ti.template(), j, c2, mu, lam, yield_strain, series: ti.template()
     return polynomial_sym(t0, t1 * k, t2 * k * k, d, square_sym(d))
 
 
-@ti.func
-def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()):
+def momentum_matrix(tau, c, stress_scale, mass):
+    """A = stress_scale tau + mass C, which a particle scatters, from a symmetric tau (6) and a full C (9)."""
+    return [stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + mass * c[i] for i in range(9)]
+
+
+def stress_of_momentum(a_bar, stress_scale):
+    """Symmetric part of the adjoint of tau (6) from that of A (9)."""
+    half = 0.5 * stress_scale
+    return (
+        2.0 * half * a_bar[0],
+        2.0 * half * a_bar[4],
+        2.0 * half * a_bar[8],
+        half * (a_bar[1] + a_bar[3]),
+        half * (a_bar[2] + a_bar[6]),
+        half * (a_bar[5] + a_bar[7]),
+    )
+
+
+def flow(d, g, yield_strain, series):
     """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
     s = k - 1.0
@@ -135,22 +151,19 @@ def flow(d: ti.template(), g: ti.template(), yield_strain, series: ti.template()
     return mul_sym_mat(m, g)
 
 
-@ti.func
-def yield_factor(d: ti.template(), yield_strain):
+def yield_factor(d, yield_strain):
     """q = tr(d^2) / 2, det d, the regularised norm of d and the factor k of return mapping."""
     q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
-    norm = ti.sqrt(2.0 * q + NORM_SHIFT)
-    return q, det_sym(d), norm, ti.min(yield_strain / norm, 1.0)
+    norm = np.sqrt(2.0 * q + NORM_SHIFT)
+    return q, det_sym(d), norm, np.minimum(yield_strain / norm, 1.0)
 
 
-@ti.func
-def scaled_sum(a, x: ti.template(), b, y: ti.template()):
+def scaled_sum(a, x, b, y):
     """a X + b Y of symmetric matrices."""
     return [a * x[i] + b * y[i] for i in range(6)]
 
 
-@ti.func
-def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_bar):
+def polynomial_adjoint(d, bar, p1, p2, q_bar, det_bar):
     """Adjoint of d from a polynomial's coefficients p1, p2 of d, d^2, the polynomial's adjoint, and those of
     q and det d."""
     quad = sym_product_twice(bar, d)
@@ -160,10 +173,7 @@ def polynomial_adjoint(d: ti.template(), bar: ti.template(), p1, p2, q_bar, det_
     return scaled_sum(1.0, first, 1.0, second)
 
 
-@ti.func
-def stress_adjoint(
-    d: ti.template(), j, c2, tau_bar: ti.template(), mu, lam, yield_strain, series: ti.template()
-):
+def stress_adjoint(d, j, c2, tau_bar, mu, lam, yield_strain, series):
     """First part of the adjoint of return mapping: adjoints of d (6) at fixed k, of k, of c2 and of J from
     ``tau_bar``, the symmetric part of that of tau (6)."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
@@ -201,23 +211,17 @@ def stress_adjoint(
     return d_bar, k_bar, j * j3_bar, lam * t0_bar * (2.0 * j - 1.0) + c2 * j3_bar
 
 
-@ti.func
-def parameter_adjoint(
-    d: ti.template(), j, c2, tau_bar: ti.template(), k_bar, yield_strain, series: ti.template()
-):
+def parameter_adjoint(d, j, c2, tau_bar, k_bar, yield_strain, series):
     """Adjoints of mu, lambda and yield strain from ``tau_bar`` as in :func:`stress_adjoint`, and from that of
     k by stress and flow together."""
     # The stress is linear in mu and lambda.
     mu_bar = dot_sym(tau_bar, stress(d, j, c2, 1.0, 0.0, yield_strain, series))
     _q, _det, norm, k = yield_factor(d, yield_strain)
-    yield_bar = ti.select(k < 1.0, k_bar / norm, 0.0 * k)
+    yield_bar = np.where(k < 1.0, k_bar / norm, 0.0 * k)
     return mu_bar, (tau_bar[0] + tau_bar[1] + tau_bar[2]) * j * (j - 1.0), yield_bar
 
 
-@ti.func
-def flow_adjoint(
-    d: ti.template(), g: ti.template(), f_new_bar: ti.template(), yield_strain, series: ti.template()
-):
+def flow_adjoint(d, g, f_new_bar, yield_strain, series):
     """Second part of the adjoint of return mapping, of plastic flow F' = exp((k - 1) d) G: adjoints of d (6)
     at fixed k, of k, and of G (9) at fixed d. Where nothing yields, the flow is the identity and this part is
     not needed."""
@@ -239,22 +243,21 @@ def flow_adjoint(
     return d_bar, k_bar, mul_sym_mat(m, f_new_bar)
 
 
-@ti.func
 def log_adjoint(
-    z: ti.template(),
+    z,
     a1,
     a2,
-    d: ti.template(),
-    d_bar: ti.template(),
+    d,
+    d_bar,
     k_bar,
     yield_strain,
-    series: ti.template(),
+    series,
 ):
     """Third part of the adjoint of return mapping: adjoint of Z (6) under d = log(b) / 2, whose coefficients
     of Z and Z^2 are a1 and a2, from those of d at fixed k and of k."""
     _q, _det, norm, k = yield_factor(d, yield_strain)
     # k = yield_strain / norm where it yields, else constant.
-    q_bar = ti.select(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
+    q_bar = np.where(k < 1.0, k * k_bar / (norm * norm), 0.0 * k)
     full = scaled_sum(1.0, d_bar, -q_bar, d)
     mean = (full[0] + full[1] + full[2]) * (1.0 / 3.0)
     dev = (full[0] - mean, full[1] - mean, full[2] - mean, full[3], full[4], full[5])
@@ -277,18 +280,17 @@ def log_adjoint(
     )
 
 
-@ti.func
 def strain_adjoint(
-    c: ti.template(),
-    f: ti.template(),
-    g: ti.template(),
+    c,
+    f,
+    g,
     j,
     c2,
-    w: ti.template(),
-    z_bar: ti.template(),
+    w,
+    z_bar,
     c2_bar,
     j_bar,
-    g_bar: ti.template(),
+    g_bar,
     dt,
 ):
     """Last part of the adjoint of return mapping: adjoints of C and F (9 each) from those of Z, of c2 and J

@@ -160,24 +160,6 @@ class ParticlePhases(Storage):
         return out
 
     @ti.func
-    def stress_and_momentum(self, tau: ti.template(), c: ti.template()):
-        """A = stress_scale tau + mass C from a symmetric tau (6) and a full C (9)."""
-        return [self.stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + self.mass * c[i] for i in range(9)]
-
-    @ti.func
-    def stress_symmetric(self, a_bar: ti.template()):
-        """Symmetric part of the adjoint of tau (6) from that of A (9)."""
-        half = 0.5 * self.stress_scale
-        return (
-            2.0 * half * a_bar[0],
-            2.0 * half * a_bar[4],
-            2.0 * half * a_bar[8],
-            half * (a_bar[1] + a_bar[3]),
-            half * (a_bar[2] + a_bar[6]),
-            half * (a_bar[5] + a_bar[7]),
-        )
-
-    @ti.func
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.parameters_of_particle(e, source, lane)

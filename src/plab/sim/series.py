@@ -15,8 +15,6 @@ said in :mod:`plab.sim.material`.
 import math
 from dataclasses import dataclass
 
-import taichi as ti
-
 __all__ = [
     "Series",
     "exp_coefficients",
@@ -53,18 +51,16 @@ class Series:
         return cls(4, 6, 3) if precision == "float32" else cls(9, 11, 4)
 
 
-@ti.func
-def inverse_cbrt(j, steps: ti.template()):
+def inverse_cbrt(j, steps):
     """J^(-1/3) for J near 1: Newton steps from the second-order expansion at 1."""
     e = j - 1.0
     c = 1.0 - e * (1.0 / 3.0) + e * e * (2.0 / 9.0)
-    for _ in ti.static(range(steps)):
+    for _ in range(steps):
         c = c * (4.0 - j * (c * c * c)) * (1.0 / 3.0)
     return c
 
 
-@ti.func
-def log_horner(i1, i2, i3, terms: ti.template()):
+def log_horner(i1, i2, i3, terms):
     """Horner states of the atanh series: coefficients of (I, Z, Z^2) after each of ``terms`` steps, lowest
     order first.
 
@@ -75,23 +71,21 @@ def log_horner(i1, i2, i3, terms: ti.template()):
     n33 = i1 * i1 - i2
     states = [0.0 * i1 for _ in range(3 * terms)]
     states[3 * terms - 3] = 0.0 * i1 + 1.0 / (2 * terms - 1)
-    for r in ti.static(range(terms - 1)):
-        k = ti.static(3 * (terms - 2 - r))
-        states[k] = i3 * states[k + 4] + n13 * states[k + 5] + 1.0 / ti.static(2 * (terms - 2 - r) + 1)
+    for r in range(terms - 1):
+        k = 3 * (terms - 2 - r)
+        states[k] = i3 * states[k + 4] + n13 * states[k + 5] + 1.0 / (2 * (terms - 2 - r) + 1)
         states[k + 1] = n23 * states[k + 5] - i2 * states[k + 4]
         states[k + 2] = states[k + 3] + i1 * states[k + 4] + n33 * states[k + 5]
     return states
 
 
-@ti.func
-def log_coefficients(i1, i2, i3, terms: ti.template()):
+def log_coefficients(i1, i2, i3, terms):
     """Coefficients a1, a2 of Z and Z^2 in atanh(Z); that of I drops out of the deviator."""
     h = log_horner(i1, i2, i3, terms)
     return h[0] - i2 * h[2], h[1] + i1 * h[2]
 
 
-@ti.func
-def log_coefficients_adjoint(i1, i2, i3, a1_bar, a2_bar, terms: ti.template()):
+def log_coefficients_adjoint(i1, i2, i3, a1_bar, a2_bar, terms):
     """Adjoints of i1, i2, i3 under :func:`log_coefficients`."""
     h = log_horner(i1, i2, i3, terms)
     n13 = i1 * i3
@@ -106,7 +100,7 @@ def log_coefficients_adjoint(i1, i2, i3, a1_bar, a2_bar, terms: ti.template()):
     n13_bar = 0.0 * i1
     n23_bar = 0.0 * i1
     n33_bar = 0.0 * i1
-    for r in ti.static(range(terms - 1)):
+    for r in range(terms - 1):
         h2 = h[3 * (r + 1) + 1]
         h3 = h[3 * (r + 1) + 2]
         i1_bar += b3 * h2
@@ -128,31 +122,28 @@ def log_coefficients_adjoint(i1, i2, i3, a1_bar, a2_bar, terms: ti.template()):
     )
 
 
-@ti.func
-def exp_horner(q, det_d, terms: ti.template()):
+def exp_horner(q, det_d, terms):
     """Horner states of the exponential series of a traceless d with q = tr(d^2) / 2, lowest order first.
 
     Entry 3 k + c of the returned list is coefficient c, of (I, d, d^2), of sum over j >= k of d^(j - k) / j!.
     """
     states = [0.0 * q for _ in range(3 * terms)]
-    states[3 * terms - 3] = 0.0 * q + ti.static(1.0 / math.factorial(terms - 1))
-    for r in ti.static(range(terms - 1)):
-        k = ti.static(3 * (terms - 2 - r))
-        states[k] = det_d * states[k + 5] + ti.static(1.0 / math.factorial(terms - 2 - r))
+    states[3 * terms - 3] = 0.0 * q + 1.0 / math.factorial(terms - 1)
+    for r in range(terms - 1):
+        k = 3 * (terms - 2 - r)
+        states[k] = det_d * states[k + 5] + 1.0 / math.factorial(terms - 2 - r)
         states[k + 1] = states[k + 3] + q * states[k + 5]
         states[k + 2] = states[k + 4]
     return states
 
 
-@ti.func
-def exp_coefficients(q, det_d, terms: ti.template()):
+def exp_coefficients(q, det_d, terms):
     """Coefficients of I, d, d^2 in exp(d) for a traceless d with q = tr(d^2) / 2."""
     h = exp_horner(q, det_d, terms)
     return h[0], h[1], h[2]
 
 
-@ti.func
-def exp_coefficients_adjoint(q, det_d, e0_bar, e1_bar, e2_bar, terms: ti.template()):
+def exp_coefficients_adjoint(q, det_d, e0_bar, e1_bar, e2_bar, terms):
     """Adjoints of q and det(d) under :func:`exp_coefficients`."""
     h = exp_horner(q, det_d, terms)
     b0 = e0_bar
@@ -160,7 +151,7 @@ def exp_coefficients_adjoint(q, det_d, e0_bar, e1_bar, e2_bar, terms: ti.templat
     b2 = e2_bar
     q_bar = 0.0 * q
     det_bar = 0.0 * q
-    for r in ti.static(range(terms - 1)):
+    for r in range(terms - 1):
         h2 = h[3 * (r + 1) + 2]
         det_bar += b0 * h2
         q_bar += b1 * h2
