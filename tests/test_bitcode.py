@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from plab.sim import bitcode, cuda_bitcode
+from plab.sim import bitcode
 from plab.sim.bitcode import Bitcode
+from plab.sim.cuda_bitcode import add
 from plab.sim.runtime import start_runtime
 
 FOLDER = Path(bitcode.__file__).parent
@@ -44,15 +45,11 @@ def test_a_platform_without_bitcode_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "numbers", "add", "size"),
-    [
-        (ti.f32, np.float32, cuda_bitcode.add_f32, 4),
-        (ti.f64, np.float64, cuda_bitcode.add_f64, 8),
-        (ti.i64, np.int64, cuda_bitcode.add_i64, 8),
-    ],
+    ("kind", "numbers", "size"),
+    [(ti.f32, np.float32, 4), (ti.f64, np.float64, 8), (ti.i64, np.int64, 8)],
     ids=["float32", "float64", "integers"],
 )
-def test_many_threads_add_to_numbers_of_a_field(kind, numbers, add, size: int) -> None:
+def test_many_threads_add_to_numbers_of_a_field(kind, numbers, size: int) -> None:
     start_runtime("cpu", "float32")
     sums = ti.Vector.field(4, kind, shape=3)
     values = np.arange(1, 1001)
@@ -60,7 +57,7 @@ def test_many_threads_add_to_numbers_of_a_field(kind, numbers, add, size: int) -
     @ti.kernel
     def add_all(given: ti.types.ndarray()):
         for i in range(given.shape[0]):
-            add(ti.get_addr(sums, 0) + ti.cast(size * (4 * (i % 3) + 2), ti.u64), given[i])
+            add(kind, ti.get_addr(sums, 0) + ti.cast(size * (4 * (i % 3) + 2), ti.u64), given[i])
 
     add_all(values)
     expected = np.zeros((3, 4), numbers)

@@ -44,7 +44,8 @@ class Adder(SumPhases):
         for i in range(values.shape[0]):
             scale = self.momentum_scale(1)
             for c in ti.static(range(4)):
-                self.add_to_node(ti.get_addr(self.grid, 0), 1, c, values[i, c], scale)
+                node = self.node_at(ti.get_addr(self.grid, 0), 1)
+                self.add_to_grid(node, c, c, values[i, c], scale)
 
     @ti.kernel
     def scatter_far(self, far: ti.i32, value: ti.f32):
@@ -52,7 +53,8 @@ class Adder(SumPhases):
         for _ in range(1):
             scale = self.momentum_scale(1)
             before = ti.static(4 * (8 if self.deterministic else 4)) * (ti.cast(far, ti.u64) - 1)
-            self.add_to_node(ti.get_addr(self.grid, 0) - before, far, 2, value, scale)
+            node = self.node_at(ti.get_addr(self.grid, 0) - before, far)
+            self.add_to_grid(node, 2, 2, value, scale)
 
     @ti.kernel
     def units(self) -> ti.f64:
@@ -77,7 +79,7 @@ class Adder(SumPhases):
     def scatter_adjoint(self, values: ti.types.ndarray()):
         for i in range(values.shape[0]):
             scale = self.adjoint_scale(0, 1)
-            self.add_to_node(ti.get_addr(self.grid, 0), 0, 1, values[i], scale)
+            self.add_to_grid(ti.get_addr(self.grid, 0), 1, 1, values[i], scale)
 
     @ti.kernel
     def gather_adjoint(self):

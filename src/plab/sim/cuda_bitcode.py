@@ -11,30 +11,16 @@ from taichi.lang.impl import expr_init
 
 from plab.sim.bitcode import Bitcode
 
-__all__ = ["add_f32", "add_f64", "add_i64", "gather_sums", "particle", "particle_adjoint"]
+__all__ = ["add", "gather_sums", "particle", "particle_adjoint"]
 
 _function = Bitcode("cuda")
 
 
 @ti.func
-def add_f32(address, value):
-    """Add to a float32 at an address."""
-    place, number = ti.cast(address, ti.u64), ti.cast(value, ti.f32)
-    ti.static(_function("add", ti.f32))(place, number)
-
-
-@ti.func
-def add_f64(address, value):
-    """Add to a float64 at an address."""
-    place, number = ti.cast(address, ti.u64), ti.cast(value, ti.f64)
-    ti.static(_function("add", ti.f64))(place, number)
-
-
-@ti.func
-def add_i64(address, value):
-    """Add to an integer of 64 bits at an address."""
-    place, number = ti.cast(address, ti.u64), ti.cast(value, ti.i64)
-    ti.static(_function("add", ti.i64))(place, number)
+def add(kind: ti.template(), address, value):
+    """Add to a number at an address, which nobody waits for."""
+    place, number = ti.cast(address, ti.u64), ti.cast(value, kind)
+    ti.static(_function("add", kind))(place, number)
 
 
 @ti.func

@@ -10,7 +10,7 @@ import math
 
 import taichi as ti
 
-from plab.sim.cuda_bitcode import add_f32, add_f64, add_i64
+from plab.sim.cuda_bitcode import add
 from plab.sim.storage import Storage
 
 __all__ = ["SumPhases"]
@@ -102,19 +102,23 @@ class SumPhases(Storage):
         return 16 if self.real == ti.f32 and not self.deterministic else 32
 
     @ti.func
+    def node_at(self, first, node):
+        """Address of a node of a grid that is scattered to, whose ``first`` number is at an address."""
+        # In 64 bits: 32 count the nodes of many environments, but not their numbers.
+        return first + ti.static(self.node_bytes) * ti.cast(node, ti.u64)
+
+    @ti.func
     def add_to_grid(self, corner, number, component, value, scale: ti.template()):
         """Add to a number of a grid that is scattered to, counted from that at an address, ``corner``.
 
         ``scale`` is a 4-vector of how many of the components' units make 1, as :meth:`momentum_scale` and
         :meth:`adjoint_scale` return them.
         """
-        place = ti.cast(ti.cast(number, ti.u32), ti.u64)
+        place = corner + ti.static(self.node_bytes // 4) * ti.cast(ti.cast(number, ti.u32), ti.u64)
         if ti.static(self.deterministic):
-            add_i64(corner + 8 * place, value * ti.select(component == 3, scale[3], scale[0]))
-        elif ti.static(self.real == ti.f32):
-            add_f32(corner + 4 * place, value)
+            add(ti.i64, place, value * ti.select(component == 3, scale[3], scale[0]))
         else:
-            add_f64(corner + 8 * place, value)
+            add(self.real, place, value)
 
     @ti.func
     def momentum_scale(self, power: ti.template()):

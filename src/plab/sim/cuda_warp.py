@@ -346,8 +346,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 rows[within(sums + (column + k) * width + width - 1)] = total[3]
             self.wait_for_warp()
             head = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), node, begin)
-            # In 64 bits: 32 count the nodes of many environments, but not their numbers.
-            base = first + ti.static(self.node_bytes) * ti.cast(head, ti.u64)
+            base = self.node_at(first, head)
             least = ti.Vector([0, 0, 0])
             if ti.static(folded):
                 bits = ti.simt.warp.shfl_sync_i32(ti.u32(ALL_LANES), folds, begin)
