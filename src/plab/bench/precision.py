@@ -71,7 +71,7 @@ class Outcome:
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too."""
+    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too; NaN if one vanishes."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
     return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
@@ -145,6 +145,11 @@ def compare(
     exact = list(run(configurations, None, precision="float64", device=device))
     targets = [target for target, _ in exact]
     rounded = run(configurations, targets, precision="float32", device=device, deterministic=deterministic)
+    with np.errstate(invalid="ignore"):
+        yield from _rows(configurations, exact, rounded)
+
+
+def _rows(configurations: Sequence[Start], exact: Sequence, rounded: Iterator) -> Iterator[dict[str, object]]:
     for start, (target, right), (_, got) in zip(configurations, exact, rounded, strict=True):
         initial = mass_of(start.scene, sample_particles(start.scene))
         for kind in start.actions:
