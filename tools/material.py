@@ -169,7 +169,7 @@ def stress(module: ir.Module, name: str, real: ir.Type) -> None:
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     tau = material.stress(d, j, c2, mu, lam, limit, tile.series)
     c = tile.take(AT_C, 9, "source")
-    a = material.momentum_matrix(tau, c, tile.number("stress_scale"), tile.number("mass"))
+    a = material.scattered_matrix(tau, c, tile.number("stress_scale"), tile.number("mass"))
     tile.leave(0, a, "affine")
     tile.note_yield(d, limit)
     tile.code.end()
@@ -188,7 +188,7 @@ def stress_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     tile = Tile(module, name, real, "affine", "stress_scale rigid")
     d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
     adjoint = material.stress_adjoint
-    tau_bar = material.stress_of_momentum(tile.take(0, 9, "affine"), tile.number("stress_scale"))
+    tau_bar = material.scattered_matrix_adjoint(tile.take(0, 9, "affine"), tile.number("stress_scale"))
     d_bar, *bars = adjoint(d, j, c2, tau_bar, mu, lam, limit, tile.series)
     tile.leave(STRAIN_D_BAR, d_bar)
     tile.leave(STRAIN_BARS, bars)
@@ -211,7 +211,7 @@ def parameter_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     """Adjoints of a tile's mu, lambda and yield strain, from those of A in ``affine`` and of k."""
     tile = Tile(module, name, real, "affine", "stress_scale")
     d, (j, c2), k_bar = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.take(STRAIN_BARS, 1)[0]
-    tau_bar = material.stress_of_momentum(tile.take(0, 9, "affine"), tile.number("stress_scale"))
+    tau_bar = material.scattered_matrix_adjoint(tile.take(0, 9, "affine"), tile.number("stress_scale"))
     adjoint = material.parameter_adjoint
     tile.leave(STRAIN_PARAMETER_BARS, adjoint(d, j, c2, tau_bar, k_bar, tile.parameters()[2], tile.series))
     tile.code.end()

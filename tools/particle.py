@@ -117,7 +117,7 @@ def particle(module: ir.Module, name: str, real: ir.Type) -> None:
     mu, lam, limit = (one.number(key) for key in ("mu", "lam", "limit"))
     with code.where(fits):
         tau = material.stress(d, j, c2, mu, lam, limit, one.series)
-        one.leave("c", material.momentum_matrix(tau, c, one.number("stress_scale"), one.number("mass")))
+        one.leave("c", material.scattered_matrix(tau, c, one.number("stress_scale"), one.number("mass")))
         one.leave("f", g)
         with code.where(one.flows(d)):
             one.leave("f", material.flow(d, g, limit, one.series))
@@ -132,7 +132,7 @@ def particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     g, j, (c2, w, z, _z2, a1, a2, d), fits = one.strain(c, f)
     mu, lam, limit = (one.number(key) for key in ("mu", "lam", "limit"))
     with code.where(fits):
-        tau_bar = material.stress_of_momentum(a_bar, one.number("stress_scale"))
+        tau_bar = material.scattered_matrix_adjoint(a_bar, one.number("stress_scale"))
         adjoint = material.stress_adjoint
         d_bar, k_bar, c2_bar, j_bar = adjoint(d, j, c2, tau_bar, mu, lam, limit, one.series)
         kept = code.variables([x.value for x in (*d_bar, k_bar, *g_bar)])

@@ -52,12 +52,12 @@ __all__ = [
     "flow_adjoint",
     "hencky_strain",
     "log_adjoint",
-    "momentum_matrix",
     "parameter_adjoint",
+    "scattered_matrix",
+    "scattered_matrix_adjoint",
     "strain_adjoint",
     "stress",
     "stress_adjoint",
-    "stress_of_momentum",
     "trial_gradient",
     "yield_factor",
 ]
@@ -124,12 +124,12 @@ def stress(d, j, c2, mu, lam, yield_strain, series):
     return polynomial_sym(t0, t1 * k, t2 * k * k, d, square_sym(d))
 
 
-def momentum_matrix(tau, c, stress_scale, mass):
+def scattered_matrix(tau, c, stress_scale, mass):
     """A = stress_scale tau + mass C, which a particle scatters, from a symmetric tau (6) and a full C (9)."""
     return [stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + mass * c[i] for i in range(9)]
 
 
-def stress_of_momentum(a_bar, stress_scale):
+def scattered_matrix_adjoint(a_bar, stress_scale):
     """Symmetric part of the adjoint of tau (6) from that of A (9)."""
     half = 0.5 * stress_scale
     return (

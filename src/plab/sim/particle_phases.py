@@ -146,20 +146,6 @@ class ParticlePhases(Storage):
         self.accumulate_material(grid_index * self.materials + body, mu_bar, lam_bar, yield_bar)
 
     @ti.func
-    def served(self, z_squared, j):
-        """Whether the series served a single particle; not for NaN."""
-        return z_squared <= self.series.z_squared_max and j >= self.series.j_min and j <= self.series.j_max
-
-    @ti.func
-    def flows(self, k):
-        """Whether plastic flow is computed where the factor of return mapping is ``k``, the least of a
-        tile."""
-        out = k < 1.0
-        if ti.static(not self.skips.flow):
-            out = True
-        return out
-
-    @ti.func
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
         """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
         p = self.parameters_of_particle(e, source, lane)
