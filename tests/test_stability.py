@@ -10,7 +10,7 @@ import pytest
 
 from plab.bench.common_scene import PLACES, common_actions, common_scene, own_components
 from plab.bench.stability import QUICK, run_cases, run_refusals
-from plab.bench.stress_cases import Plan, bang_bang_actions, refusals, stress_cases
+from plab.bench.stress_cases import StressPlan, bang_bang_actions, refusals, stress_cases
 from plab.cli import bench
 from plab.config import build_scene, load_config
 from plab.scene import SceneError
@@ -70,7 +70,7 @@ def test_the_quick_plan_has_every_family_and_every_task() -> None:
 
 
 def test_few_particles_survive(tmp_path: Path) -> None:
-    cases = [c for c in stress_cases(Plan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
+    cases = [c for c in stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
     rows = list(run_cases(cases, "float32"))
     assert len(rows) == 4
     assert {row["outcome"] for row in rows} == {"survived"}

@@ -41,7 +41,7 @@ from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import Body, Scene, sample_particles
 from plab.sim import CONTACT_MODELS, PRECISIONS, Simulator, Skips
 
-__all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Setting", "attempts_at", "lattice", "rows"]
+__all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Resolution", "attempts_at", "lattice", "rows"]
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
 QUICK_TASKS = ("Move", "Rope")
@@ -67,7 +67,7 @@ class UncheckedScene(Scene):
 
 
 @dataclass(frozen=True)
-class Setting:
+class Resolution:
     """How something is simulated.
 
     Attributes:
@@ -110,18 +110,18 @@ class Plan:
     repeats: int = 2
     device: str = "cpu"
 
-    def settings(self) -> list[Setting]:
+    def settings(self) -> list[Resolution]:
         """All settings but the references."""
-        out = [Setting("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
-        out += [Setting("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
-        return out + [Setting("grid", n, self._substeps_of(n)) for n in self.grids[:-1]]
+        out = [Resolution("substeps", self.grid, s, p) for p in PRECISIONS for s in self.substeps]
+        out += [Resolution("substeps", self.grid, self.usual, p, "singular values") for p in PRECISIONS]
+        return out + [Resolution("grid", n, self._substeps_of(n)) for n in self.grids[:-1]]
 
-    def references(self) -> dict[str, Setting]:
+    def references(self) -> dict[str, Resolution]:
         """Reference by axis."""
         finest = self.grids[-1]
         return {
-            "substeps": Setting("substeps", self.grid, self.reference),
-            "grid": Setting("grid", finest, self._substeps_of(finest)),
+            "substeps": Resolution("substeps", self.grid, self.reference),
+            "grid": Resolution("grid", finest, self._substeps_of(finest)),
         }
 
     def _substeps_of(self, grid: int) -> int:
@@ -199,7 +199,7 @@ class Attempt:
         self._plan = plan
         self._places = places
 
-    def start(self, setting: Setting) -> tuple[Scene, np.ndarray]:
+    def start(self, setting: Resolution) -> tuple[Scene, np.ndarray]:
         """Return the common scene of a setting and its particles.
 
         Grids have particles on a lattice, as many per cell: random ones would differ between grids by more
@@ -225,7 +225,7 @@ def _volume(body: Body) -> float:
     return float(np.prod(body.size)) if body.shape == "box" else 4.0 / 3.0 * np.pi * body.size[0] ** 3
 
 
-def simulate(setting: Setting, attempts: Sequence[Attempt], repeats: int, device: str) -> Iterator[tuple]:
+def simulate(setting: Resolution, attempts: Sequence[Attempt], repeats: int, device: str) -> Iterator[tuple]:
     """Run all tasks and contact models in one setting.
 
     Args:
@@ -281,7 +281,9 @@ def _roll(simulator: Simulator, attempt: Attempt, repeats: int, mass: float) -> 
     return Result(simulator.state().x[0], gradient, min(seconds[1:] or seconds), outcome)
 
 
-def judge(setting: Setting, attempt: Attempt, result: Result, exact: Result, grid: int) -> dict[str, float]:
+def judge(
+    setting: Resolution, attempt: Attempt, result: Result, exact: Result, grid: int
+) -> dict[str, float]:
     """Return the errors of a result by column, NaN where there is nothing to compare; mass tensors are
     compared on so many grid nodes per axis."""
     start = attempt.start(setting)[1]

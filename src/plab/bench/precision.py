@@ -56,7 +56,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Simulated:
     """What one precision made of some actions.
 
     Attributes:
@@ -101,7 +101,7 @@ def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim
         sim: Precision, device and whether sums are deterministic, as :class:`plab.sim.Simulator` takes them.
 
     Yields:
-        For each configuration its target and an :class:`Outcome` per kind of actions.
+        For each configuration its target and a :class:`Simulated` per kind of actions.
     """
     simulator = Simulator([configurations[0].scene], terms=grid_terms(), **sim)
     for number, start in enumerate(configurations):
@@ -121,7 +121,7 @@ def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim
             soft = simulator.rollout(actions[None], strict=False)
             x, failures = final[kind]
             text = "; ".join([*failures, *soft.failures.values()])
-            outcomes[kind] = Outcome(x, cast(np.ndarray, soft.gradient)[0][:, start.components], text)
+            outcomes[kind] = Simulated(x, cast(np.ndarray, soft.gradient)[0][:, start.components], text)
         yield target, outcomes
 
 

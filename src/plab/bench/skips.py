@@ -18,7 +18,7 @@ from plab.errors import pick
 from plab.progress import show_line
 from plab.sim import Skips
 
-__all__ = ["CASES", "COLUMNS", "Case", "cases_for", "rows"]
+__all__ = ["CASES", "COLUMNS", "SkipCase", "cases_for", "rows"]
 
 COLUMNS = (
     "skip", "task", "device", "precision", "batch", "what", "ms", "ms_without", "ratio", "ratio_min",
@@ -31,7 +31,7 @@ rollout, because plasticity and contact have kinks."""
 
 
 @dataclass(frozen=True)
-class Case:
+class SkipCase:
     """A skip, and a scene that has something to skip.
 
     Attributes:
@@ -50,22 +50,22 @@ class Case:
 
 
 CASES = (
-    Case("empty_blocks", ("task=Move",)),
-    Case("empty_grids", ("task=Move",), devices=("cpu",)),
-    Case("far_manipulators", ("task=TripleMove",), (GRADIENT, FORWARD)),
-    Case("rotations", ("task=TripleMove",), (GRADIENT, FORWARD)),
-    Case("singular_values", ("task=Move",)),
-    Case("flow", ("task=Move",)),
-    Case("history", ("task=Move",), (REWARD,)),
-    Case("still_manipulators", ("task=Rope",), (GRADIENT, REWARD)),
-    Case("adjoints", ("task=Torus",), (GRADIENT,), from_start=True),
-    Case("launches", ("task=Move",), (FORWARD, GRADIENT), devices=("cuda",)),
-    Case("waiting", ("task=Move",), devices=("cpu",)),
+    SkipCase("empty_blocks", ("task=Move",)),
+    SkipCase("empty_grids", ("task=Move",), devices=("cpu",)),
+    SkipCase("far_manipulators", ("task=TripleMove",), (GRADIENT, FORWARD)),
+    SkipCase("rotations", ("task=TripleMove",), (GRADIENT, FORWARD)),
+    SkipCase("singular_values", ("task=Move",)),
+    SkipCase("flow", ("task=Move",)),
+    SkipCase("history", ("task=Move",), (REWARD,)),
+    SkipCase("still_manipulators", ("task=Rope",), (GRADIENT, REWARD)),
+    SkipCase("adjoints", ("task=Torus",), (GRADIENT,), from_start=True),
+    SkipCase("launches", ("task=Move",), (FORWARD, GRADIENT), devices=("cuda",)),
+    SkipCase("waiting", ("task=Move",), devices=("cpu",)),
 )
 """A row of the table each, for every kind."""
 
 
-def cases_for(device: str, names: Sequence[str] | None) -> list[Case]:
+def cases_for(device: str, names: Sequence[str] | None) -> list[SkipCase]:
     """Return the cases of a device, all or those of some skips.
 
     Raises:
@@ -80,7 +80,7 @@ def cases_for(device: str, names: Sequence[str] | None) -> list[Case]:
 
 
 def rows(
-    cases: Sequence[Case],
+    cases: Sequence[SkipCase],
     overrides: Sequence[str],
     batch: int,
     steps: int,
@@ -118,7 +118,7 @@ def rows(
         del with_it, without
 
 
-def _row(case: Case, with_it: Workload, without: Workload, kind: str, repeats: int) -> dict[str, object]:
+def _row(case: SkipCase, with_it: Workload, without: Workload, kind: str, repeats: int) -> dict[str, object]:
     cfg, simulator = with_it.cfg, with_it.simulator
     loss, gradient = _differences(with_it, without, kind == GRADIENT)
     seconds = _alternate([with_it.call(kind), without.call(kind)], repeats)

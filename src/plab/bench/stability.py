@@ -21,7 +21,7 @@ from typing import cast
 
 import numpy as np
 
-from plab.bench.stress_cases import Case, Plan, refusals
+from plab.bench.stress_cases import StressCase, StressPlan, refusals
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms
 from plab.scene import SceneError
@@ -40,11 +40,11 @@ REFUSAL = "refusal"
 
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
-FULL = Plan(particles=300, long_tasks=tuple(suite_tasks()))
-QUICK = Plan(particles=64, variants=("1",), long_tasks=("Move",))
+FULL = StressPlan(particles=300, long_tasks=tuple(suite_tasks()))
+QUICK = StressPlan(particles=64, variants=("1",), long_tasks=("Move",))
 
 
-def run_cases(cases: Sequence[Case], precision: str) -> Iterator[dict[str, object]]:
+def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
     """Run cases and judge them.
 
     Args:
@@ -84,9 +84,9 @@ def run_refusals() -> Iterator[dict[str, object]]:
         yield dict(zip(COLUMNS, values, strict=True))
 
 
-def _groups(cases: Sequence[Case]) -> dict[tuple, list[Case]]:
+def _groups(cases: Sequence[StressCase]) -> dict[tuple, list[StressCase]]:
     """Cases by what a compiled simulator is made for, and by what one rollout shares."""
-    groups: dict[tuple, list[Case]] = {}
+    groups: dict[tuple, list[StressCase]] = {}
     for case in cases:
         scene = case.scene
         shapes = tuple(m.shape for m in scene.manipulators)
@@ -105,7 +105,7 @@ def _target(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(mass, shape), np.broadcast_to(np.maximum(distance, 0.0), shape)
 
 
-def _run_together(simulator: Simulator, cases: Sequence[Case]) -> list[dict[str, object]]:
+def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> list[dict[str, object]]:
     """Run at most a batch of cases of one group."""
     full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
     _start(simulator, full)
@@ -140,7 +140,7 @@ def _run_together(simulator: Simulator, cases: Sequence[Case]) -> list[dict[str,
     return rows
 
 
-def _start(simulator: Simulator, cases: Sequence[Case]) -> None:
+def _start(simulator: Simulator, cases: Sequence[StressCase]) -> None:
     """Put a batch of cases into their initial states."""
     simulator.set_scenes([case.scene for case in cases])
     simulator.set_contact([case.contact for case in cases])
@@ -151,7 +151,7 @@ def _start(simulator: Simulator, cases: Sequence[Case]) -> None:
     simulator.set_initial_state(state)
 
 
-def _outcome(simulator, case: Case, failure: str | None, e: int, state, mass: np.ndarray) -> str:
+def _outcome(simulator, case: StressCase, failure: str | None, e: int, state, mass: np.ndarray) -> str:
     """Judge the end of a case."""
     if failure is not None:
         return failure
@@ -166,7 +166,7 @@ def _outcome(simulator, case: Case, failure: str | None, e: int, state, mass: np
     return "survived"
 
 
-def _speeds(simulator: Simulator, cases: Sequence[Case]) -> np.ndarray:
+def _speeds(simulator: Simulator, cases: Sequence[StressCase]) -> np.ndarray:
     """Largest speed of any particle after any environment step, shape [case]."""
     full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
     _start(simulator, full)

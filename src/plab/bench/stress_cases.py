@@ -19,7 +19,7 @@ from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.scene import Body, Manipulator, Scene, Vec3, vector3
 
-__all__ = ["Case", "Plan", "refusals", "stress_cases"]
+__all__ = ["StressCase", "StressPlan", "refusals", "stress_cases"]
 
 STEP_TIME = 19e-4
 """Simulated time of an environment step of the suite [s]."""
@@ -32,7 +32,7 @@ HOLD = 10
 
 
 @dataclass(frozen=True)
-class Plan:
+class StressPlan:
     """How much is run.
 
     Attributes:
@@ -51,7 +51,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Case:
+class StressCase:
     """One thing to survive.
 
     Attributes:
@@ -73,7 +73,7 @@ class Case:
     contact_weight: float = 0.0
 
 
-def stress_cases(plan: Plan) -> list[Case]:
+def stress_cases(plan: StressPlan) -> list[StressCase]:
     """Return all cases of a plan."""
     families = (suite_actions, materials, crushing, walls, overlaps, deformations, stiff, few_particles)
     return [case for family in families for case in family(plan)]
@@ -106,14 +106,20 @@ def task_scene(task: str, variant: str) -> Scene:
 
 
 def common_case(
-    plan: Plan, family: str, name: str, scene: Scene, actions: np.ndarray, contact: str, **state: np.ndarray
-) -> Case:
+    plan: StressPlan,
+    family: str,
+    name: str,
+    scene: Scene,
+    actions: np.ndarray,
+    contact: str,
+    **state: np.ndarray,
+) -> StressCase:
     """Return a case in the common kind of scene, from a scene and actions of its own."""
     common, actions = common_scene(scene, plan.particles), common_actions(scene, actions)
-    return Case(family, name, common, actions, contact, state)
+    return StressCase(family, name, common, actions, contact, state)
 
 
-def suite_actions(plan: Plan) -> Iterator[Case]:
+def suite_actions(plan: StressPlan) -> Iterator[StressCase]:
     """All configurations under random and bang-bang actions, in both contact models; some for long."""
     short = itertools.product(["suite"], suite_tasks(), plan.variants, ACTIONS, ("soft", "hard"))
     family = f"{plan.long_horizon} steps"
@@ -140,7 +146,7 @@ def sphere(*position: float) -> Manipulator:
     return Manipulator("Sphere", (0.04,), vector3(position), scale=(0.03,) * 3)
 
 
-def squeezing(plan: Plan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
+def squeezing(plan: StressPlan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
     """Two balls at the cube's sides, and actions that press them together and pull them apart again."""
     wave = np.where(np.arange(plan.horizon) % 24 < 12, 1.0, -1.0)
     actions = np.zeros((plan.horizon, 6))
@@ -148,7 +154,7 @@ def squeezing(plan: Plan) -> tuple[tuple[Manipulator, ...], np.ndarray]:
     return (sphere(0.36, 0.1, 0.5), sphere(0.64, 0.1, 0.5)), actions
 
 
-def materials(plan: Plan) -> Iterator[Case]:
+def materials(plan: StressPlan) -> Iterator[StressCase]:
     """Yield stress from none to infinite, Poisson ratio up to what the suite's time step allows, E."""
     tools, actions = squeezing(plan)
     for young, nu, flow in itertools.product(
@@ -159,7 +165,7 @@ def materials(plan: Plan) -> Iterator[Case]:
         yield common_case(plan, "material", name, scene, actions, "soft")
 
 
-def stiff(plan: Plan) -> Iterator[Case]:
+def stiff(plan: StressPlan) -> Iterator[StressCase]:
     """Materials that need all the substeps that they are given: E times 100, and nu up to 0.49."""
     tools, actions = squeezing(plan)
     substeps = math.ceil(STEP_TIME / replace(box_scene(), youngs_modulus=5e5).stable_dt)
@@ -171,7 +177,7 @@ def stiff(plan: Plan) -> Iterator[Case]:
         limit = scene.youngs_modulus * (scene.stable_dt / scene.dt) ** 2
         scene = replace(counted(scene, plan.particles), youngs_modulus=0.9999 * limit)
         name = f"E {limit:.0f}, nu {nu:g}, yield stress {flow:g}, {contact}"
-        yield Case("stiff", name, scene, actions[:10], contact, contact_weight=1.0)
+        yield StressCase("stiff", name, scene, actions[:10], contact, contact_weight=1.0)
 
 
 def counted(scene: Scene, particles: int, **changes: Any) -> Scene:
@@ -179,7 +185,7 @@ def counted(scene: Scene, particles: int, **changes: Any) -> Scene:
     return replace(scene, bodies=(replace(scene.bodies[0], particles=particles, **changes),))
 
 
-def crushing(plan: Plan) -> Iterator[Case]:
+def crushing(plan: StressPlan) -> Iterator[StressCase]:
     """Manipulators that crush the cube against the floor or each other, and stay there."""
     lying = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
     thin, six = (0.03,) * 3, np.concatenate([np.eye(3), -np.eye(3)])
@@ -210,7 +216,7 @@ def crushing(plan: Plan) -> Iterator[Case]:
         yield common_case(plan, "crush", f"{name}, yield stress {flow:g}, {contact}", scene, held, contact)
 
 
-def walls(plan: Plan) -> Iterator[Case]:
+def walls(plan: StressPlan) -> Iterator[StressCase]:
     """Cubes thrown and pushed into the walls and corners."""
     for number, direction in enumerate(itertools.product((-1.0, 0.0, 1.0), repeat=3)):
         if not any(direction):
@@ -227,7 +233,7 @@ def walls(plan: Plan) -> Iterator[Case]:
         yield common_case(plan, "walls", f"pushed into {place}, {contact}", scene, push, contact)
 
 
-def overlaps(plan: Plan) -> Iterator[Case]:
+def overlaps(plan: StressPlan) -> Iterator[StressCase]:
     """Bodies in each other, manipulators in a body, all particles at one point."""
     cube = Body("box", (0.5, 0.3, 0.5), (0.2,) * 3, 1000)
     ball = Body("sphere", (0.55, 0.35, 0.5), (0.12,), 1000)
@@ -254,7 +260,7 @@ def overlaps(plan: Plan) -> Iterator[Case]:
         yield common_case(plan, "overlap", f"{name}, {contact}", scene, own, contact, **state)
 
 
-def deformations(plan: Plan) -> Iterator[Case]:
+def deformations(plan: StressPlan) -> Iterator[StressCase]:
     """Initial deformation gradients that are inverted, singular, tiny or huge, with and without flow.
 
     They store a lot of energy, and the material stiffens while it is let go, hence the substeps.
@@ -278,16 +284,16 @@ def deformations(plan: Plan) -> Iterator[Case]:
         scene = box_scene(*tools, yield_stress=flow, substeps=DEFORMED, dt=STEP_TIME / DEFORMED)
         scene, state = counted(scene, plan.particles), {"F": turn @ shape @ turn.transpose(0, 2, 1)}
         title = f"{name}, yield stress {flow:g}"
-        yield Case("deformation", title, scene, actions[:3], "soft", state, contact_weight=1.0)
+        yield StressCase("deformation", title, scene, actions[:3], "soft", state, contact_weight=1.0)
 
 
-def few_particles(plan: Plan) -> Iterator[Case]:
+def few_particles(plan: StressPlan) -> Iterator[StressCase]:
     """A single particle, and a handful."""
     tools, actions = squeezing(plan)
     for count, flow, contact in itertools.product((1, 5), (50.0, math.inf), ("soft", "hard")):
         scene = counted(box_scene(*tools, yield_stress=flow), count, size=(0.02,) * 3)
         name = f"{count} particle(s), yield stress {flow:g}, {contact}"
-        yield Case("few particles", name, scene, actions, contact, contact_weight=1.0)
+        yield StressCase("few particles", name, scene, actions, contact, contact_weight=1.0)
 
 
 # --------------------------------------------------------------------------------------------------- refusals

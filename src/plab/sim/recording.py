@@ -18,7 +18,7 @@ from plab.sim.tensors import on_device, output_for
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Recorder", "Recording"]
+__all__ = ["Recording", "StateRecorder"]
 
 
 class Recording:
@@ -75,7 +75,7 @@ class Recording:
         return self._back({name: bar for name, bar in given.items() if bar is not None})
 
 
-class Recorder:
+class StateRecorder:
     """Takes states from the device while a rollout runs, and puts derivatives by them to the states'
     adjoints."""
 

@@ -15,7 +15,7 @@ from plab.sim.closed_loop import ClosedLoop
 from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
 from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
-from plab.sim.recording import Recorder, Recording
+from plab.sim.recording import Recording, StateRecorder
 from plab.sim.state import Rollout, State
 from plab.sim.tensors import action_array, numbers_of
 
@@ -109,7 +109,7 @@ class Simulator(ForwardSimulator):
         self.reset()
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
         poses = self._pose_history(steps, self._initial_poses)
-        recorder = Recorder(self._particles, actions, every_step, mass, steps)
+        recorder = StateRecorder(self._particles, actions, every_step, mass, steps)
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         self._tape.forward(array, poses, None, steps, plan, after=recorder.note)
         require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
