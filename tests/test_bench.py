@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import plab
 from plab.bench import bound, everyday, skips, speed, workload
@@ -224,6 +225,29 @@ def test_skips_change_nothing(usual: Simulator, device: str) -> None:
     assert 0 < usual.steps_before_contact(STEPS) < STEPS
     assert thorough.steps_before_contact(STEPS) == 0
     assert np.abs(results[0].gradient[:, 0]).max() > 0
+
+
+@pytest.mark.parametrize("skipped", [True, False])
+def test_the_switch_of_far_manipulators_is_obeyed(skipped: bool) -> None:
+    sim = simulator(skips=Skips(far_manipulators=skipped))
+    engine, seen = sim._engine, ti.field(ti.i32, shape=())
+
+    @ti.kernel
+    def look_at_a_corner():
+        for _ in range(1):
+            seen[None] = engine.near_manipulators(0, 0, 0)
+
+    sim.step(actions()[:, 0])
+    look_at_a_corner()
+    # The sphere and the pillar are far from it.
+    assert seen[None] == (0 if skipped else 0b11)
+
+
+@pytest.mark.parametrize("task", ["Table", "Move"])
+def test_rollouts_begin_where_a_manipulator_touches_the_body(task: str) -> None:
+    load = workload.build(load_config([f"task={task}", "sim.particles_scale=0.05"]), 1, 2)
+    load.call(ROLLOUT)()
+    assert load.simulator.steps_before_contact(load.steps) == 0
 
 
 def resident_mb() -> float:

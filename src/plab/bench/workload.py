@@ -144,29 +144,31 @@ def build(
         simulator.set_initial_state(like.simulator.state())
     elif not from_start:
         first = max(0, actions.shape[1] // 2 - steps // 2)
-        simulator.reset()
-        for t in range(first):
-            simulator.step(actions[:, t])
-        first += _until_contact(simulator, actions[:, first:])
+        _run(simulator, actions[:, :first])
+        idle = _before_contact(simulator, actions[:, first:])
+        _run(simulator, actions[:, first : first + idle])
+        first += idle
         simulator.set_initial_state(simulator.state())
     chosen = np.arange(first, first + steps) % actions.shape[1]
     return Workload(cfg, simulator, actions[:, chosen], first_step_s)
 
 
-def _until_contact(simulator: Simulator, actions: np.ndarray) -> int:
-    """Go on to the state before a manipulator touches a body, if one does; return the number of steps."""
-    first = state = simulator.state()
-    simulator.set_initial_state(first)
+def _run(simulator: Simulator, actions: np.ndarray) -> None:
+    """Go through actions, shape [batch, T, A], from the initial state."""
+    simulator.reset()
+    for t in range(actions.shape[1]):
+        simulator.step(actions[:, t])
+
+
+def _before_contact(simulator: Simulator, actions: np.ndarray) -> int:
+    """Take the state for the initial one, and return how many steps by actions, shape [batch, T, A], go by
+    before a manipulator touches a body; 0 if none does."""
+    simulator.set_initial_state(simulator.state())
     simulator.reset()
     for t in range(actions.shape[1]):
         simulator.step(actions[:, t])
         if simulator.steps_before_contact(1) == 0:
-            simulator.set_initial_state(state)
-            simulator.reset()
             return t
-        state = simulator.state()
-    simulator.set_initial_state(first)
-    simulator.reset()
     return 0
 
 

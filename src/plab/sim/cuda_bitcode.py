@@ -31,8 +31,9 @@ def variables(real: ti.template(), values: ti.template()):
 
 @ti.func
 def particle(real: ti.template(), c: ti.template(), f: ti.template(), numbers: ti.template()):
-    """Return A and F after the substep of a particle whose C and F are given, and whether the series served
-    it; else nothing is changed. ``numbers`` are parameters and constants as in ``tools/particle.py``."""
+    """Return A and F after the substep of a particle whose C and F are given, 9 numbers each, and whether the
+    series served it; else nothing is changed. ``numbers`` are those of ``tools/particle.py``, in its order:
+    three parameters, constants, bounds."""
     a, f_new, rest = variables(real, c), variables(real, f), variables(real, numbers)
     served = ti.cast(0.0, real)
     ti.static(_function("particle", real))(*a, *f_new, *rest, served)
@@ -48,8 +49,8 @@ def particle_adjoint(
     f_bar: ti.template(),
     numbers: ti.template(),
 ):
-    """Return the adjoints of C and F of a particle, and those of its three parameters, from those of A and of
-    the new F, and whether the series served it; else nothing is changed."""
+    """Return the adjoints of C and F of a particle, 9 numbers each, and of its three parameters, from those
+    of A and of the new F, and whether the series served it; else nothing is changed."""
     c_bar, old_bar, rest = variables(real, c), variables(real, f), variables(real, numbers)
     a, b, served = variables(real, a_bar), variables(real, f_bar), ti.cast(0.0, real)
     ti.static(_function("particle_adjoint", real))(*c_bar, *old_bar, *a, *b, *rest, served)

@@ -247,7 +247,8 @@ class Simulator(ForwardSimulator):
         return self._particles.unpack(bar.to_numpy(), poses)
 
     def steps_before_contact(self, steps: int) -> int:
-        """Environment steps of the rollout just done before a manipulator touches any environment's body."""
+        """Environment steps of the rollout just done, of ``steps``, before a manipulator that moves touches
+        any environment's body; 0 where the whole gradient is asked for."""
         if self._engine.full_gradient or not self._skips.adjoints:
             return 0
         touched = self._engine.touched.to_numpy() != 0

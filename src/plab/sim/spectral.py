@@ -26,7 +26,8 @@ SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
 
 
-# Taichi's own products of matrices take it several times as long to compile.
+# Taichi's own products of matrices take it several times as long to compile; those of plab.sim.linalg are no
+# functions of Taichi's.
 
 
 @ti.func
