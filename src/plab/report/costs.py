@@ -154,7 +154,8 @@ def _diagram(name: str, table: pd.DataFrame, panels: Sequence[tuple[str, str, st
 
 def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str) -> None:
     """Draw a line per precision and material: a column of errors against one of costs, with what was
-    varied."""
+    varied at the first line's points."""
+    named: set[int] = set()
     for (precision, material), rows in own.groupby(["precision", "material"], sort=False):
         (colour, dashes), mark = _LINES.get(precision, ("#777777", "-")), _MARKS.get(material, "^")
         label = precision if material == "series" else f"{precision}, {material}"
@@ -162,7 +163,9 @@ def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str)
         stable = rows[rows["outcome"] == "stable"]
         panel.plot(stable[cost], stable["error"], mark + dashes, color=colour, markersize=3.5, label=label)
         for x, y, number in stable[[cost, "error", varied]].itertuples(index=False):
-            panel.annotate(str(number), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
+            if number not in named:
+                panel.annotate(str(number), (x, y), fontsize=5, xytext=(2, 2), textcoords="offset points")
+        named.update(stable[varied])
         # What broke off has no error: it is at the upper edge, whatever the scale.
         above: Any = panel.get_xaxis_transform()
         small: dict[str, Any] = {"fontsize": 5, "textcoords": "offset points", "xycoords": above}
