@@ -4,6 +4,9 @@ A matrix is a tuple of 9 components in row-major order, a symmetric one a tuple 
 12).
 """
 
+import operator
+from functools import reduce
+
 __all__ = [
     "cofactor_sym",
     "det",
@@ -23,49 +26,38 @@ __all__ = [
 ]
 
 
+SYM = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of a symmetric matrix's components."""
+
+
+def transposed(a):
+    """A^T of a full matrix."""
+    return tuple(a[3 * k + i] for i in range(3) for k in range(3))
+
+
+def entry(a, b, i, j):
+    """Component i, j of A B, both full."""
+    return total(a[3 * i + k] * b[3 * k + j] for k in range(3))
+
+
+def total(terms):
+    """Their sum, from the first on."""
+    return reduce(operator.add, terms)
+
+
 def mul(a, b):
     """A B, both full."""
-    return (
-        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
-        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
-        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
-        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
-        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
-        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
-        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
-    )
+    return tuple(entry(a, b, i, j) for i in range(3) for j in range(3))
 
 
 def mul_tn(a, b):
     """A^T B, both full."""
-    return (
-        a[0] * b[0] + a[3] * b[3] + a[6] * b[6],
-        a[0] * b[1] + a[3] * b[4] + a[6] * b[7],
-        a[0] * b[2] + a[3] * b[5] + a[6] * b[8],
-        a[1] * b[0] + a[4] * b[3] + a[7] * b[6],
-        a[1] * b[1] + a[4] * b[4] + a[7] * b[7],
-        a[1] * b[2] + a[4] * b[5] + a[7] * b[8],
-        a[2] * b[0] + a[5] * b[3] + a[8] * b[6],
-        a[2] * b[1] + a[5] * b[4] + a[8] * b[7],
-        a[2] * b[2] + a[5] * b[5] + a[8] * b[8],
-    )
+    return mul(transposed(a), b)
 
 
 def mul_nt(a, b):
     """A B^T, both full."""
-    return (
-        a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
-        a[0] * b[3] + a[1] * b[4] + a[2] * b[5],
-        a[0] * b[6] + a[1] * b[7] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[1] + a[5] * b[2],
-        a[3] * b[3] + a[4] * b[4] + a[5] * b[5],
-        a[3] * b[6] + a[4] * b[7] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[1] + a[8] * b[2],
-        a[6] * b[3] + a[7] * b[4] + a[8] * b[5],
-        a[6] * b[6] + a[7] * b[7] + a[8] * b[8],
-    )
+    return mul(a, transposed(b))
 
 
 def det(a):
@@ -122,14 +114,7 @@ def inverse_sym(s):
 
 def outer_sym(a):
     """A A^T of a full matrix, symmetric."""
-    return (
-        a[0] * a[0] + a[1] * a[1] + a[2] * a[2],
-        a[3] * a[3] + a[4] * a[4] + a[5] * a[5],
-        a[6] * a[6] + a[7] * a[7] + a[8] * a[8],
-        a[0] * a[3] + a[1] * a[4] + a[2] * a[5],
-        a[0] * a[6] + a[1] * a[7] + a[2] * a[8],
-        a[3] * a[6] + a[4] * a[7] + a[5] * a[8],
-    )
+    return tuple(entry(a, transposed(a), i, j) for i, j in SYM)
 
 
 def square_sym(s):
@@ -161,36 +146,29 @@ def mul_sym_mat(s, b):
 
 def sym_product_twice(a, b):
     """A B + B A of two symmetric matrices, symmetric."""
-    return (
-        2.0 * (a[0] * b[0] + a[3] * b[3] + a[4] * b[4]),
-        2.0 * (a[3] * b[3] + a[1] * b[1] + a[5] * b[5]),
-        2.0 * (a[4] * b[4] + a[5] * b[5] + a[2] * b[2]),
-        a[0] * b[3] + a[3] * b[1] + a[4] * b[5] + b[0] * a[3] + b[3] * a[1] + b[4] * a[5],
-        a[0] * b[4] + a[3] * b[5] + a[4] * b[2] + b[0] * a[4] + b[3] * a[5] + b[4] * a[2],
-        a[3] * b[4] + a[1] * b[5] + a[5] * b[2] + b[3] * a[4] + b[1] * a[5] + b[5] * a[2],
+    a, b = mat_from_sym(a), mat_from_sym(b)
+    pairs = ((a, b), (b, a))
+    return tuple(
+        2.0 * entry(a, b, i, i)
+        if i == j
+        else total(c[3 * i + k] * d[3 * k + j] for c, d in pairs for k in range(3))
+        for i, j in SYM
     )
 
 
 def sandwich_sym(w, z):
     """W Z W of two symmetric matrices, symmetric."""
-    wz = mul(mat_from_sym(w), mat_from_sym(z))
-    return (
-        wz[0] * w[0] + wz[1] * w[3] + wz[2] * w[4],
-        wz[3] * w[3] + wz[4] * w[1] + wz[5] * w[5],
-        wz[6] * w[4] + wz[7] * w[5] + wz[8] * w[2],
-        wz[0] * w[3] + wz[1] * w[1] + wz[2] * w[5],
-        wz[0] * w[4] + wz[1] * w[5] + wz[2] * w[2],
-        wz[3] * w[4] + wz[4] * w[5] + wz[5] * w[2],
-    )
+    w = mat_from_sym(w)
+    wz = mul(w, mat_from_sym(z))
+    return tuple(entry(wz, w, i, j) for i, j in SYM)
 
 
 def sym_of_product(a, b):
     """Symmetric part of A B^T, both full."""
-    return (
-        a[0] * b[0] + a[1] * b[1] + a[2] * b[2],
-        a[3] * b[3] + a[4] * b[4] + a[5] * b[5],
-        a[6] * b[6] + a[7] * b[7] + a[8] * b[8],
-        0.5 * (a[0] * b[3] + a[1] * b[4] + a[2] * b[5] + a[3] * b[0] + a[4] * b[1] + a[5] * b[2]),
-        0.5 * (a[0] * b[6] + a[1] * b[7] + a[2] * b[8] + a[6] * b[0] + a[7] * b[1] + a[8] * b[2]),
-        0.5 * (a[3] * b[6] + a[4] * b[7] + a[5] * b[8] + a[6] * b[3] + a[7] * b[4] + a[8] * b[5]),
+    b = transposed(b)
+    return tuple(
+        entry(a, b, i, i)
+        if i == j
+        else 0.5 * total(a[3 * m + k] * b[3 * k + n] for m, n in ((i, j), (j, i)) for k in range(3))
+        for i, j in SYM
     )

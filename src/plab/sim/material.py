@@ -86,27 +86,13 @@ def hencky_strain(g, j, series):
     tr_y = y[0] + y[1] + y[2]
     a1, a2 = log_coefficients(i1, 0.5 * (i1 * i1 - tr_y), det_sym(z), series.log_terms)
     mean = (a1 * i1 + a2 * tr_y) * (1.0 / 3.0)
-    d = (
-        a1 * z[0] + a2 * y[0] - mean,
-        a1 * z[1] + a2 * y[1] - mean,
-        a1 * z[2] + a2 * y[2] - mean,
-        a1 * z[3] + a2 * y[3],
-        a1 * z[4] + a2 * y[4],
-        a1 * z[5] + a2 * y[5],
-    )
+    d = [a1 * z[i] + a2 * y[i] - mean if i < 3 else a1 * z[i] + a2 * y[i] for i in range(6)]
     return c2, w, z, tr_y, a1, a2, d
 
 
 def polynomial_sym(p0, p1, p2, d, d2):
     """p0 I + p1 d + p2 d^2, symmetric."""
-    return (
-        p0 + p1 * d[0] + p2 * d2[0],
-        p0 + p1 * d[1] + p2 * d2[1],
-        p0 + p1 * d[2] + p2 * d2[2],
-        p1 * d[3] + p2 * d2[3],
-        p1 * d[4] + p2 * d2[4],
-        p1 * d[5] + p2 * d2[5],
-    )
+    return [(p0 + p1 * d[i] if i < 3 else p1 * d[i]) + p2 * d2[i] for i in range(6)]
 
 
 def stress(d, j, c2, mu, lam, yield_strain, series):
@@ -243,16 +229,7 @@ def flow_adjoint(d, g, f_new_bar, yield_strain, series):
     return d_bar, k_bar, mul_sym_mat(m, f_new_bar)
 
 
-def log_adjoint(
-    z,
-    a1,
-    a2,
-    d,
-    d_bar,
-    k_bar,
-    yield_strain,
-    series,
-):
+def log_adjoint(z, a1, a2, d, d_bar, k_bar, yield_strain, series):
     """Third part of the adjoint of return mapping: adjoint of Z (6) under d = log(b) / 2, whose coefficients
     of Z and Z^2 are a1 and a2, from those of d at fixed k and of k."""
     _q, _det, norm, k = yield_factor(d, yield_strain)
@@ -270,29 +247,15 @@ def log_adjoint(
     quad = sym_product_twice(dev, z)
     cof = cofactor_sym(z)
     diag = i1_bar + i2_bar * i1
-    return (
-        a1 * dev[0] + a2 * quad[0] + diag - i2_bar * z[0] + i3_bar * cof[0],
-        a1 * dev[1] + a2 * quad[1] + diag - i2_bar * z[1] + i3_bar * cof[1],
-        a1 * dev[2] + a2 * quad[2] + diag - i2_bar * z[2] + i3_bar * cof[2],
-        a1 * dev[3] + a2 * quad[3] - i2_bar * z[3] + i3_bar * cof[3],
-        a1 * dev[4] + a2 * quad[4] - i2_bar * z[4] + i3_bar * cof[4],
-        a1 * dev[5] + a2 * quad[5] - i2_bar * z[5] + i3_bar * cof[5],
-    )
+    return [
+        (a1 * dev[i] + a2 * quad[i] + diag if i < 3 else a1 * dev[i] + a2 * quad[i])
+        - i2_bar * z[i]
+        + i3_bar * cof[i]
+        for i in range(6)
+    ]
 
 
-def strain_adjoint(
-    c,
-    f,
-    g,
-    j,
-    c2,
-    w,
-    z_bar,
-    c2_bar,
-    j_bar,
-    g_bar,
-    dt,
-):
+def strain_adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, dt):
     """Last part of the adjoint of return mapping: adjoints of C and F (9 each) from those of Z, of c2 and J
     by the stress, and of G by the flow; ``w`` is (b + I)^-1."""
     p = sandwich_sym(w, z_bar)
