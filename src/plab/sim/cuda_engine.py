@@ -15,8 +15,9 @@ import sys
 import taichi as ti
 
 from plab.sim.cuda_phases import DISTANCE_GROUPS
-from plab.sim.cuda_threads import RESIDENT_BLOCK, ThreadPhases
-from plab.sim.cuda_warp import NODE_BITS, WARP_BLOCK
+from plab.sim.cuda_threads import POSE_SHARE, RESIDENT_BLOCK, ThreadPhases
+from plab.sim.cuda_warp import BLOCK_WARPS, NODE_BITS, NODE_STRIDE, WARP_BLOCK, WARP_NUMBERS
+from plab.sim.particle_phases import SIZES
 from plab.sim.storage import STATE
 from plab.sim.tensors import Array
 
@@ -25,18 +26,34 @@ __all__ = ["CudaEngine"]
 THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 
-RESIDENT_TURNS = 2
+RESIDENT_BLOCKS = 2
+"""Blocks of a multiprocessor in the step that is one launch, at most."""
+
+RESIDENT_TURNS = 4
 """Up to so many particles per resident thread a step is one launch, and so is its adjoint."""
 
+PARTS_MOST = 4
+"""Warps that share a tile's particles there, at most."""
 
-def multiprocessors() -> int:
-    """Multiprocessors of the CUDA device, by asking the driver; Taichi does not tell."""
-    count = ctypes.c_int(0)
+RESERVED = 1024
+"""Bytes of shared memory that a device takes for itself from each block."""
+
+MULTIPROCESSORS, SHARED_BYTES = 16, 81
+"""The driver's numbers for how many multiprocessors there are, and for the shared memory of each [bytes]."""
+
+
+def device_attribute(number: int) -> int:
+    """A number of the CUDA device, by asking the driver; Taichi does not tell. 1 if it does not answer."""
+    value = ctypes.c_int(0)
     driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    attribute = 16  # CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT
-    if driver.cuDeviceGetAttribute(ctypes.byref(count), attribute, 0) != 0 or count.value < 1:
-        return 1
-    return count.value
+    failed = driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0) != 0
+    return 1 if failed else max(1, value.value)
+
+
+def resident_blocks(number_bytes: int) -> int:
+    """How many blocks of the step that is one launch a multiprocessor certainly holds at once."""
+    shared = number_bytes * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
+    return max(1, min(RESIDENT_BLOCKS, device_attribute(SHARED_BYTES) // shared))
 
 
 @ti.data_oriented
@@ -54,13 +71,19 @@ class CudaEngine(ThreadPhases):
         super().__init__(*args)
         self.particle_threads = self.batch * self.tiles * self.lanes
         self.pose_threads = self.batch * max(1, self.manipulators)
-        self.resident_threads = multiprocessors() * RESIDENT_BLOCK
+        self.frame_threads = -(-self.pose_threads // POSE_SHARE) * RESIDENT_BLOCK
+        blocks = device_attribute(MULTIPROCESSORS) * resident_blocks(SIZES[self.real])
+        self.resident_threads = blocks * RESIDENT_BLOCK
+        # Few particles are shared out to more warps, each of which is sooner done with fewer.
+        self.parts = max(1, min(PARTS_MOST, self.resident_threads // self.particle_threads))
+        self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
 
     @property
     def resident(self) -> bool:
         """Whether a step is one launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
+        few = few and self.frame_threads <= self.resident_threads
         return few and self.skips.launches and not self.deterministic
 
     @property
@@ -134,18 +157,10 @@ class CudaEngine(ThreadPhases):
     @ti.kernel
     def advance_kernel(self, poses: Array, actions: Array, t: ti.i32, before: ti.i32, after: ti.i32):
         """Poses and frames of all substeps of environment step t."""
-        self.block_count[0] = 0
-        for q in range(self.pose_threads):
-            # Neighbouring threads take the same manipulator of different environments, hence the same path.
-            for m in ti.static(range(self.manipulators)):
-                if q // self.batch == m:
-                    self.advance_manipulator(q % self.batch, m, actions, poses, t, before, after)
-        for q in range(self.pose_threads * self.substeps):
-            s = q // self.pose_threads
-            r = q % self.pose_threads
-            for m in ti.static(range(self.manipulators)):
-                if r // self.batch == m:
-                    self.set_frame(r % self.batch, s, m)
+        ti.loop_config(block_dim=RESIDENT_BLOCK)
+        for w in range(self.frame_threads):
+            self.block_count[0] = 0
+            self.set_frames(w, self.frame_threads, poses, actions, t, before, after)
 
     @ti.kernel
     def substep_kernel(
@@ -154,13 +169,13 @@ class CudaEngine(ThreadPhases):
         """Substep s of all environments, from time slot ``before`` to ``after``."""
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
-            self.scatter_thread(state, before, after, q, time, stamp)
+            self.scatter_thread(state, before, after, q, time, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
                 self.grid_thread(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
-            self.gather_thread(state, before, after, q, time)
+            self.gather_thread(state, before, after, q, time, 1)
 
     @ti.kernel
     def resident_step_kernel(
@@ -182,38 +197,30 @@ class CudaEngine(ThreadPhases):
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
             meetings = 0
-            for m in ti.static(range(self.manipulators)):
-                if w // self.batch == m:
-                    self.advance_manipulator(w % self.batch, m, actions, poses, t, pose_before, pose_after)
-            meetings = self.meet(w, meetings)
-            for turn in range(self.resident_turns(w, self.pose_threads * self.substeps)):
-                q = w + turn * self.resident_threads
-                for m in ti.static(range(self.manipulators)):
-                    if q % self.pose_threads // self.batch == m:
-                        self.set_frame(q % self.pose_threads % self.batch, q // self.pose_threads, m)
+            self.set_frames(w, self.resident_threads, poses, actions, t, pose_before, pose_after)
             for s in range(self.substeps):
-                before = slot + s * stride
-                for turn in range(self.resident_turns(w, self.particle_threads)):
+                before, time = slot + s * stride, t * self.substeps + s
+                for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.scatter_thread(state, before, before + stride, q, t * self.substeps + s, stamp)
+                    self.scatter_thread(state, before, before + stride, q, time, stamp, self.parts)
                 meetings = self.meet(w, meetings)
                 for turn in range(self.resident_turns(w, self.active_nodes())):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
                 meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.particle_threads)):
+                for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.gather_thread(state, before, before + stride, q, t * self.substeps + s)
+                    self.gather_thread(state, before, before + stride, q, time, self.parts)
                 # A warp scatters what it has gathered itself, so that the others need not wait.
                 self.wait_for_warp()
 
     @ti.kernel
     def losses_kernel(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
         """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
-        self.block_count[0] = 0
         for e in range(self.batch):
+            self.block_count[0] = 0
             self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
         for q in range(self.particle_threads):
-            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q)
+            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, 1)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
             particle = tile * self.lanes + lane
             self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
@@ -236,7 +243,6 @@ class CudaEngine(ThreadPhases):
     @ti.kernel
     def loss_gradient_kernel(self, state: Array, slot: ti.i32, bar: Array):
         """Add the gradient of the losses just computed to the adjoints of particles and poses."""
-        self.block_count[0] = 0
         for q in range(self.particle_threads):
             e, particle = self.particle_of(q)
             if particle < self.particles:
@@ -248,6 +254,7 @@ class CudaEngine(ThreadPhases):
             for q in range(self.particle_threads):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
+            self.block_count[0] = 0
             if ti.static(self.beyond_nearest):
                 self.take_poses(e)
             self.nearest_gradient(state, slot, bar, e)
@@ -264,13 +271,13 @@ class CudaEngine(ThreadPhases):
                 self.bound_thread(state, bar, before, after, q)
         ti.loop_config(block_dim=WARP_BLOCK)
         for q in range(self.particle_threads):
-            self.scatter_thread_adjoint(state, bar, before, after, q, stamp)
+            self.scatter_thread_adjoint(state, bar, before, after, q, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
             for turn in range(self.turns_of(w, self.active_nodes())):
                 self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
-            self.gather_thread_adjoint(state, bar, before, after, q)
+            self.gather_thread_adjoint(state, bar, before, after, q, 1)
 
     @ti.kernel
     def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
@@ -283,16 +290,16 @@ class CudaEngine(ThreadPhases):
             for back in range(self.substeps):
                 s = self.substeps - 1 - back
                 before = slot + s
-                for turn in range(self.resident_turns(w, self.particle_threads)):
+                for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp)
+                    self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp, self.parts)
                 meetings = self.meet(w, meetings)
                 for turn in range(self.resident_turns(w, self.active_nodes())):
                     self.grid_thread_adjoint(w, w + turn * self.resident_threads, s)
                 meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.particle_threads)):
+                for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
-                    self.gather_thread_adjoint(state, bar, before, before + 1, q)
+                    self.gather_thread_adjoint(state, bar, before, before + 1, q, self.parts)
                 self.wait_for_warp()
 
     @ti.kernel

@@ -13,6 +13,7 @@ import taichi as ti
 
 from plab.sim.cuda_bitcode import gather_sums, particle, particle_adjoint
 from plab.sim.cuda_order import OrderPhases
+from plab.sim.cuda_warp import RUN_BITS, WARP
 from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7, with_unit_rotation
 from plab.sim.shapes import signed_distance
@@ -21,14 +22,14 @@ from plab.sim.transfer import affine_field, spline, spline_slope
 
 __all__ = ["DISTANCE_GROUPS", "CudaPhases"]
 
-DISTANCE_GROUPS = 128
-"""Threads per environment and manipulator that tally distances."""
+DISTANCE_GROUPS = 256
+"""Threads per environment and manipulator that tally distances, warps of them together."""
 
 
 class CudaPhases(OrderPhases, PosePhases):
     """Phases that differ from the CPU's."""
 
-    shares = DISTANCE_GROUPS
+    shares = DISTANCE_GROUPS // WARP
 
     def attach(self, terms: Sequence[Any]) -> None:
         """Take over the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
@@ -355,11 +356,16 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def tally_group(self, e, m, group):
-        """Tally the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator."""
+        """Tally the distances of every ``DISTANCE_GROUPS``-th particle from a manipulator, and join what the
+        lanes of a warp have tallied; all lanes of a warp take part."""
         first = (e * self.manipulators + m) * (self.tiles * self.lanes)
         for k, _column, term in ti.static(self.distance_terms):
             tally = term.start()
             for r in range((self.particles - group + DISTANCE_GROUPS - 1) // DISTANCE_GROUPS):
                 particle = group + r * DISTANCE_GROUPS
                 tally = term.add(tally, self.distance[first + particle], particle)
-            self.tally_part[k, e, group, m] = tally
+            for step in ti.static(range(RUN_BITS)):
+                above = [self.wide_from_above(tally[i], 1 << step) for i in range(2)]
+                tally = term.join(tally, ti.Vector([above[0], above[1]]))
+            if group % WARP == 0:
+                self.tally_part[k, e, group // WARP, m] = tally

@@ -9,14 +9,17 @@ from plab.sim.grid_phases import MASS_MIN
 from plab.sim.storage import AT_V
 from plab.sim.transfer import spline, widen
 
-__all__ = ["RESIDENT_BLOCK", "ThreadPhases"]
+__all__ = ["POSE_SHARE", "RESIDENT_BLOCK", "ThreadPhases"]
 
 MOMENTUM_AND_MASS, MASS, VELOCITY = (0, 1, 2, 3), (3,), (0, 1, 2)
 """Components of grids that are scattered to."""
 
 RESIDENT_BLOCK = WARP_BLOCK
-"""Threads of a block of the step that is one launch. There is one block per multiprocessor, so that all are
-resident whatever their registers."""
+"""Threads of a block of the step that is one launch: Taichi gives them no more registers than two blocks of a
+multiprocessor have."""
+
+POSE_SHARE = 8
+"""Manipulators that a block moves."""
 
 
 class ThreadPhases(CudaPhases):
@@ -24,34 +27,64 @@ class ThreadPhases(CudaPhases):
 
     Attributes:
         resident_threads: Threads that are resident at once, in the kernels that are one launch per step.
+        pose_threads: Manipulators of all environments, and one at least.
     """
 
     resident_threads: int
+    pose_threads: int
 
     @ti.func
-    def sorted_particle(self, state: ti.template(), slot, q):
-        """The particle that thread q takes of its warp's tile, in the order of their base nodes; all lanes of
-        a warp take part.
+    def own_particle(self, q, parts: ti.template()):
+        """Environment and number of the particle of thread q, where ``parts`` warps share a tile's particles,
+        neighbours to each; and whether the thread has one."""
+        share = ti.static((WARP + parts - 1) // parts)
+        unit, place = q // WARP, q % WARP + q // WARP % parts * share
+        e, particle = self.particle_of(unit // parts * WARP + ti.min(place, WARP - 1))
+        return e, particle, particle < self.particles and q % WARP < share and place < WARP
+
+    @ti.func
+    def sorted_particle(self, state: ti.template(), slot, q, parts: ti.template()):
+        """The particle that thread q takes of its warp's share of a tile, see :meth:`own_particle`, in the
+        order of their base nodes; all lanes of a warp take part.
 
         Returns environment; tile; entry of the tile; lane in it; position; base node, and x / dx - base; and
-        the base node's grid index, which is negative, and another for each, where the particle is padding.
+        the base node's grid index, which is negative, and another for each, where there is no particle.
         """
-        e, place = self.particle_of(q)
-        tile = place // self.lanes
+        e, particle, own = self.own_particle(q, parts)
+        tile = particle // self.lanes
         entry = self.tile_entry(slot, e, tile)
-        lane = self.sorted_lane(state, entry, tile, place % self.lanes)
+        lane, taken = self.sorted_lane(state, entry, particle % self.lanes, own, q % WARP)
         x = self.vector(state, entry, lane)
         base, fx = self.stencil(x)
-        particle = tile * self.lanes + lane
         node = e * self.nodes + self.linear(base)
-        if particle >= self.particles:
-            node = -1 - particle
+        if not taken:
+            node = -1 - q % WARP
         return e, tile, entry, lane, x, base, fx, node
 
     @ti.func
     def resident_turns(self, w, total):
         """How many of ``total`` items resident thread w works on."""
         return (total - w + self.resident_threads - 1) // self.resident_threads
+
+    @ti.func
+    def set_frames(self, w, threads, poses: ti.template(), actions: ti.template(), t, before, after):
+        """Poses and frames of all substeps of environment step t, by the last of ``threads`` threads, whose
+        blocks have the fewest particles; all threads of a block take part."""
+        at = w % RESIDENT_BLOCK
+        first = ((threads - w + at) // RESIDENT_BLOCK - 1) * POSE_SHARE
+        count = ti.min(self.pose_threads - first, POSE_SHARE)
+        for m in ti.static(range(self.manipulators)):
+            # Neighbouring threads take the same manipulator of different environments, hence the same path.
+            if at < count and (first + at) // self.batch == m:
+                self.advance_manipulator((first + at) % self.batch, m, actions, poses, t, before, after)
+        ti.simt.block.sync()
+        if count > 0:
+            for turn in range((count * self.substeps - at + RESIDENT_BLOCK - 1) // RESIDENT_BLOCK):
+                number = at + turn * RESIDENT_BLOCK
+                q = first + number % count
+                for m in ti.static(range(self.manipulators)):
+                    if q // self.batch == m:
+                        self.set_frame(q % self.batch, number // count, m)
 
     @ti.func
     def meet(self, w, meetings):
@@ -70,12 +103,12 @@ class ThreadPhases(CudaPhases):
         return meetings + 1
 
     @ti.func
-    def scatter_thread(self, state: ti.template(), before, after, q, time, stamp):
+    def scatter_thread(self, state: ti.template(), before, after, q, time, stamp, parts: ti.template()):
         """Material update and scatter of a particle of thread q's tile; all lanes of a warp take part.
 
         ``time`` is noted where the state is broken by what an integer cannot hold.
         """
-        e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q)
+        e, tile, source, lane, _x, base, fx, node = self.sorted_particle(state, before, q, parts)
         first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
         if first:
             self.mark_shared(e, base, stamp)
@@ -121,10 +154,12 @@ class ThreadPhases(CudaPhases):
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
 
     @ti.func
-    def scatter_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q, stamp):
+    def scatter_thread_adjoint(
+        self, state: ti.template(), bar: ti.template(), before, after, q, stamp, parts: ti.template()
+    ):
         """Scatter of a particle of thread q's tile again, with the adjoint of the grid velocities; all lanes
         of a warp take part."""
-        e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q)
+        e, tile, source, lane, x, base, fx, node = self.sorted_particle(state, before, q, parts)
         target = self.tile_entry(after, e, tile)
         entry9 = (e * self.tiles + tile) * 9
         first, heads, taking = self.heads_of(node, node >= 0, q % WARP)
@@ -186,10 +221,12 @@ class ThreadPhases(CudaPhases):
             ti.atomic_max(self.adjoint_bound[e], bits)
 
     @ti.func
-    def gather_thread_adjoint(self, state: ti.template(), bar: ti.template(), before, after, q):
+    def gather_thread_adjoint(
+        self, state: ti.template(), bar: ti.template(), before, after, q, parts: ti.template()
+    ):
         """Adjoint of both transfers and of the material, for thread q's own particle."""
-        e, particle = self.particle_of(q)
-        if particle < self.particles:
+        e, particle, own = self.own_particle(q, parts)
+        if own:
             tile = particle // self.lanes
             lane = particle & (self.lanes - 1)
             source = self.tile_entry(before, e, tile)
@@ -262,10 +299,10 @@ class ThreadPhases(CudaPhases):
                             self.add_up(self.pose_sums, (e * self.manipulators + m) * 8 + i, total)
 
     @ti.func
-    def gather_thread(self, state: ti.template(), before, after, q, time):
+    def gather_thread(self, state: ti.template(), before, after, q, time, parts: ti.template()):
         """Grid to particle, for thread q's own particle."""
-        e, particle = self.particle_of(q)
-        if particle < self.particles:
+        e, particle, own = self.own_particle(q, parts)
+        if own:
             tile = particle // self.lanes
             source = self.tile_entry(before, e, tile)
             target = self.tile_entry(after, e, tile)

@@ -161,11 +161,15 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         ``unit`` has the units of the components, see :meth:`add_to_grid`."""
         lane = w % WARP
         corner = (w % WARP_BLOCK - lane) * NODE_STRIDE
+        # All are read before any is written: the device waits once, not four times.
+        taken = ti.Vector.zero(self.real, 4)
+        for turn in ti.static(range(4)):
+            node = e * self.nodes + self.linear_in_block(block, r - lane + turn * 8 + lane // 4)
+            taken[turn] = ti.cast(grid[node][lane % 4], self.real)
         for turn in ti.static(range(4)):
             near = turn * 8 + lane // 4
-            node = e * self.nodes + self.linear_in_block(block, r - lane + near)
-            shared[corner + near * NODE_STRIDE + lane % 4] = ti.cast(grid[node][lane % 4], self.real)
-            grid[node][lane % 4] = 0
+            shared[corner + near * NODE_STRIDE + lane % 4] = taken[turn]
+            grid[e * self.nodes + self.linear_in_block(block, r - lane + near)][lane % 4] = 0
         self.wait_for_warp()
         out = ti.Vector.zero(self.real, 4)
         for c in ti.static(range(4)):
@@ -223,14 +227,13 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     # any order of particles.
 
     @ti.func
-    def sorted_lane(self, state: ti.template(), source, tile, lane):
-        """Which particle of the tile a lane takes: the one whose base node is the lane-th in order."""
-        base, _fx = self.stencil(self.vector(state, source, lane))
-        node = self.linear(base)
-        if tile * self.lanes + lane >= self.particles:
-            node = self.nodes
+    def sorted_lane(self, state: ti.template(), source, place, own, lane):
+        """Which particle of the tile a lane of the warp takes: the one whose base node is the lane-th in
+        order, of those at the ``place`` of each lane that has its ``own``; and whether it takes one."""
+        base, _fx = self.stencil(self.vector(state, source, place))
+        node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.
-        packed = node * self.lanes + lane
+        packed = node * self.lanes + place
         for stage in ti.static(range(1, RUN_BITS + 1)):
             for step in ti.static(range(stage - 1, -1, -1)):
                 other = ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), packed, 1 << step)
@@ -239,7 +242,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
                 # A lane keeps the lesser where it is the lower of a rising pair or the upper of a falling.
                 if (lane >> stage) & 1 == (lane >> step) & 1:
                     packed = least
-        return packed & (self.lanes - 1)
+        return packed & (self.lanes - 1), packed < self.nodes * self.lanes
 
     @ti.func
     def heads_of(self, key, taking_part, lane):
