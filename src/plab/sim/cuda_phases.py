@@ -31,6 +31,11 @@ class CudaPhases(OrderPhases, PosePhases):
 
     shares = DISTANCE_GROUPS // WARP
 
+    @property
+    def node_mask(self) -> int:
+        """Largest number of a node of all environments, all bits set."""
+        return int(min(1 << (self.batch * self.nodes).bit_length(), 1 << 31) - 1)
+
     def attach(self, terms: Sequence[Any]) -> None:
         """Take over the terms, before the first kernel is compiled; see :meth:`TermPhases.attach`."""
         super().attach(terms)
@@ -66,7 +71,8 @@ class CudaPhases(OrderPhases, PosePhases):
         mz = m0
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
-                row = node + (i * self.axis + j) * self.axis
+                # Masked, so that LLVM can tell that sums with it do not wrap: one address for three nodes.
+                row = (node + (i * self.axis + j) * self.axis) & ti.static(self.node_mask)
                 wij = w[i][0] * w[j][1]
                 g1 = (wij * w[1][2]) * self.node4(grid, row + 1)
                 g2 = (wij * w[2][2]) * self.node4(grid, row + 2)
