@@ -73,7 +73,8 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
     for panel in drawing.figure.axes:
         # A line and what broke off, in each precision.
         assert [tuple(line.get_xdata()) for line in panel.get_lines()] == [(10.0, 20.0), (5.0,)] * 2
-        assert [text.get_text() for text in panel.texts] == ["10", "20", "5"] * 2
+        # Points of the same number are named once.
+        assert [text.get_text() for text in panel.texts] == ["10", "20", "5", "5"]
     save([drawing], tmp_path, {"footer": []})
     assert all((tmp_path / f"Move_substeps.{kind}").stat().st_size > 5000 for kind in ("png", "pdf"))
 
