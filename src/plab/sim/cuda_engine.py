@@ -71,6 +71,7 @@ class CudaEngine(ThreadPhases):
         super().__init__(*args)
         self.particle_threads = self.batch * self.tiles * self.lanes
         self.pose_threads = self.batch * max(1, self.manipulators)
+        # Threads of as many blocks as move all poses.
         self.frame_threads = -(-self.pose_threads // POSE_SHARE) * RESIDENT_BLOCK
         blocks = device_attribute(MULTIPROCESSORS) * resident_blocks(SIZES[self.real])
         self.resident_threads = blocks * RESIDENT_BLOCK
@@ -83,8 +84,9 @@ class CudaEngine(ThreadPhases):
     def resident(self) -> bool:
         """Whether a step is one launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
-        few = few and self.frame_threads <= self.resident_threads
-        return few and self.skips.launches and not self.deterministic
+        # Blocks that move poses are among the resident ones.
+        fits = few and self.frame_threads <= self.resident_threads
+        return fits and self.skips.launches and not self.deterministic
 
     @property
     def sorts(self) -> bool:
