@@ -23,6 +23,7 @@ from omegaconf import DictConfig, open_dict
 
 if TYPE_CHECKING:
     from plab.config import Config
+    from plab.sweep.carry import Carrier
     from plab.tally import Outcome
 
 __all__ = ["BatchLauncher", "BatchSweeper"]
@@ -110,12 +111,8 @@ class BatchLauncher(Launcher):
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run all jobs; see :meth:`hydra.plugins.launcher.Launcher.launch`."""
         from plab.config import ConfigError
-        from plab.config.checks import check_device, check_packages
-        from plab.results import result_path
-        from plab.sweep.carry import carry_here, run_sweep
-        from plab.sweep.compose import Refused, compose_jobs
-        from plab.sweep.gpus import carry_on, gpus
-        from plab.tally import Outcome, Tally
+        from plab.sweep.carry import carry_here
+        from plab.sweep.gpus import gpus, processes_on
 
         if self._size is not None and (type(self._size) is not int or self._size < 1):
             raise ConfigError(f"hydra.launcher.batch_size must be at least 1 or null, not {self._size}")
@@ -128,6 +125,23 @@ class BatchLauncher(Launcher):
                 "hydra.launcher.inner has to be a launcher's settings, with its _target_: choose one, as by "
                 "hydra/launcher=batch_joblib"
             )
+        if not self._per_gpu or self._inner is not None:
+            return self._run(job_overrides, carry_here, 1)
+        names = gpus()
+        with processes_on(names, self._per_gpu, len(job_overrides)) as carry:
+            return self._run(job_overrides, carry, len(names) * self._per_gpu)
+
+    def _run(
+        self, job_overrides: Sequence[Sequence[str]], carry: Carrier, processes: int
+    ) -> Sequence[JobReturn]:
+        """Run all jobs, so many batches at a time."""
+        from plab.config import ConfigError
+        from plab.config.checks import check_device, check_packages
+        from plab.results import result_path
+        from plab.sweep.carry import run_sweep
+        from plab.sweep.compose import Refused, compose_jobs
+        from plab.tally import Outcome, Tally
+
         load = self._context.config_loader.load_sweep_config
         entries = compose_jobs(job_overrides, lambda overrides: load(self._config, overrides))
         refused = [entry for entry in entries if isinstance(entry, Refused)]
@@ -136,7 +150,6 @@ class BatchLauncher(Launcher):
             raise ConfigError(refused[0].reason)
         cfgs = {n: entry for n, entry in enumerate(entries) if not isinstance(entry, Refused)}
         paths = {n: str(result_path(cfg)) for n, cfg in cfgs.items()}
-        carry, processes = carry_here, 1
         if self._inner is not None:
             carry = self._carry_elsewhere({paths[n]: job_overrides[n] for n in cfgs})
             processes = _processes(self._inner)
@@ -144,9 +157,6 @@ class BatchLauncher(Launcher):
             for cfg in cfgs.values():
                 check_device(cfg)
                 check_packages(cfg)
-        if self._per_gpu:
-            names = gpus()
-            carry, processes = carry_on(names, self._per_gpu), len(names) * self._per_gpu
         tally = getattr(self._task, "tally", Tally())
         tally.started = True
         tally.outcomes += [Outcome(" ".join(r.overrides), "", "refused", message=r.reason) for r in refused]
@@ -157,9 +167,7 @@ class BatchLauncher(Launcher):
         values = [scores[paths[n]] if n in paths else math.nan for n in range(len(entries))]
         return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
 
-    def _carry_elsewhere(
-        self, overrides: dict[str, Sequence[str]]
-    ) -> Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]:
+    def _carry_elsewhere(self, overrides: dict[str, Sequence[str]]) -> Carrier:
         """Return what hands batches to the inner launcher, one job each; ``overrides`` are by result file."""
         from plab.errors import tell
         from plab.plugins import passed_on

@@ -8,6 +8,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeAlias
 
@@ -20,7 +22,7 @@ from plab.reuse import SimulatorCache
 from plab.sweep.carry import Carrier, look_up
 from plab.tally import Outcome
 
-__all__ = ["carry_on", "choose", "gpus"]
+__all__ = ["choose", "gpus", "processes_on"]
 
 Kind: TypeAlias = tuple[str, str]
 """Task and family of methods."""
@@ -41,38 +43,52 @@ def gpus() -> list[str]:
     return names
 
 
-def carry_on(names: Sequence[str], per_gpu: int = 1) -> Carrier:
-    """Return what carries out batches on some GPUs, named as ``CUDA_VISIBLE_DEVICES`` names them, by some
-    processes each."""
+@contextmanager
+def processes_on(names: Sequence[str], per_gpu: int, most: int) -> Iterator[Carrier]:
+    """Start processes on some GPUs, and yield what carries out batches by them; afterwards they end.
+
+    They load what they need while the batches are still being made.
+
+    Args:
+        names: The GPUs, as ``CUDA_VISIBLE_DEVICES`` names them.
+        per_gpu: Processes of each.
+        most: Processes of all, at most.
+    """
     # One process for each GPU before any has its second.
     places = [
         (name, f"GPU {name}" if per_gpu == 1 else f"GPU {name}, {k + 1}")
         for k in range(per_gpu)
         for name in names
     ]
+    workers: list[_Worker] = []
+    try:
+        for place in places[:most]:
+            workers.append(_Worker(*place))
+        yield partial(_carry, workers)
+    finally:
+        for worker in workers:
+            worker.end()
 
-    def carry(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
-        waiting = list(batches)
-        workers = [_Worker(*place) for place in places[: len(batches)]]
-        shown = any(cfg.progress for batch in batches for cfg in batch)
-        try:
-            with show_several([worker.label for worker in workers], enabled=shown) as report:
-                while waiting or any(worker.batch for worker in workers):
-                    for worker in workers:
-                        if waiting and not worker.batch:
-                            had = [other.kind for other in workers if other is not worker]
-                            worker.give(waiting.pop(choose(waiting, worker.kind, had)), progress())
-                    for worker in _heard([worker for worker in workers if worker.batch]):
-                        for kind, *content in worker.messages():
-                            if kind == "ended":
-                                yield from _told(*content)
-                            else:
-                                report(worker.label, kind, *content)
-        finally:
-            for worker in workers:
-                worker.end()
 
-    return carry
+def _carry(
+    workers: Sequence[_Worker], batches: list[list[Config]], progress: Callable[[], str]
+) -> Iterator[Outcome]:
+    """Give batches to whoever is free, and yield how their runs ended."""
+    waiting = list(batches)
+    used = workers[: len(batches)]
+    shown = any(cfg.progress for batch in batches for cfg in batch)
+    with show_several([worker.label for worker in used], enabled=shown) as report:
+        while waiting or any(worker.batch for worker in used):
+            for worker in used:
+                if waiting and not worker.batch:
+                    had = [other.kind for other in used if other is not worker]
+                    worker.give(waiting.pop(choose(waiting, worker.kind, had)), progress())
+            for worker in _heard([worker for worker in used if worker.batch]):
+                for kind, *content in worker.messages():
+                    if kind == "ended":
+                        yield from _told(*content)
+                    else:
+                        report(worker.label, kind, *content)
 
 
 def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
@@ -115,7 +131,10 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(self.name, theirs), daemon=True)
+        # Ctrl-C reaches all processes of a terminal: this one sees to it that the other ends.
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
         self.process.start()
+        signal.signal(signal.SIGINT, handler)
         theirs.close()
 
     def give(self, batch: list[Config], note: str) -> None:
@@ -145,7 +164,9 @@ class _Worker:
         self.connection.close()
         if self.batch:
             self.process.terminate()
-        self.process.join(PATIENCE)
+        # One that was never given anything may be loading still.
+        if self.kind is not None:
+            self.process.join(PATIENCE)
         self.process.kill()
 
 
@@ -166,7 +187,7 @@ def _heard(workers: Sequence[_Worker]) -> list[_Worker]:
 def _work(name: str, connection: Connection) -> None:
     """Carry out batches until there are no more; runs in a process of its own."""
     os.environ[VISIBLE] = name
-    # Ctrl-C reaches all processes of a terminal: the one that has started this one sees to it that it ends.
+    # Where what ignores Ctrl-C is not inherited.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _interrupt)
     threading.Thread(target=_end_with_parent, daemon=True).start()
