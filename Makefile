@@ -52,9 +52,7 @@ test-quick: $(VENV)/.dev.stamp
 	$(PARALLEL) -m "not physics and not whole and not slow and not gpu"
 
 test-gpu: $(VENV)/.dev.stamp
-	$(PARALLEL) -m gpu
-	PLAB_TEST_DEVICE=cuda $(PARALLEL) -m "not slow" tests/test_simulator.py tests/test_simulator_reference.py \
-	    tests/test_mixed_materials.py tests/verification
+	PLAB_TEST_DEVICE=cuda $(PARALLEL) -m "gpu and not slow"
 
 test-slow: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest -m slow

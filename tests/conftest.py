@@ -23,6 +23,15 @@ from suite import DEVICE
 os.environ["PLAB_TRACEBACK"] = "1"
 
 
+OF_ANY_DEVICE = (
+    "tests/test_simulator.py",
+    "tests/test_simulator_reference.py",
+    "tests/test_mixed_materials.py",
+    "tests/verification/",
+)
+"""Tests of the simulator that need a GPU where they are to run on one."""
+
+
 @pytest.fixture(scope="session")
 def device() -> str:
     """Device on which the simulator's tests run: ``PLAB_TEST_DEVICE``, cpu unless set."""
@@ -109,7 +118,11 @@ def refused(seen: list[Config], told: Callable[..., str]) -> Callable[..., str]:
     return call
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if DEVICE == "cuda" and item.nodeid.startswith(OF_ANY_DEVICE):
+            item.add_marker("gpu")
     needing = [item for item in items if "gpu" in item.keywords]
     if needing and not cuda_is_usable():
         for item in needing:

@@ -95,14 +95,14 @@ def test_gradients_of_tensors_stay_on_the_device() -> None:
     np.testing.assert_allclose(actions.grad.cpu().numpy(), want.gradient, atol=1e-9 * scale)
 
 
-@pytest.mark.parametrize("envs", [2, 128])
+@pytest.mark.parametrize("envs", [2, 512])
 def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
     """Also where there are so many particles that they are put into the order of their cells."""
     gradients = []
     for device, size in (("cpu", 2), ("cuda", envs)):
         cfg = load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}"])
         episodes = EpisodeBatch([cfg] * size, contact="soft")
-        if size == 128:
+        if size == 512:
             assert episodes.problem.simulator._engine.sorts
         torch.manual_seed(0)
         entries = episodes.observation_space.shape[0]

@@ -1,5 +1,5 @@
-; Additions to numbers in global memory whose former values nobody asks for. Arguments point to local variables: an
-; address, and what is added there.
+; Additions to numbers in global memory whose former values nobody asks for, and a look at one that others change.
+; Arguments point to local variables: an address, and what is added there or found.
 
 target triple = "nvptx64-nvidia-cuda"
 
@@ -16,6 +16,14 @@ define void @add_f64(i64* %where, double* %what) alwaysinline {
   %number = load double, double* %what
   %address = inttoptr i64 %place to double addrspace(1)*
   %former = atomicrmw fadd double addrspace(1)* %address, double %number monotonic
+  ret void
+}
+
+define void @look_i32(i64* %where, i32* %what) alwaysinline {
+  %place = load i64, i64* %where
+  %address = inttoptr i64 %place to i32 addrspace(1)*
+  %number = load volatile i32, i32 addrspace(1)* %address
+  store i32 %number, i32* %what
   ret void
 }
 

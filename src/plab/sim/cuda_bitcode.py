@@ -11,7 +11,7 @@ from taichi.lang.impl import expr_init
 
 from plab.sim.bitcode import Bitcode
 
-__all__ = ["add", "gather_sums", "particle", "particle_adjoint"]
+__all__ = ["add", "gather_sums", "look", "particle", "particle_adjoint"]
 
 _function = Bitcode("cuda")
 
@@ -21,6 +21,14 @@ def add(kind: ti.template(), address, value):
     """Add to a number at an address, which nobody waits for."""
     place, number = ti.cast(address, ti.u64), ti.cast(value, kind)
     ti.static(_function("add", kind))(place, number)
+
+
+@ti.func
+def look(address):
+    """The 32-bit integer at an address, which others change meanwhile."""
+    place, number = ti.cast(address, ti.u64), 0
+    ti.static(_function("look", ti.i32))(place, number)
+    return number
 
 
 @ti.func

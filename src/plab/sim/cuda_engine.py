@@ -61,9 +61,9 @@ class CudaEngine(ThreadPhases):
     """Kernels for CUDA; public methods as those of :class:`plab.sim.engine.CpuEngine`.
 
     ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
-    its length. It is begun anew once per environment step and once per loss, and grows in between: a block
-    that the body leaves within a step costs little, while taking all blocks into the list in every substep
-    would cost an atomic per particle.
+    its length. It is empty before each environment step and each loss, and grows in them: a block that the
+    body leaves within a step costs little, while taking all blocks into the list in every substep would cost
+    an atomic per particle. ``mass_blocks`` is how many the last loss had.
     """
 
     def __init__(self, *args: object) -> None:
@@ -75,10 +75,17 @@ class CudaEngine(ThreadPhases):
         self.frame_threads = -(-self.pose_threads // POSE_SHARE) * RESIDENT_BLOCK
         blocks = device_attribute(MULTIPROCESSORS) * resident_blocks(SIZES[self.real])
         self.resident_threads = blocks * RESIDENT_BLOCK
+        self.last_arrival = ctypes.c_int32((1 << 31) - (blocks - 1)).value
         # Few particles are shared out to more warps, each of which is sooner done with fewer.
         self.parts = max(1, min(PARTS_MOST, self.resident_threads // self.particle_threads))
         self.part_threads = self.parts * self.particle_threads
         self.node_threads = min(self.batch * self.blocks << NODE_BITS, THREADS_MAX)
+        self.mass_blocks = ti.field(ti.i32, shape=1)
+
+    @property
+    def tally_threads(self) -> int:
+        """Threads that tally distances."""
+        return DISTANCE_GROUPS * self.batch * self.manipulators if self.distance_terms else 0
 
     @property
     def resident(self) -> bool:
@@ -161,7 +168,6 @@ class CudaEngine(ThreadPhases):
         """Poses and frames of all substeps of environment step t."""
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.frame_threads):
-            self.block_count[0] = 0
             self.set_frames(w, self.frame_threads, poses, actions, t, before, after)
 
     @ti.kernel
@@ -174,10 +180,12 @@ class CudaEngine(ThreadPhases):
             self.scatter_thread(state, before, after, q, time, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
+            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
                 self.grid_thread(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             self.gather_thread(state, before, after, q, time, 1)
+            if q == 0 and s == self.substeps - 1:
+                self.block_count[0] = 0
 
     @ti.kernel
     def resident_step_kernel(
@@ -194,53 +202,54 @@ class CudaEngine(ThreadPhases):
     ):
         """One environment step in one launch, for few particles: threads that are all resident at once meet
         at barriers between the phases, where launches would take longer than the phases do."""
-        self.block_count[0] = 0
-        self.arrivals[0] = 0
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
-            meetings = 0
             self.set_frames(w, self.resident_threads, poses, actions, t, pose_before, pose_after)
             for s in range(self.substeps):
                 before, time = slot + s * stride, t * self.substeps + s
                 for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread(state, before, before + stride, q, time, stamp, self.parts)
-                meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.active_nodes())):
+                self.meet(w)
+                for turn in range(self.resident_turns(w, self.active_nodes(self.block_count))):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
-                meetings = self.meet(w, meetings)
+                self.meet(w)
                 for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, time, self.parts)
                 # A warp scatters what it has gathered itself, so that the others need not wait.
                 self.wait_for_warp()
+            if w == 0:
+                self.block_count[0] = 0
 
     @ti.kernel
     def losses_kernel(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
         """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
-        for e in range(self.batch):
-            self.block_count[0] = 0
-            self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
-        for q in range(self.particle_threads):
-            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, 1)
+        for q in range(self.part_threads):
+            e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, self.parts)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
             particle = tile * self.lanes + lane
             self.particle_terms_thread(state, q, entry, e, particle, lane, x, node >= 0)
         ti.loop_config(block_dim=WARP_BLOCK)
-        for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
-                self.node_terms_thread(w, w + turn * self.node_threads)
-        if ti.static(len(self.distance_terms) > 0):
-            for q in range(self.pose_threads * DISTANCE_GROUPS):
+        for w in range(self.node_threads + self.tally_threads):
+            if w < self.node_threads:
+                for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+                    self.node_terms_thread(w, w + turn * self.node_threads)
+            else:
+                q = w - self.node_threads
                 for m in ti.static(range(self.manipulators)):
                     if ti.static(self.motions[m] != "static"):
-                        if q // DISTANCE_GROUPS % max(1, self.manipulators) == m:
+                        if q // DISTANCE_GROUPS % self.manipulators == m:
                             self.tally_group(
                                 q // (DISTANCE_GROUPS * self.manipulators), m, q % DISTANCE_GROUPS
                             )
         for e in range(self.batch):
             self.take_measures(e)
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
+            self.node_part[e, 0][ti.static(len(self.node_terms))] = 0.0
+            if e == 0:
+                self.mass_blocks[0] = self.block_count[0]
+                self.block_count[0] = 0
 
     @ti.kernel
     def loss_gradient_kernel(self, state: Array, slot: ti.i32, bar: Array):
@@ -256,7 +265,6 @@ class CudaEngine(ThreadPhases):
             for q in range(self.particle_threads):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
-            self.block_count[0] = 0
             if ti.static(self.beyond_nearest):
                 self.take_poses(e)
             self.nearest_gradient(state, slot, bar, e)
@@ -276,7 +284,7 @@ class CudaEngine(ThreadPhases):
             self.scatter_thread_adjoint(state, bar, before, after, q, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
+            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
                 self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             self.gather_thread_adjoint(state, bar, before, after, q, 1)
@@ -285,20 +293,18 @@ class CudaEngine(ThreadPhases):
     def resident_adjoint_kernel(self, state: Array, bar: Array, slot: ti.i32, stamp: ti.i32):
         """Adjoints of all substeps of an environment step in one launch, as :meth:`resident_step_kernel` runs
         them."""
-        self.arrivals[0] = 0
         ti.loop_config(block_dim=RESIDENT_BLOCK)
         for w in range(self.resident_threads):
-            meetings = 0
             for back in range(self.substeps):
                 s = self.substeps - 1 - back
                 before = slot + s
                 for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp, self.parts)
-                meetings = self.meet(w, meetings)
-                for turn in range(self.resident_turns(w, self.active_nodes())):
+                self.meet(w)
+                for turn in range(self.resident_turns(w, self.active_nodes(self.block_count))):
                     self.grid_thread_adjoint(w, w + turn * self.resident_threads, s)
-                meetings = self.meet(w, meetings)
+                self.meet(w)
                 for turn in range(self.resident_turns(w, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread_adjoint(state, bar, before, before + 1, q, self.parts)
@@ -317,6 +323,7 @@ class CudaEngine(ThreadPhases):
             for row in range(self.batch * self.materials):
                 self.take_material(row)
         for q in range(self.pose_threads):
+            self.block_count[0] = 0
             for m in ti.static(range(self.manipulators)):
                 if q // self.batch == m:
                     self.retreat_through(q % self.batch, m, actions, actions_bar, t)
@@ -325,7 +332,7 @@ class CudaEngine(ThreadPhases):
     def export_mass(self, out: Array):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
+            for turn in range(self.turns_of(w, self.active_nodes(self.mass_blocks))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 i = self.node_of_block(block, r)
                 if self.in_tensor(i - 1):

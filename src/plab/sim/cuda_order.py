@@ -85,7 +85,6 @@ class OrderPhases(WarpPhases):
         The move is written as that of step t, and which given particle is where after it to ``after``, from
         which was where before it, ``numbers``.
         """
-        self.block_count[0] = 0
         for e in range(self.batch):
             self.placed[e] = 0
         for q in range(self.particle_threads):
@@ -97,7 +96,7 @@ class OrderPhases(WarpPhases):
                 self.list_block(e * self.blocks + block, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
+            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.begin_shares(e, e * self.nodes + self.linear_in_block(block, r), w % WARP)
         for q in range(self.particle_threads):
@@ -108,11 +107,13 @@ class OrderPhases(WarpPhases):
                 place = self.cell_count[e * self.nodes + self.linear(base)] + self.rank[q]
             moves[t * self.particle_threads + q - particle + place] = particle
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes())):
+            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.cell_count[e * self.nodes + self.linear_in_block(block, r)] = 0
         for q in range(self.particle_threads):
             _e, place = self.particle_of(q)
+            if q == 0:
+                self.block_count[0] = 0
             after[q] = numbers[q - place + moves[t * self.particle_threads + q]]
             self.move_particle(state, slot, target, target_slot, moves, t, q)
 

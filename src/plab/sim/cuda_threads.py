@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from plab.sim.cuda_bitcode import look
 from plab.sim.cuda_phases import CudaPhases
 from plab.sim.cuda_sums import LARGEST_MOMENTUM
 from plab.sim.cuda_warp import ALL_LANES, BLOCK_WARPS, NODE_STRIDE, RUN_BITS, WARP, WARP_BLOCK, WARP_NUMBERS
@@ -27,10 +28,12 @@ class ThreadPhases(CudaPhases):
 
     Attributes:
         resident_threads: Threads that are resident at once, in the kernels that are one launch per step.
+        last_arrival: What the first block adds where all meet, where each other adds 1.
         pose_threads: Manipulators of all environments, and one at least.
     """
 
     resident_threads: int
+    last_arrival: int
     pose_threads: int
 
     @ti.func
@@ -87,20 +90,19 @@ class ThreadPhases(CudaPhases):
                         self.set_frame(q % self.batch, number // count, m)
 
     @ti.func
-    def meet(self, w, meetings):
-        """Wait until all resident threads are here for the same time; returns how often they have met."""
-        ti.simt.grid.memfence()
+    def meet(self, w):
+        """Wait until all resident threads are here, and have written what they write."""
         ti.simt.block.sync()
         if w % RESIDENT_BLOCK == 0:
-            goal = (meetings + 1) * (self.resident_threads // RESIDENT_BLOCK)
-            ti.atomic_add(self.arrivals[0], 1)
-            # An atomic that changes nothing: a plain load could be hoisted out of the loop.
-            while ti.atomic_or(self.arrivals[0], 0) < goal:
+            # After a meeting of its block one thread's fence is one for what all have written.
+            ti.simt.grid.memfence()
+            # What all blocks add turns the sign, so that nobody need begin anew.
+            before = ti.atomic_add(self.arrivals[0], ti.select(w == 0, self.last_arrival, 1))
+            while (before ^ look(ti.get_addr(self.arrivals, 0))) >= 0:
                 pass
+            # What others wrote must not be read from this processor's own cache.
+            ti.simt.grid.memfence()
         ti.simt.block.sync()
-        # What others wrote must not be read from this processor's own cache.
-        ti.simt.grid.memfence()
-        return meetings + 1
 
     @ti.func
     def scatter_thread(self, state: ti.template(), before, after, q, time, stamp, parts: ti.template()):

@@ -126,9 +126,9 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         return (total - w + self.node_threads - 1) // self.node_threads
 
     @ti.func
-    def active_nodes(self):
-        """Nodes of the active blocks of all environments."""
-        count = self.block_count[0]
+    def active_nodes(self, counter: ti.template()):
+        """Nodes of the blocks of all environments that ``counter`` has counted."""
+        count = counter[0]
         if ti.static(not self.skips.empty_blocks):
             count = self.batch * self.blocks
         return count << NODE_BITS

@@ -13,7 +13,7 @@ from plab.cache import cache_dir
 
 __all__ = ["Bitcode"]
 
-_ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i64: "i64"}
+_ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
 
 
 class Bitcode:
