@@ -46,8 +46,8 @@ def device_attribute(number: int) -> int:
     """A number of the CUDA device, by asking the driver; Taichi does not tell. 1 if it does not answer."""
     value = ctypes.c_int(0)
     driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    failed = driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0) != 0
-    return 1 if failed else max(1, value.value)
+    driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0)
+    return max(1, value.value)
 
 
 def resident_blocks(number_bytes: int) -> int:
@@ -125,10 +125,6 @@ class CudaEngine(ThreadPhases):
             before = slot + s * stride
             self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp)
 
-    def losses(self, state: ti.Ndarray, slot: int, terms: ti.Ndarray, at: int, stamp: int) -> None:
-        """Measures of all environments, written to ``terms`` from entry ``at``."""
-        self.losses_kernel(state, slot, terms, at, stamp)
-
     def step_adjoint(
         self,
         state: ti.Ndarray,
@@ -152,7 +148,7 @@ class CudaEngine(ThreadPhases):
         """
         end = slot + self.substeps
         self.advance_kernel(poses, actions, t, t, t + 1)
-        self.losses_kernel(state, end, terms, at, stamp)
+        self.losses(state, end, terms, at, stamp)
         self.loss_gradient_kernel(state, end, bar)
         if contact and self.resident:
             self.resident_adjoint_kernel(state, bar, slot, stamp + 1)
@@ -180,7 +176,7 @@ class CudaEngine(ThreadPhases):
             self.scatter_thread(state, before, after, q, time, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 self.grid_thread(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             self.gather_thread(state, before, after, q, time, 1)
@@ -207,14 +203,14 @@ class CudaEngine(ThreadPhases):
             self.set_frames(w, self.resident_threads, poses, actions, t, pose_before, pose_after)
             for s in range(self.substeps):
                 before, time = slot + s * stride, t * self.substeps + s
-                for turn in range(self.resident_turns(w, self.part_threads)):
+                for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread(state, before, before + stride, q, time, stamp, self.parts)
                 self.meet(w)
-                for turn in range(self.resident_turns(w, self.active_nodes(self.block_count))):
+                for turn in range(self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))):
                     self.grid_thread(w, w + turn * self.resident_threads, s)
                 self.meet(w)
-                for turn in range(self.resident_turns(w, self.part_threads)):
+                for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread(state, before, before + stride, q, time, self.parts)
                 # A warp scatters what it has gathered itself, so that the others need not wait.
@@ -223,8 +219,9 @@ class CudaEngine(ThreadPhases):
                 self.block_count[0] = 0
 
     @ti.kernel
-    def losses_kernel(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
-        """Measures; leaves mass and the loss's slope at the nodes of active blocks."""
+    def losses(self, state: Array, slot: ti.i32, terms: Array, at: ti.i32, stamp: ti.i32):
+        """Measures of all environments, written to ``terms`` from entry ``at``; leaves mass and the loss's
+        slope at the nodes of active blocks."""
         for q in range(self.part_threads):
             e, tile, entry, lane, x, base, fx, node = self.sorted_particle(state, slot, q, self.parts)
             self.scatter_mass_thread(q, e, base, fx, node, stamp)
@@ -233,7 +230,7 @@ class CudaEngine(ThreadPhases):
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads + self.tally_threads):
             if w < self.node_threads:
-                for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+                for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                     self.node_terms_thread(w, w + turn * self.node_threads)
             else:
                 q = w - self.node_threads
@@ -261,8 +258,7 @@ class CudaEngine(ThreadPhases):
                 entry = self.tile_entry(slot, e, tile)
                 lane = particle & (self.lanes - 1)
                 self.add_particle_gradient(state, entry, bar, self.tile_entry(0, e, tile), lane, e)
-        if ti.static(self.beyond_nearest):
-            for q in range(self.particle_threads):
+            if ti.static(self.beyond_nearest):
                 self.distance_gradient_thread(state, slot, bar, q)
         for e in range(self.batch):
             if ti.static(self.beyond_nearest):
@@ -284,7 +280,7 @@ class CudaEngine(ThreadPhases):
             self.scatter_thread_adjoint(state, bar, before, after, q, stamp, 1)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 self.grid_thread_adjoint(w, w + turn * self.node_threads, s)
         for q in range(self.particle_threads):
             self.gather_thread_adjoint(state, bar, before, after, q, 1)
@@ -298,14 +294,14 @@ class CudaEngine(ThreadPhases):
             for back in range(self.substeps):
                 s = self.substeps - 1 - back
                 before = slot + s
-                for turn in range(self.resident_turns(w, self.part_threads)):
+                for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.scatter_thread_adjoint(state, bar, before, before + 1, q, stamp, self.parts)
                 self.meet(w)
-                for turn in range(self.resident_turns(w, self.active_nodes(self.block_count))):
+                for turn in range(self.turns_of(w, self.resident_threads, self.nodes_in(self.block_count))):
                     self.grid_thread_adjoint(w, w + turn * self.resident_threads, s)
                 self.meet(w)
-                for turn in range(self.resident_turns(w, self.part_threads)):
+                for turn in range(self.turns_of(w, self.resident_threads, self.part_threads)):
                     q = w + turn * self.resident_threads
                     self.gather_thread_adjoint(state, bar, before, before + 1, q, self.parts)
                 self.wait_for_warp()
@@ -332,7 +328,7 @@ class CudaEngine(ThreadPhases):
     def export_mass(self, out: Array):
         """Write the mass left at the nodes by :meth:`losses` to a cleared batch of n^3 tensors."""
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes(self.mass_blocks))):
+            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.mass_blocks))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 i = self.node_of_block(block, r)
                 if self.in_tensor(i - 1):
@@ -343,7 +339,5 @@ class CudaEngine(ThreadPhases):
         """Copy the particle state of all environments between time slots."""
         size = self.batch * self.tiles * STATE
         for i in range(size * self.lanes):
-            entry = i // self.lanes
-            target[target_slot * size + entry][i % self.lanes] = source[source_slot * size + entry][
-                i % self.lanes
-            ]
+            entry, lane = i // self.lanes, i % self.lanes
+            target[target_slot * size + entry][lane] = source[source_slot * size + entry][lane]

@@ -96,7 +96,7 @@ class OrderPhases(WarpPhases):
                 self.list_block(e * self.blocks + block, stamp)
         ti.loop_config(block_dim=WARP_BLOCK)
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.begin_shares(e, e * self.nodes + self.linear_in_block(block, r), w % WARP)
         for q in range(self.particle_threads):
@@ -107,7 +107,7 @@ class OrderPhases(WarpPhases):
                 place = self.cell_count[e * self.nodes + self.linear(base)] + self.rank[q]
             moves[t * self.particle_threads + q - particle + place] = particle
         for w in range(self.node_threads):
-            for turn in range(self.turns_of(w, self.active_nodes(self.block_count))):
+            for turn in range(self.turns_of(w, self.node_threads, self.nodes_in(self.block_count))):
                 e, block, r = self.node_of(w + turn * self.node_threads)
                 self.cell_count[e * self.nodes + self.linear_in_block(block, r)] = 0
         for q in range(self.particle_threads):

@@ -90,39 +90,7 @@ class CudaPhases(OrderPhases, PosePhases):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        w = spline(fx)
-        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.linear(base), w)
-        self.put_gathered(state, target, lane, x, fx, m0, mx, my, mz, e, time)
-
-    @ti.func
-    def gather_particle_adjoint(
-        self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e
-    ):
-        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``. Returns its
-        adjoint, row by row."""
-        x = self.vector(state, source, lane)
-        base, fx = self.stencil(x)
-        a = self.load(self.affine, entry9, lane, 9)
-        v_after = self.vector(state, after + AT_V, lane)
-        q = self.momentum_field(state, source, a, lane, fx)
-        h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
-        w = spline(fx)
-        dw = spline_slope(fx)
-        node = e * self.nodes + self.linear(base)
-        velocity = self.node_address(self.velocity, node)
-        momentum = self.node_address(self.momentum_bar, node)
-        m0, mx, my, mz, slope = gather_sums(self.real, velocity, momentum, self.axis, w, dw, q, h)
-        c_bar = self.load(bar, target + AT_C, lane, 9)
-        return self.put_transfer_adjoint(bar, target, lane, a, c_bar, x, v_after, fx, m0, mx, my, mz, slope)
-
-    @ti.func
-    def put_gathered(self, state: ti.template(), target, lane, x, fx, m0, mx, my, mz, e, time):
-        """Write v, C and x after the substep of the particle at x, from moments of the grid's velocities.
-
-        ``m0`` is the sum of w v over the stencil, ``mx``, ``my``, ``mz`` are those of w v times the node's
-        offset (0, 1, 2) along an axis, 4-vectors whose last entry is ignored. ``time`` is noted where the
-        speed is not sane.
-        """
+        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.linear(base), spline(fx))
         scale = 4.0 * self.inv_dx
         c0 = scale * (mx - fx[0] * m0)
         c1 = scale * (my - fx[1] * m0)
@@ -137,28 +105,25 @@ class CudaPhases(OrderPhases, PosePhases):
         self.note_speed(speed, e, time)
 
     @ti.func
-    def put_transfer_adjoint(
-        self,
-        bar: ti.template(),
-        target,
-        lane,
-        a: ti.template(),
-        c_bar: ti.template(),
-        x,
-        v_after,
-        fx: ti.template(),
-        m0,
-        mx,
-        my,
-        mz,
-        slope,
+    def gather_particle_adjoint(
+        self, state: ti.template(), source, after, bar: ti.template(), target, entry9, lane, e
     ):
-        """Write the adjoints of x and v before the substep; returns that of A, row by row.
-
-        Takes A, the adjoint of C, x before and v after the substep; the moments of the momentum's adjoint as
-        in :meth:`put_gathered`; and ``slope``, the sum of grad_f w (momentum_bar . q + velocity . h) over the
-        stencil, 3-vector.
-        """
+        """Adjoint of both transfers for one particle, of x and v in ``bar``; A is in ``affine``. Returns its
+        adjoint, row by row."""
+        x = self.vector(state, source, lane)
+        base, fx = self.stencil(x)
+        a = self.load(self.affine, entry9, lane, 9)
+        v_after = self.vector(state, after + AT_V, lane)
+        q = self.momentum_field(state, source, a, lane, fx)
+        h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
+        node = e * self.nodes + self.linear(base)
+        velocity = self.node_address(self.velocity, node)
+        momentum = self.node_address(self.momentum_bar, node)
+        # Moments of the momentum's adjoint, as in the gather, and the slope of both grids' part in it.
+        m0, mx, my, mz, slope = gather_sums(
+            self.real, velocity, momentum, self.axis, spline(fx), spline_slope(fx), q, h
+        )
+        c_bar = self.load(bar, target + AT_C, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
         a_bar = ti.Vector.zero(self.real, 9)

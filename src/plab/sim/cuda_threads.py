@@ -65,11 +65,6 @@ class ThreadPhases(CudaPhases):
         return e, tile, entry, lane, x, base, fx, node
 
     @ti.func
-    def resident_turns(self, w, total):
-        """How many of ``total`` items resident thread w works on."""
-        return (total - w + self.resident_threads - 1) // self.resident_threads
-
-    @ti.func
     def set_frames(self, w, threads, poses: ti.template(), actions: ti.template(), t, before, after):
         """Poses and frames of all substeps of environment step t, by the last of ``threads`` threads, whose
         blocks have the fewest particles; all threads of a block take part."""

@@ -121,12 +121,12 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
         return out
 
     @ti.func
-    def turns_of(self, w, total):
-        """How many of ``total`` items thread w of a loop over nodes works on."""
-        return (total - w + self.node_threads - 1) // self.node_threads
+    def turns_of(self, w, threads, total):
+        """How many of ``total`` items thread w of some threads works on."""
+        return (total - w + threads - 1) // threads
 
     @ti.func
-    def active_nodes(self, counter: ti.template()):
+    def nodes_in(self, counter: ti.template()):
         """Nodes of the blocks of all environments that ``counter`` has counted."""
         count = counter[0]
         if ti.static(not self.skips.empty_blocks):

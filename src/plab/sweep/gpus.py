@@ -60,10 +60,8 @@ def processes_on(names: Sequence[str], per_gpu: int, most: int) -> Iterator[Carr
         for k in range(per_gpu)
         for name in names
     ]
-    workers: list[_Worker] = []
+    workers = [_Worker(*place) for place in places[:most]]
     try:
-        for place in places[:most]:
-            workers.append(_Worker(*place))
         yield partial(_carry, workers)
     finally:
         for worker in workers:
