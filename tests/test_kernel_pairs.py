@@ -175,18 +175,20 @@ class Threads(ThreadPhases):
     @ti.kernel
     def advance_all(self, poses: ti.types.ndarray(ndim=1), actions: ti.types.ndarray(ndim=1)):
         for e in range(self.batch):
-            for m in ti.static(range(self.manipulators)):
-                self.advance_manipulator(e, m, actions, poses, 0, 0, 1)
-                for s in range(self.substeps):
-                    self.set_frame(e, s, m)
+            for _shape, start, stop in ti.static(self.shape_ranges):
+                for m in range(start, stop):
+                    self.advance_manipulator(e, start, m, actions, poses, 0, 0, 1)
+                    for s in range(self.substeps):
+                        self.set_frame(e, s, m)
 
     @ti.kernel
     def retreat_all(self, actions: ti.types.ndarray(ndim=1), actions_bar: ti.types.ndarray(ndim=1)):
         for e in range(self.batch):
-            for m in ti.static(range(self.manipulators)):
-                for s in range(self.substeps):
-                    self.share_frame(e, m, s)
-                self.retreat_through(e, m, actions, actions_bar, 0)
+            for _shape, start, stop in ti.static(self.shape_ranges):
+                for m in range(start, stop):
+                    for s in range(self.substeps):
+                        self.share_frame(e, start, m, s)
+                    self.retreat_through(e, start, m, actions, actions_bar, 0)
 
 
 @pytest.fixture(scope="module")

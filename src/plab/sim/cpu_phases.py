@@ -10,7 +10,7 @@ from plab.sim.cpu_material import MaterialTiles
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import advance_pose
-from plab.sim.pose_phases import PosePhases, with_unit_rotation
+from plab.sim.pose_phases import PosePhases
 from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STENCILS, STRAINS
 from plab.sim.term_phases import TermPhases
 
@@ -214,26 +214,20 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
         ``after``."""
         self.note_step(e, t)
-        for m in ti.static(range(self.manipulators)):
-            entry = (before * self.batch + e) * self.manipulators + m
-            for i in ti.static(range(8)):
-                self.pose[e, 0, m][i] = poses[entry * 8 + i]
-            if ti.static(self.rotations_as_given):
-                self.pose[e, 0, m] = with_unit_rotation(self.pose[e, 0, m])
-            u = self.substep_motion(e, m, actions, t)
-            for s in range(self.substeps):
-                self.pose[e, s + 1, m] = advance_pose(
-                    self.motions[m],
-                    self.pose[e, s, m],
-                    u,
-                    self.low[e, m],
-                    self.high[e, m],
-                    self.minimal_gap[e, m],
-                )
-                self.set_frame(e, s, m)
-            entry = (after * self.batch + e) * self.manipulators + m
-            for i in ti.static(range(8)):
-                poses[entry * 8 + i] = self.pose[e, self.substeps, m][i]
+        for _shape, start, stop in ti.static(self.shape_ranges):
+            for m in range(start, stop):
+                pose = self.given_pose(poses, before, e, m)
+                self.pose[e, 0, m] = pose
+                u = self.substep_motion(e, start, m, actions, t)
+                for s in range(self.substeps):
+                    pose = advance_pose(
+                        self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+                    )
+                    self.pose[e, s + 1, m] = pose
+                    self.set_frame(e, s, m)
+                entry = (after * self.batch + e) * self.manipulators + m
+                for i in ti.static(range(8)):
+                    poses[entry * 8 + i] = pose[i]
 
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):
@@ -242,7 +236,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         self.frame_bar[grid_index, m, entry] = self.frame_bar[grid_index, m, entry] + wide
 
     @ti.func
-    def collect_frame_adjoint(self, e, m: ti.template()):
+    def collect_frame_adjoint(self, e, m):
         """Sum the chunks' frame adjoints of one manipulator, and clear them."""
         bar = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
         for c in range(self.chunks):
@@ -252,21 +246,15 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         return bar
 
     @ti.func
-    def retreat_manipulator(
-        self, e, m: ti.template(), s, actions: ti.template(), actions_bar: ti.template(), t
-    ):
-        """Adjoint of one manipulator's motion in substep s: pose_bar goes from its end to its start."""
-        end_bar, start_bar = self.frame_shares(e, m, s, self.collect_frame_adjoint(e, m))
-        u = self.substep_motion(e, m, actions, t)
-        pose_bar, u_bar = self.retreat_pose(e, m, s, u, self.pose_bar[e, m] + end_bar)
-        self.pose_bar[e, m] = pose_bar + start_bar
-        self.add_to_action_adjoint(e, m, actions, actions_bar, t, u_bar)
-
-    @ti.func
     def retreat_manipulators(self, e, s, actions: ti.template(), actions_bar: ti.template(), t):
-        """Adjoint of all manipulators' motion in substep s."""
-        for m in ti.static(range(self.manipulators)):
-            self.retreat_manipulator(e, m, s, actions, actions_bar, t)
+        """Adjoint of all manipulators' motion in substep s: pose_bar goes from its end to its start."""
+        for _shape, start, stop in ti.static(self.shape_ranges):
+            for m in range(start, stop):
+                end_bar, start_bar = self.frame_shares(e, start, m, s, self.collect_frame_adjoint(e, m))
+                u = self.substep_motion(e, start, m, actions, t)
+                pose_bar, u_bar = self.retreat_pose(e, start, m, s, u, self.pose_bar[e, m] + end_bar)
+                self.pose_bar[e, m] = pose_bar + start_bar
+                self.add_to_action_adjoint(e, start, m, actions, actions_bar, t, u_bar)
 
     # -- terms of the loss, one chunk ---------------------------------------------------------------
 

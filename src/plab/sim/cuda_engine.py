@@ -234,12 +234,12 @@ class CudaEngine(ThreadPhases):
                     self.node_terms_thread(w, w + turn * self.node_threads)
             else:
                 q = w - self.node_threads
-                for m in ti.static(range(self.manipulators)):
-                    if ti.static(self.motions[m] != "static"):
-                        if q // DISTANCE_GROUPS % self.manipulators == m:
-                            self.tally_group(
-                                q // (DISTANCE_GROUPS * self.manipulators), m, q % DISTANCE_GROUPS
-                            )
+                number, count = q // DISTANCE_GROUPS, ti.static(max(1, self.manipulators))
+                e, m = number // count, number % count
+                for shape, start, stop in ti.static(self.shape_ranges):
+                    if ti.static(self.acts(shape)):
+                        if start <= m < stop:
+                            self.tally_group(e, m, q % DISTANCE_GROUPS)
         for e in range(self.batch):
             self.take_measures(e)
             self.join_measures(e, terms, at + ti.static(self.measures) * e)
@@ -310,19 +310,19 @@ class CudaEngine(ThreadPhases):
     def retreat_kernel(self, actions: Array, actions_bar: Array, t: ti.i32):
         """Adjoint of all manipulators' motion in environment step t, from its frames' adjoints."""
         for q in range(self.pose_threads * self.substeps):
-            s = q // self.pose_threads
-            r = q % self.pose_threads
-            for m in ti.static(range(self.manipulators)):
-                if r // self.batch == m:
-                    self.share_frame(r % self.batch, m, s)
+            m = q % self.pose_threads // self.batch
+            for _shape, start, stop in ti.static(self.shape_ranges):
+                if start <= m < stop:
+                    self.share_frame(q % self.batch, start, m, q // self.pose_threads)
         if ti.static(self.full_gradient):
             for row in range(self.batch * self.materials):
                 self.take_material(row)
         for q in range(self.pose_threads):
             self.block_count[0] = 0
-            for m in ti.static(range(self.manipulators)):
-                if q // self.batch == m:
-                    self.retreat_through(q % self.batch, m, actions, actions_bar, t)
+            m = q // self.batch
+            for _shape, start, stop in ti.static(self.shape_ranges):
+                if start <= m < stop:
+                    self.retreat_through(q % self.batch, start, m, actions, actions_bar, t)
 
     @ti.kernel
     def export_mass(self, out: Array):

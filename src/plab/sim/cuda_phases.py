@@ -15,7 +15,7 @@ from plab.sim.cuda_bitcode import gather_sums, particle, particle_adjoint
 from plab.sim.cuda_order import OrderPhases
 from plab.sim.cuda_warp import RUN_BITS, WARP
 from plab.sim.motion import advance_pose
-from plab.sim.pose_phases import PosePhases, vec7, with_unit_rotation
+from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
 from plab.sim.transfer import affine_field, spline, spline_slope
@@ -237,22 +237,17 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def advance_manipulator(
-        self, e, m: ti.template(), actions: ti.template(), poses: ti.template(), t, before, after
+        self, e, start: ti.template(), m, actions: ti.template(), poses: ti.template(), t, before, after
     ):
         """Poses of one manipulator in all substeps of environment step t."""
-        if ti.static(m == 0):
+        if m == 0:
             self.note_step(e, t)
-        pose = self.pose[e, 0, m]
-        entry = (before * self.batch + e) * self.manipulators + m
-        for i in ti.static(range(8)):
-            pose[i] = poses[entry * 8 + i]
-        if ti.static(self.rotations_as_given):
-            pose = with_unit_rotation(pose)
+        pose = self.given_pose(poses, before, e, m)
         self.pose[e, 0, m] = pose
-        u = self.substep_motion(e, m, actions, t)
+        u = self.substep_motion(e, start, m, actions, t)
         for s in range(self.substeps):
             pose = advance_pose(
-                self.motions[m], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+                self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
             )
             self.pose[e, s + 1, m] = pose
         entry = (after * self.batch + e) * self.manipulators + m
@@ -260,28 +255,30 @@ class CudaPhases(OrderPhases, PosePhases):
             poses[entry * 8 + i] = pose[i]
 
     @ti.func
-    def retreat_through(self, e, m: ti.template(), actions: ti.template(), actions_bar: ti.template(), t):
+    def retreat_through(
+        self, e, start: ti.template(), m, actions: ti.template(), actions_bar: ti.template(), t
+    ):
         """Adjoint of one manipulator's motion in all substeps of environment step t, from what
         :meth:`share_frame` has left."""
         bar = self.pose_bar[e, m]
-        u = self.substep_motion(e, m, actions, t)
+        u = self.substep_motion(e, start, m, actions, t)
         total = vec7(0.0)
         for back in range(self.substeps):
             s = self.substeps - 1 - back
-            pose_bar, u_bar = self.retreat_pose(e, m, s, u, bar + self.end_share[e, s, m])
+            pose_bar, u_bar = self.retreat_pose(e, start, m, s, u, bar + self.end_share[e, s, m])
             bar = pose_bar + self.start_share[e, s, m]
             total += u_bar
         self.pose_bar[e, m] = bar
-        self.add_to_action_adjoint(e, m, actions, actions_bar, t, total)
+        self.add_to_action_adjoint(e, start, m, actions, actions_bar, t, total)
 
     @ti.func
-    def share_frame(self, e, m: ti.template(), s):
+    def share_frame(self, e, start: ti.template(), m, s):
         """Share the adjoint of a substep's frame out to the poses around it, and clear it."""
         frame = ti.Vector.zero(ti.f64, FRAME_ADJOINT)
         for i in ti.static(range(FRAME_ADJOINT)):
             at = ((e * self.substeps + s) * self.manipulators + m) * FRAME_ADJOINT + i
             frame[i] = self.take_sum(self.frame_sums, at)
-        self.end_share[e, s, m], self.start_share[e, s, m] = self.frame_shares(e, m, s, frame)
+        self.end_share[e, s, m], self.start_share[e, s, m] = self.frame_shares(e, start, m, s, frame)
 
     # -- terms of the loss --------------------------------------------------------------------------
 

@@ -71,18 +71,17 @@ class ThreadPhases(CudaPhases):
         at = w % RESIDENT_BLOCK
         first = ((threads - w + at) // RESIDENT_BLOCK - 1) * POSE_SHARE
         count = ti.min(self.pose_threads - first, POSE_SHARE)
-        for m in ti.static(range(self.manipulators)):
-            # Neighbouring threads take the same manipulator of different environments, hence the same path.
-            if at < count and (first + at) // self.batch == m:
-                self.advance_manipulator((first + at) % self.batch, m, actions, poses, t, before, after)
+        # Neighbouring threads take the same manipulator of different environments, hence the same path.
+        e, m = (first + at) % self.batch, (first + at) // self.batch
+        for _shape, start, stop in ti.static(self.shape_ranges):
+            if at < count and start <= m < stop:
+                self.advance_manipulator(e, start, m, actions, poses, t, before, after)
         ti.simt.block.sync()
         if count > 0:
             for turn in range((count * self.substeps - at + RESIDENT_BLOCK - 1) // RESIDENT_BLOCK):
                 number = at + turn * RESIDENT_BLOCK
                 q = first + number % count
-                for m in ti.static(range(self.manipulators)):
-                    if q // self.batch == m:
-                        self.set_frame(q % self.batch, number // count, m)
+                self.set_frame(q % self.batch, number // count, q // self.batch)
 
     @ti.func
     def meet(self, w):

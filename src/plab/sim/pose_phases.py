@@ -7,7 +7,7 @@ from plab.sim.motion import advance_pose_adjoint, rotation_matrix, rotation_matr
 from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 
-__all__ = ["PosePhases", "vec7", "with_unit_rotation"]
+__all__ = ["PosePhases", "vec7"]
 
 vec4 = ti.types.vector(4, ti.f64)
 vec7 = ti.types.vector(7, ti.f64)
@@ -35,15 +35,25 @@ def with_unit_rotation(pose):
 
 
 class PosePhases(Storage):
-    """Poses within one environment step and the frames in which contact is computed."""
+    """Poses within one environment step and the frames in which contact is computed.
+
+    What differs between shapes is compiled for each of the ``shape_ranges``: ``start`` is the first of those
+    that manipulator ``m`` is in.
+    """
 
     @ti.func
-    def substep_motion(self, e, m: ti.template(), actions: ti.template(), t):
+    def action_of(self, e, start: ti.template(), m, t):
+        """Where manipulator m's numbers begin among the actions of all."""
+        own = ti.static(self.action_offsets[start]) + (m - start) * ti.static(self.action_dims[start])
+        return (t * self.batch + e) * self.actions_per_step + own
+
+    @ti.func
+    def substep_motion(self, e, start: ti.template(), m, actions: ti.template(), t):
         """One substep's share of the clipped, scaled action of manipulator m."""
         u = vec7(0.0)
-        for i in ti.static(range(self.action_dims[m])):
-            a = actions[(t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)]
-            u[i] = ti.min(ti.max(a, -1.0), 1.0) * self.scale[e, m][i] / self.substeps
+        entry = self.action_of(e, start, m, t)
+        for i in ti.static(range(self.action_dims[start])):
+            u[i] = ti.min(ti.max(actions[entry + i], -1.0), 1.0) * self.scale[e, m][i] / self.substeps
         return u
 
     @ti.func
@@ -53,19 +63,25 @@ class PosePhases(Storage):
             if self.touched[e] == 0:
                 self.untouched_step[e] = t
 
+    @ti.func
+    def given_pose(self, poses: ti.template(), slot, e, m):
+        """Manipulator m's pose in slot ``slot`` of the pose history."""
+        pose = vec8(0.0)
+        for i in ti.static(range(8)):
+            pose[i] = poses[((slot * self.batch + e) * self.manipulators + m) * 8 + i]
+        if ti.static(self.rotations_as_given):
+            pose = with_unit_rotation(pose)
+        return pose
+
     @ti.kernel
     def place(self, poses: Array, slot: ti.i32):
         """Take slot ``slot`` of the pose history as the end of an environment step, for the losses."""
         for e in range(self.batch):
-            for m in ti.static(range(self.manipulators)):
-                entry = (slot * self.batch + e) * self.manipulators + m
-                for i in ti.static(range(8)):
-                    self.pose[e, self.substeps, m][i] = poses[entry * 8 + i]
-                if ti.static(self.rotations_as_given):
-                    self.pose[e, self.substeps, m] = with_unit_rotation(self.pose[e, self.substeps, m])
+            for m in range(self.manipulators):
+                self.pose[e, self.substeps, m] = self.given_pose(poses, slot, e, m)
 
     @ti.func
-    def set_frame(self, e, s, m: ti.template()):
+    def set_frame(self, e, s, m):
         """Centre, rotation and rates of a manipulator in substep s; the rates are differences taken in
         float64."""
         start = self.pose[e, s, m]
@@ -82,21 +98,16 @@ class PosePhases(Storage):
         self.frame_gap[e, s, m] = ti.cast(start[7], self.real)
 
     @ti.func
-    def retreat_pose(self, e, m: ti.template(), s, u, bar):
+    def retreat_pose(self, e, start: ti.template(), m, s, u, bar):
         """Adjoints of the pose at the start of substep s and of its motion u, given that of the pose at its
         end."""
+        pose = self.pose[e, s, m]
         return advance_pose_adjoint(
-            self.motions[m],
-            self.pose[e, s, m],
-            u,
-            self.low[e, m],
-            self.high[e, m],
-            self.minimal_gap[e, m],
-            bar,
+            self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m], bar
         )
 
     @ti.func
-    def frame_shares(self, e, m: ti.template(), s, frame):
+    def frame_shares(self, e, start: ti.template(), m, s, frame):
         """What a frame's adjoint adds to the adjoints of the poses at the end and at the start of substep
         s."""
         inv_dt = ti.cast(1.0, ti.f64) / self.dt
@@ -111,7 +122,7 @@ class PosePhases(Storage):
                 rotation_bar[i, j] = frame[AT_FRAME_ROTATION + 3 * i + j]
                 spin_bar[i, j] = frame[AT_FRAME_SPIN + 3 * i + j] * inv_dt
         start_bar[7] = frame[AT_FRAME_GAP]
-        if ti.static(MANIPULATOR_SHAPES[self.shapes[m]].turns):
+        if ti.static(MANIPULATOR_SHAPES[self.shapes[start]].turns):
             end_q = rotation_matrix_adjoint(quaternion(self.pose[e, s + 1, m]), spin_bar)
             start_q = rotation_matrix_adjoint(quaternion(self.pose[e, s, m]), rotation_bar - spin_bar)
             for i in ti.static(range(4)):
@@ -121,10 +132,10 @@ class PosePhases(Storage):
 
     @ti.func
     def add_to_action_adjoint(
-        self, e, m: ti.template(), actions: ti.template(), actions_bar: ti.template(), t, u_bar
+        self, e, start: ti.template(), m, actions: ti.template(), actions_bar: ti.template(), t, u_bar
     ):
         """Add the adjoint of :meth:`substep_motion` to that of the action."""
-        for i in ti.static(range(self.action_dims[m])):
-            entry = (t * self.batch + e) * self.actions_per_step + ti.static(self.action_offsets[m] + i)
-            if ti.abs(actions[entry]) <= 1.0:
-                actions_bar[entry] += u_bar[i] * self.scale[e, m][i] / self.substeps
+        entry = self.action_of(e, start, m, t)
+        for i in ti.static(range(self.action_dims[start])):
+            if ti.abs(actions[entry + i]) <= 1.0:
+                actions_bar[entry + i] += u_bar[i] * self.scale[e, m][i] / self.substeps

@@ -340,13 +340,14 @@ class TermPhases(Storage):
             terms[at + column] = sums[k]
         for k, column, term in ti.static(self.distance_terms):
             total = ti.cast(0.0, ti.f64)
-            for m in ti.static(range(self.manipulators)):
-                if ti.static(self.motions[m] != "static"):
-                    tally = self.tally_part[k, e, 0, m]
-                    for c in range(1, self.shares):
-                        tally = term.join(tally, self.tally_part[k, e, c, m])
-                    self.tally[k, e, m] = tally
-                    total += term.measure(tally)
+            for shape, start, stop in ti.static(self.shape_ranges):
+                if ti.static(self.acts(shape)):
+                    for m in range(start, stop):
+                        tally = self.tally_part[k, e, 0, m]
+                        for c in range(1, self.shares):
+                            tally = term.join(tally, self.tally_part[k, e, c, m])
+                        self.tally[k, e, m] = tally
+                        total += term.measure(tally)
             terms[at + column] = total
         terms[at + ti.static(len(self.terms))] = part[last]
         terms[at + ti.static(len(self.terms) + 1)] = ti.cast(self.fault[e], ti.f64)
