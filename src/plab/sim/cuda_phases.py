@@ -90,7 +90,8 @@ class CudaPhases(OrderPhases, PosePhases):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
         x = self.vector(state, source, lane)
         base, fx = self.stencil(x)
-        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.linear(base), spline(fx))
+        w = spline(fx)
+        m0, mx, my, mz = self.moments(self.velocity, e * self.nodes + self.linear(base), w)
         scale = 4.0 * self.inv_dx
         c0 = scale * (mx - fx[0] * m0)
         c1 = scale * (my - fx[1] * m0)
@@ -116,13 +117,13 @@ class CudaPhases(OrderPhases, PosePhases):
         v_after = self.vector(state, after + AT_V, lane)
         q = self.momentum_field(state, source, a, lane, fx)
         h = self.velocity_adjoint_field(state, x, after, bar, target, lane, fx)
+        w = spline(fx)
+        dw = spline_slope(fx)
         node = e * self.nodes + self.linear(base)
         velocity = self.node_address(self.velocity, node)
         momentum = self.node_address(self.momentum_bar, node)
         # Moments of the momentum's adjoint, as in the gather, and the slope of both grids' part in it.
-        m0, mx, my, mz, slope = gather_sums(
-            self.real, velocity, momentum, self.axis, spline(fx), spline_slope(fx), q, h
-        )
+        m0, mx, my, mz, slope = gather_sums(self.real, velocity, momentum, self.axis, w, dw, q, h)
         c_bar = self.load(bar, target + AT_C, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
