@@ -75,9 +75,7 @@ def computed(simulator: Simulator, actions: np.ndarray) -> Results:
     }
 
 
-def results_of(
-    scenes: list[int], precision: str, contact: str, times: int = 1
-) -> list[dict[str, np.ndarray]]:
+def results_of(scenes: list[int], precision: str, contact: str, times: int = 1) -> list[Results]:
     """What a simulator of some scenes computes, each time; it is gone before there is another, as only then
     its kernels are not compiled anew."""
     simulator = simulator_of(scenes, precision, contact)
