@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,9 @@ from plab.errors import ConfigError, out_of_memory
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError
+from plab.scene import Scene
 from plab.sim import DeviceError, SimulationError, Simulator
+from plab.sim.batch import scene_kind
 
 __all__ = [
     "COLUMNS",
@@ -23,6 +25,7 @@ __all__ = [
     "measures",
     "shared_problem",
     "simulation_errors",
+    "simulator_key",
 ]
 
 COLUMNS = ("loss", "reward", "iou", "score")
@@ -57,15 +60,27 @@ def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
 
 
 def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
-    """Return the problem of some configurations, with the simulator kept from the last runs if it fits."""
-    scenes, sim, method = tuple(build_scenes(cfgs)), cfgs[0].sim, cfgs[0].method
+    """Return the problem of some configurations, with the simulator kept from the last runs if it can be of
+    these scenes."""
+    scenes = tuple(build_scenes(cfgs))
 
     def build() -> Simulator:
         return build_simulator(scenes, cfgs[0])
 
+    def refill(simulator: Simulator) -> None:
+        if simulator.scenes == scenes:
+            simulator.reset()
+        else:
+            simulator.set_scenes(scenes)
+
+    return Problem(cfgs, cache.get((len(cfgs), simulator_key(cfgs[0], scenes[0])), build, check=refill))
+
+
+def simulator_key(cfg: Config, scene: Scene) -> Hashable:
+    """Return what is the same for configurations whose simulators differ in their scenes alone."""
+    sim, method = cfg.sim, cfg.method
     loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
-    key = scenes, loss, sim.precision, sim.device, sim.memory_mb, sim.deterministic
-    return Problem(cfgs, cache.get(key, build, check=Simulator.reset))
+    return scene_kind(scene), loss, sim.precision, sim.device, sim.memory_mb, sim.deterministic
 
 
 def checked_array(array: Any, shape: Sequence[int], dtype: str, name: str) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
@@ -13,11 +13,11 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from plab.config import Config, MethodConfig
+from plab.config import Config, MethodConfig, build_scene
 from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
 from plab.reuse import SimulatorCache
-from plab.runners.common import LAST, episode_columns
+from plab.runners.common import LAST, episode_columns, simulator_key
 from plab.runners.runner import Runner, Track
 
 __all__ = [
@@ -135,9 +135,9 @@ def environment_key(cfg: Config) -> str:
 
 
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
-    """Return batches of environments, in their initial states, those kept from the last run if they fit;
-    each is of some configurations, which the environments have in turn, a number of environments and a
-    contact model."""
+    """Return batches of environments, in their initial states, those kept from the last run if they can be
+    of these scenes; each is of some configurations, which the environments have in turn, a number of
+    environments and a contact model."""
 
     def build() -> list[EpisodeBatch]:
         return [
@@ -154,8 +154,11 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
 
-    key = tuple((tuple(map(environment_key, cfgs)), size, contact) for cfgs, size, contact in kinds)
-    return cache.get(key, build, check=start_again)
+    def key(cfg: Config) -> Hashable:
+        return simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, *(getattr(cfg, one) for one in OBSERVED)
+
+    keys = tuple((key(cfgs[0]), size, contact) for cfgs, size, contact in kinds)
+    return cache.get(keys, build, check=start_again)
 
 
 @contextmanager

@@ -11,7 +11,15 @@ from numpy.typing import ArrayLike
 
 from plab.scene import Scene, SceneError
 
-__all__ = ["initial_poses", "require_alike", "with_material"]
+__all__ = ["initial_poses", "require_alike", "scene_kind", "with_material"]
+
+SHARED = ("particle_count", "material_count", "grid_size", "dt", "substeps", "numbers", "floor")
+"""What scenes of one simulator have in common, beside their manipulators' shapes."""
+
+
+def scene_kind(scene: Scene) -> tuple[Any, ...]:
+    """What is the same for scenes that one simulator can be of, one after the other or side by side."""
+    return (*(getattr(scene, name) for name in SHARED), *(tool.shape for tool in scene.manipulators))
 
 
 def require_alike(scenes: Sequence[Scene]) -> None:
@@ -26,7 +34,7 @@ def require_alike(scenes: Sequence[Scene]) -> None:
             raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
         scene.validate()
     for number, scene in enumerate(scenes[1:], start=1):
-        for name in ("particle_count", "material_count", "grid_size", "dt", "substeps", "numbers", "floor"):
+        for name in SHARED:
             if getattr(scene, name) != getattr(first, name):
                 raise SceneError(
                     f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
