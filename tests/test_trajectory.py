@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from plab.config import Config, ConfigError, load_config
+from plab.config import Config, ConfigError, build_scene, load_config
 from plab.families import FAMILIES
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import RunResult, read, result_path
+from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_config, trajectory
 from plab.runners.common import measures, shared_problem
 from plab.runners.trajectory import ActionSequence
@@ -217,6 +218,20 @@ def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monke
     out = capsys.readouterr().out
     assert out.count("\n") == 1
     assert str(finished.path) in out and f"{finished.evaluation['score']:.4f}" in out
+
+
+def test_the_next_variant_in_the_same_simulator_is_as_if_alone(tmp_path: Path) -> None:
+    first, other = (make_config(tmp_path, f"variant={variant}") for variant in (1, 3))
+    cache = SimulatorCache()
+    run_config(first, cache)
+    kept = shared_problem(cache, [first]).simulator
+    run_config(other, cache)
+    assert shared_problem(cache, [other]).simulator is kept and kept.scenes[0] != build_scene(first)
+    alone = make_config(tmp_path / "alone", "variant=3")
+    run_config(alone, SimulatorCache())
+    assert_same_numbers(read(result_path(other)), read(result_path(alone)))
+    # Of another kind, hence a simulator of its own.
+    assert shared_problem(cache, [make_config(tmp_path, "sim.substeps=6")]).simulator is not kept
 
 
 def test_force_repeats_with_the_same_numbers(tmp_path: Path, finished: RunResult) -> None:
