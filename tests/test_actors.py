@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 
 from plab.bench.unseen import FIRST
 from plab.cli.bench import unseen
-from plab.config import Config, ConfigError, drawn_configs, load_config
+from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.reuse import SimulatorCache
@@ -269,9 +269,14 @@ def test_rounds_take_the_drawn_scenes_in_turn(tmp_path: Path) -> None:
         training.train()
         taken.append([one.seed_scene for one in batch.configs])
     assert taken == [[1000, 1001], [1002, 1000], [1001, 1002]]
-    # Whoever shares the environments next has those it asks for.
-    (again,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
-    assert again is batch and [one.variant for one in batch.configs] == ["1", "1"]
+    # Whoever shares the environments next has those it asks for, and the same again as they are.
+    for variant in "1", "3", "3":
+        wanted = [make_config(tmp_path, "pods", "method.epochs=1", f"variant={variant}")]
+        problem = batch.problem
+        (again,) = shared_batches(CACHE, (wanted, 2, cfg.method.contact))
+        assert again is batch and [one.variant for one in batch.configs] == [variant] * 2
+        assert batch.problem.scenes[1] == build_scene(*wanted)
+    assert batch.problem is problem
 
 
 def test_scenes_that_do_not_fit_are_left_out(tmp_path: Path, monkeypatch) -> None:

@@ -66,7 +66,7 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem) -> None:
 
 def test_environments_of_tensors_do_what_those_of_arrays_do() -> None:
     cfgs = [load_config([*COARSE, "sim=reference", f"task.yield_stress={s}"]) for s in (20, 50)]
-    env, arrays = TensorEnv(cfgs), EpisodeBatch(cfgs)
+    env, arrays = TensorEnv(EpisodeBatch(cfgs)), EpisodeBatch(cfgs)
     np.testing.assert_array_equal(env.reset().numpy(), arrays.reset()[0])
     for t in range(HORIZON):
         actions = draw(t)[:, t].detach().float()

@@ -42,7 +42,7 @@ def test_cuda_gives_what_the_cpu_gives() -> None:
 def test_tensors_stay_on_the_device(own_stream: bool) -> None:
     """Also where PyTorch works in another stream than Taichi."""
     cfgs = [load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2
-    env, arrays = TensorEnv(cfgs), EpisodeBatch(cfgs)
+    env, arrays = TensorEnv(EpisodeBatch(cfgs)), EpisodeBatch(cfgs)
     generator = torch.Generator("cuda").manual_seed(0)
     with torch.cuda.stream(torch.cuda.Stream() if own_stream else torch.cuda.default_stream()):
         first = env.reset()
@@ -59,7 +59,8 @@ def test_tensors_stay_on_the_device(own_stream: bool) -> None:
 @pytest.mark.parametrize("at", [0, 1])
 def test_what_breaks_off_rests_on_the_device(at: int) -> None:
     """The first environment is not finite before a step; the other one goes on."""
-    env = TensorEnv([load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2)
+    cfg = load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])
+    env = TensorEnv(EpisodeBatch([cfg] * 2))
     actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(4, 2, 6)
     env.reset()
     whole = [env.step(action, strict=False) for action in actions]

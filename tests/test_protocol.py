@@ -164,7 +164,7 @@ def test_rotations_are_of_unit_length_after_the_start(simulator: Simulator) -> N
 
 
 def test_one_simulator_has_one_floor(simulator: Simulator) -> None:
-    with pytest.raises(SceneError, match="need the same floor: scene 0 has release, scene 1 has plab"):
+    with pytest.raises(SceneError, match="need the same floor: the simulator has release, scene 0 has plab"):
         simulator.set_scenes([replace(scene, floor="plab") for scene in SCENES])
 
 

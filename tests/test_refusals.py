@@ -248,10 +248,10 @@ def test_calls_from_python(call, line):
 
 @pytest.mark.physics
 def test_rollouts_of_no_steps_and_of_no_numbers():
-    from plab.envs.tensors import TensorEnv
+    from plab.envs.core import EpisodeBatch
 
     with pytest.raises(PlabError, match="there is no configuration"):
-        TensorEnv([])
+        EpisodeBatch([])
     simulator = Simulator([scene(("Sphere",))])
     for given, line in (
         (np.zeros((1, 0, simulator.action_dim)), "actions have no steps: give one at least"),

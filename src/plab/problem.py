@@ -37,7 +37,16 @@ if TYPE_CHECKING:
 
     from plab.scene import Scene
 
-__all__ = ["Episodes", "Problem", "Trials", "build_scenes", "build_simulator", "fits", "make_targets"]
+__all__ = [
+    "Episodes",
+    "Problem",
+    "Trials",
+    "build_scenes",
+    "build_simulator",
+    "fits",
+    "kinds_of",
+    "make_targets",
+]
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
         plab.config.ConfigError: If a variant does not exist.
         plab.scene.SceneError: If a scene cannot be simulated.
     """
-    kinds = _kinds(cfgs)
+    kinds = kinds_of(cfgs)
     scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
     return [scenes[kind] for kind in kinds]
 
@@ -126,15 +135,17 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
     )
 
 
-def _kinds(cfgs: Sequence[Config]) -> list[str]:
-    """Return texts that are equal where configurations differ in method, seed and files only."""
+def kinds_of(cfgs: Sequence[Config]) -> list[str]:
+    """Return texts that are equal where configurations have the same environment: where they differ in seed,
+    files and how the method learns only."""
+
+    def text(cfg: Config) -> str:
+        sections = (asdict(part) for part in (cfg.task, cfg.protocol, cfg.sim, cfg.targets))
+        loss = cfg.method.loss_weights, cfg.method.loss_terms
+        return json.dumps([cfg.variant, cfg.seed_particles, *sections, *loss])
+
     # A planner's batch has each configuration many times.
-    texts = {
-        id(cfg): json.dumps(
-            [cfg.variant, cfg.seed_particles, asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim)]
-        )
-        for cfg in {id(cfg): cfg for cfg in cfgs}.values()
-    }
+    texts = {id(cfg): text(cfg) for cfg in {id(cfg): cfg for cfg in cfgs}.values()}
     return [texts[id(cfg)] for cfg in cfgs]
 
 
@@ -167,7 +178,7 @@ class Problem:
         """
         _require_alike(cfgs)
         # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
-        kinds = _kinds(cfgs)
+        kinds = kinds_of(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or build_simulator(build_scenes(cfgs), cfgs[0])
         self.scenes = self.simulator.scenes

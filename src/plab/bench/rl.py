@@ -120,8 +120,9 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     with population_settings(method):
-        training = TensorEnv([one for one in cfgs for _ in range(method.num_envs)], contact=method.contact)
-        evaluation = TensorEnv(cfgs)
+        own = [one for one in cfgs for _ in range(method.num_envs)]
+        training = TensorEnv(EpisodeBatch(own, contact=method.contact))
+        evaluation = TensorEnv(EpisodeBatch(cfgs))
         population = Population(cfgs, range(agents), training, evaluation, [None] * agents)
         population.evaluate()
         population.train(2 * method.num_envs)

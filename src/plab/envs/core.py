@@ -20,7 +20,7 @@ from plab.config.selection import OBSERVED
 from plab.config.words import word_list
 from plab.envs.observations import Observer, spaces
 from plab.errors import ArgumentError
-from plab.problem import Problem, build_scenes
+from plab.problem import Problem, build_scenes, kinds_of
 from plab.sim import CONTACT_MODELS, SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
@@ -214,11 +214,14 @@ class EpisodeBatch:
         if len(cfgs) != self.size:
             raise ArgumentError(f"{len(cfgs)} configurations for {self.size} sub-environments")
         _require_alike([*self.configs[:1], *cfgs])
-        scenes, simulator = build_scenes(cfgs), self._simulator
-        # Of none, should there be an error half way.
-        self.configs: tuple[Config, ...] = ()
-        simulator.set_scenes(scenes)
-        self._take(cfgs, Problem(cfgs, simulator))
+        scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
+        simulator.reset()
+        if kinds_of(cfgs) != kinds_of(self.configs):
+            # Of none, should there be an error half way.
+            self.configs: tuple[Config, ...] = ()
+            simulator.set_scenes(scenes)
+            problem = Problem(cfgs, simulator)
+        self._take(cfgs, problem)
         self._begin()
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:

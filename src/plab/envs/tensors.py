@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
-from plab.config import Config
 from plab.envs.core import EpisodeBatch, Transition
 
 __all__ = ["TensorEnv"]
@@ -24,10 +22,10 @@ class TensorEnv:
         device: Where the tensors are.
     """
 
-    def __init__(self, cfgs: Sequence[Config], *, contact: str = "hard") -> None:
-        """Build everything; arguments and errors as for :class:`plab.envs.core.EpisodeBatch`."""
-        self.batch = EpisodeBatch(cfgs, contact=contact)
-        self.device = torch.device(self.batch.problem.simulator.device)
+    def __init__(self, batch: EpisodeBatch) -> None:
+        """Give tensors' way into environments that there are."""
+        self.batch = batch
+        self.device = torch.device(batch.problem.simulator.device)
         self._like = torch.empty(0, device=self.device)
 
     def reset(self) -> torch.Tensor:

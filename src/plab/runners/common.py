@@ -14,7 +14,7 @@ from plab.problem import Episodes, Problem, build_scenes, build_simulator
 from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError
 from plab.scene import Scene
-from plab.sim import DeviceError, SimulationError, Simulator
+from plab.sim import DeviceError, SimulationError
 from plab.sim.batch import scene_kind
 
 __all__ = [
@@ -62,18 +62,10 @@ def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
 def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
     """Return the problem of some configurations, with the simulator kept from the last runs if it can be of
     these scenes."""
-    scenes = tuple(build_scenes(cfgs))
-
-    def build() -> Simulator:
-        return build_simulator(scenes, cfgs[0])
-
-    def refill(simulator: Simulator) -> None:
-        if simulator.scenes == scenes:
-            simulator.reset()
-        else:
-            simulator.set_scenes(scenes)
-
-    return Problem(cfgs, cache.get((len(cfgs), simulator_key(cfgs[0], scenes[0])), build, check=refill))
+    scenes = build_scenes(cfgs)
+    key = len(cfgs), simulator_key(cfgs[0], scenes[0])
+    kept = cache.get(key, lambda: build_simulator(scenes, cfgs[0]), check=lambda it: it.set_scenes(scenes))
+    return Problem(cfgs, kept)
 
 
 def simulator_key(cfg: Config, scene: Scene) -> Hashable:

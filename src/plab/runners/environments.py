@@ -3,11 +3,10 @@ settings."""
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +22,6 @@ from plab.runners.runner import Runner, Track
 __all__ = [
     "Evaluation",
     "PolicyRunner",
-    "environment_key",
     "evaluation",
     "shared_batches",
     "torch_settings",
@@ -125,15 +123,6 @@ def evaluation(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) 
     return Evaluation(sums | last, np.concatenate(actions), failure)
 
 
-def environment_key(cfg: Config) -> str:
-    """Return a text that is the same for configurations whose environments are alike."""
-    method = asdict(cfg.method)
-    loss = [method["loss_weights"], method["loss_terms"]]
-    sections = [asdict(cfg.task), asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
-    seen = [getattr(cfg, key) for key in OBSERVED]
-    return json.dumps([*sections, loss, cfg.variant, cfg.seed_particles, seen])
-
-
 def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
     """Return batches of environments, in their initial states, those kept from the last run if they can be
     of these scenes; each is of some configurations, which the environments have in turn, a number of
@@ -147,18 +136,15 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
 
     def start_again(batches: list[EpisodeBatch]) -> None:
         for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
-            wanted = [cfgs[k % len(cfgs)] for k in range(batch.size)]
-            # A run may have gone on to other scenes.
-            if list(map(environment_key, batch.configs)) != list(map(environment_key, wanted)):
-                batch.renew(wanted)
+            batch.renew([cfgs[k % len(cfgs)] for k in range(batch.size)])
             batch.reset()
             batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
 
-    def key(cfg: Config) -> Hashable:
-        return simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, *(getattr(cfg, one) for one in OBSERVED)
-
-    keys = tuple((key(cfgs[0]), size, contact) for cfgs, size, contact in kinds)
-    return cache.get(keys, build, check=start_again)
+    key: list[Hashable] = []
+    for (cfg, *_), size, contact in kinds:
+        key += [simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, size, contact]
+        key += [getattr(cfg, name) for name in OBSERVED]
+    return cache.get(tuple(key), build, check=start_again)
 
 
 @contextmanager

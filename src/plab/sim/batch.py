@@ -22,27 +22,27 @@ def scene_kind(scene: Scene) -> tuple[Any, ...]:
     return (*(getattr(scene, name) for name in SHARED), *(tool.shape for tool in scene.manipulators))
 
 
-def require_alike(scenes: Sequence[Scene]) -> None:
-    """Raise SceneError if scenes cannot be simulated, or do not fit together in one simulator."""
+def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
+    """Raise SceneError if scenes cannot be simulated, or do not fit together in one simulator, that of
+    ``like`` if there is one."""
     if isinstance(scenes, Scene):
         raise SceneError("a simulator takes a list of scenes, one per environment: Simulator([scene])")
     if not scenes:
         raise SceneError("a simulator needs at least one scene")
-    first = scenes[0]
-    for scene in scenes:
+    first, of = (like, "the simulator") if like else (scenes[0], "scene 0")
+    for number, scene in enumerate(scenes):
         if not isinstance(scene, Scene):
             raise SceneError(f"scenes are what build_scene() returns, not {scene!r}")
         scene.validate()
-    for number, scene in enumerate(scenes[1:], start=1):
         for name in SHARED:
             if getattr(scene, name) != getattr(first, name):
                 raise SceneError(
-                    f"scenes of one batch need the same {name}: scene 0 has {getattr(first, name)}, "
+                    f"scenes of one batch need the same {name}: {of} has {getattr(first, name)}, "
                     f"scene {number} has {getattr(scene, name)}"
                 )
         if [m.shape for m in scene.manipulators] != [m.shape for m in first.manipulators]:
             raise SceneError(
-                f"scenes of one batch need the same manipulators; scene {number} differs from scene 0"
+                f"scenes of one batch need the same manipulators; scene {number} differs from {of}"
             )
 
 

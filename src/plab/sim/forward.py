@@ -199,7 +199,7 @@ class ForwardSimulator:
         self._require_runtime()
         if len(scenes) != self.batch:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
-        require_alike([self.scenes[0], *scenes])
+        require_alike(scenes, self.scenes[0])
         self.scenes = tuple(scenes)
         self._engine.fill_parameters(scenes)
         self._start_from(particles)

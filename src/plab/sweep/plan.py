@@ -8,12 +8,13 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
-from plab.config import Config, RlConfig
+from plab.config import Config, RlConfig, build_scene
 from plab.config.selection import OBSERVED
 from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
 from plab.scene import Scene
+from plab.sim.batch import scene_kind
 from plab.sim.memory import batch_limit
 from plab.sizes import most_environments
 
@@ -40,13 +41,11 @@ def plan(
         Batches, each as evenly filled as the others of its kind.
     """
     groups: dict[str, list[Config]] = {}
-    scenes = build_scenes(cfgs)
-    for cfg, scene in zip(cfgs, scenes, strict=True):
+    for cfg, scene in zip(cfgs, build_scenes(cfgs), strict=True):
         groups.setdefault(json.dumps(_kind(cfg, scene)), []).append(cfg)
-    first = {id(cfg): scene for cfg, scene in zip(cfgs, scenes, strict=True)}
     batches = []
     for group in groups.values():
-        limit = _limit(group[0], first[id(group[0])], size, sharing)
+        limit = _limit(group[0], size, sharing)
         batches += _split(group, max(-(-len(group) // limit), -(-processes // len(groups))))
     return batches
 
@@ -63,11 +62,11 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other, and agents learn in step.
     alike = row_count(method) if own.batching else method
-    return [*kind, alike, scene.particle_count, scene.material_count, [m.shape for m in scene.manipulators]]
+    return [*kind, alike, *scene_kind(scene)]
 
 
-def _limit(cfg: Config, scene: Scene, size: int | None, sharing: int) -> int:
-    own = family(cfg.method.family)
+def _limit(cfg: Config, size: int | None, sharing: int) -> int:
+    own, scene = family(cfg.method.family), build_scene(cfg)
     if not (own.batching or own.joins_populations(cfg.method)):
         return 1
     if size is not None:

@@ -21,7 +21,7 @@ from plab.envs.tensors import TensorEnv
 from plab.problem import build_scenes
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import PolicyRunner, environment_key
+from plab.runners.environments import PolicyRunner, shared_batches
 from plab.runners.jobs import RunError
 from plab.runners.policy import save_policy
 from plab.runners.population.agents import OffPolicyAgents, trained_policy
@@ -53,26 +53,14 @@ class PopulationRunner(PolicyRunner):
         """Make the environments of the training, and those in the hard contact model that judge."""
         check_torch_device(self.method)
         cfgs, method = [track.cfg for track in self.tracks], self.method
-        kinds = (method.num_envs, method.contact), (1, "hard")
         self._spaces = Spaces(*spaces(cfgs[0], build_scenes(cfgs)))
         (observed,), (actions,) = (space.shape for space in self._spaces)
         self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
         self._total = total_steps(method, self._sizes.horizon)
         self._require_memory()
-
-        def build() -> list[TensorEnv]:
-            return [
-                TensorEnv([cfg for cfg in cfgs for _ in range(size)], contact=contact)
-                for size, contact in kinds
-            ]
-
-        def start_again(envs: list[TensorEnv]) -> None:
-            for env, (_, contact) in zip(envs, kinds, strict=True):
-                env.reset()
-                env.batch.problem.simulator.set_contact(contact, softness=method.softness)
-
-        key = "population", kinds, tuple(environment_key(cfg) for cfg in cfgs)
-        self._training, self._evaluation = self.cache.get(key, build, check=start_again)
+        own = [cfg for cfg in cfgs for _ in range(method.num_envs)]
+        kinds = (own, len(own), method.contact), (cfgs, len(cfgs), "hard")
+        self._training, self._evaluation = map(TensorEnv, shared_batches(self.cache, *kinds))
         self.problem = self._evaluation.batch.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
