@@ -201,9 +201,10 @@ def built(scenes: list[Scene]) -> tuple[Tiles, Threads]:
     both = Tiles(scenes, runtime, Skips(), True), Threads(scenes, runtime, Skips(), True)
     order = np.stack([np.random.default_rng(9).permutation(s.particle_count) for s in scenes])
     for phases in both:
+        phases.fill_parameters(scenes)
         phases.fill_bodies(scenes, order)
         phases.allocate_adjoint()
-        phases.clear_adjoint()
+        phases.clear_adjoint(ti.ndarray(phases.lane_type, shape=1))
     return both
 
 

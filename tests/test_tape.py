@@ -34,14 +34,11 @@ class Numbers:
     def array(self, slots: int) -> np.ndarray:
         return np.full(slots, -1)
 
-    def clear(self, array: np.ndarray) -> None:
-        array.fill(0)
-
     def allocate(self, steps: int) -> np.ndarray:
         return np.full(steps, -1)
 
-    def clear_adjoint(self) -> None:
-        pass
+    def clear_adjoint(self, bar: np.ndarray) -> None:
+        bar.fill(0)
 
     def allocate_adjoint(self) -> None:
         pass

@@ -19,12 +19,12 @@ class Density(NodeTerm):
         """Share the target's mass tensor, and keep its sum."""
         super().attach(sim)
         self.target = sim.reference("mass")
-        self.total = ti.field(ti.f64, shape=sim.batch)
+        self.total = sim.share(ti.field(ti.f64, shape=sim.batch))
 
     def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
         """Sum the targets' masses: what empty environments miss."""
         # A target of the release may have negative ones.
-        self.total.from_numpy(np.abs(mass).sum(axis=(1, 2, 3)))
+        self.sim.write(self.total, np.abs(mass).sum(axis=(1, 2, 3)))
 
     @ti.func
     def empty(self, e):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,8 +25,6 @@ class EpisodeReplay(ReplayBuffer):
     Stable-Baselines3's buffer takes. Transitions are only ever appended, and overwritten when they are older
     than anything that a checkpoint can ask for: a process that resumes finds the buffer as the checkpoint
     knew it. What was appended after the checkpoint is appended again.
-
-    Where samples go to a CUDA device, a copy of the buffer is kept there, and samples are drawn from it.
 
     Attributes:
         added: Steps of all environments that were added, the overwritten ones included.
@@ -82,31 +79,13 @@ class EpisodeReplay(ReplayBuffer):
         size = 4 * sum(int(np.prod(shape)) for shape in shapes.values())
         _require_file(Path(path), size, create=added == 0)
         self._file = np.memmap(path, np.float32, "r+")
-        self._lay_out(shapes)
-
-    def _lay_out(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Set the arrays of these names and shapes, one after the other in the file."""
+        # One array after the other.
         start = 0
         for name, shape in shapes.items():
             part = self._file[start : start + int(np.prod(shape))]
             # A plain array: indexing a memmap costs more.
             setattr(self, name, np.asarray(part).reshape(shape))
             start += part.size
-        self._copies = self._copy_to_device() if self.device.type == "cuda" else None
-
-    def _copy_to_device(self) -> dict[str, torch.Tensor]:
-        """Return copies of the whole buffer on the device; ResultsError if it has no room for them."""
-        arrays = {name: getattr(self, name) for name in ("observations", "actions", "rewards")}
-        try:
-            # Without an earlier process there is nothing to copy yet.
-            if self.added == 0:
-                return {name: torch.empty(a.shape, device=self.device) for name, a in arrays.items()}
-            return {name: torch.from_numpy(a).to(self.device) for name, a in arrays.items()}
-        except torch.cuda.OutOfMemoryError as error:
-            raise ResultsError(
-                f"no room on the device for {self._file.nbytes / 1e9:.1f} GB of replay buffer: "
-                "set method.torch_device=cpu or a smaller method.buffer_size"
-            ) from error
 
     def add(
         self,
@@ -124,14 +103,6 @@ class EpisodeReplay(ReplayBuffer):
         self.observations[first + 1] = next_obs
         self.actions[place] = action
         self.rewards[place] = reward
-        if self._copies is not None:
-            changed: dict[str, Any] = {
-                "observations": slice(first, first + 2),
-                "actions": place,
-                "rewards": place,
-            }
-            for name, rows in changed.items():
-                self._copies[name][rows] = torch.from_numpy(getattr(self, name)[rows]).to(self.device)
         self.added += 1
 
     def size(self) -> int:
@@ -146,8 +117,6 @@ class EpisodeReplay(ReplayBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         envs = np.random.randint(0, self.n_envs, size=len(batch_inds))  # noqa: NPY002
         first = batch_inds + batch_inds // self._horizon
-        if self._copies is not None and env is None:
-            return self._samples_on_device(self._copies, batch_inds, first, envs)
         data = (
             self._normalize_obs(self.observations[first, envs], env),
             self.actions[batch_inds, envs],
@@ -157,21 +126,6 @@ class EpisodeReplay(ReplayBuffer):
             self._normalize_reward(self.rewards[batch_inds, envs].reshape(-1, 1), env),
         )
         return ReplayBufferSamples(*(self.to_torch(cast(np.ndarray, array)) for array in data))
-
-    def _samples_on_device(
-        self, copies: dict[str, torch.Tensor], places: np.ndarray, first: np.ndarray, envs: np.ndarray
-    ) -> ReplayBufferSamples:
-        """Take samples from the copies; see :meth:`_get_samples`."""
-        numbers = torch.from_numpy(np.stack([places, first, envs])).to(self.device)
-        place, row, env = numbers
-        observations = copies["observations"]
-        return ReplayBufferSamples(
-            observations[row, env],
-            copies["actions"][place, env],
-            observations[row + 1, env],
-            torch.zeros((len(places), 1), device=self.device),
-            copies["rewards"][place, env].reshape(-1, 1),
-        )
 
     def flush(self) -> None:
         """Wait until the disk has everything that was added; ResultsError if it does not take it."""

@@ -66,7 +66,7 @@ class ClosedLoop:
         if t < self._steps:
             device = "cuda" if engine.cuda else "cpu"
             row = step_actions(chosen, engine.batch, engine.actions_per_step, device)
-            copy_numbers(row, 0, self.actions, t * self._row, self._row)
+            copy_numbers(self.actions, t * self._row, row, self._row, 1)
 
     def after(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Look at the state that step t has led to."""
@@ -75,7 +75,7 @@ class ClosedLoop:
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
         """Add to the adjoint of the state that step t has led to what it does through its observation."""
         if self._discount != 1.0:
-            self._engine.term_weights.from_numpy(self.weights * self._discount**t)
+            self._engine.write(self._engine.term_weights, self.weights * self._discount**t)
         given = self.answer(t + 1)
         if given is None:
             return

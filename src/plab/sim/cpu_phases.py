@@ -24,22 +24,15 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
 
     shares = CHUNKS
 
-    def allocate_adjoint(self) -> None:
-        """Allocate what only gradients need, once."""
-        if hasattr(self, "velocity_bar"):
-            return
-        super().allocate_adjoint()
+    def _allocate_adjoint(self) -> None:
+        super()._allocate_adjoint()
         m = max(1, self.manipulators)
         self.frame_bar = ti.field(ti.f64, shape=(self.batch * self.chunks, m, FRAME_ADJOINT))
+        self.adjoint_sums += [(self.frame_bar, 0)]
         # Shares of the chunks in the poses' adjoints under terms of distances.
         self.pose_part = ti.Vector.field(
             8, ti.f64, shape=(self.batch, self.chunks if self.beyond_nearest else 1, m)
         )
-
-    def clear_adjoint(self) -> None:
-        """Begin a gradient: clear the adjoints that are sums over its steps."""
-        super().clear_adjoint()
-        self.frame_bar.fill(0)
 
     # -- shares -------------------------------------------------------------------------------------
 

@@ -45,11 +45,8 @@ class CudaPhases(OrderPhases, PosePhases):
         # Distances of all particles, written and tallied once per loss; static manipulators leave theirs out.
         self.distance = ti.field(self.real, shape=threads * self.manipulators if moving else 1)
 
-    def allocate_adjoint(self) -> None:
-        """Allocate what only gradients need, once."""
-        if hasattr(self, "velocity_bar"):
-            return
-        super().allocate_adjoint()
+    def _allocate_adjoint(self) -> None:
+        super()._allocate_adjoint()
         # What the frames' adjoints add to those of the poses at each substep's end and start.
         shares = (self.batch, self.substeps, max(1, self.manipulators))
         self.end_share = ti.Vector.field(8, ti.f64, shape=shares)

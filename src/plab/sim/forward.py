@@ -21,7 +21,7 @@ from plab.sim.runtime import is_current, register_user, start_runtime
 from plab.sim.skips import Skips
 from plab.sim.state import Measures, State, rest_state
 from plab.sim.tape import Tape
-from plab.sim.tensors import numbers_of, on_device, output_for, step_actions
+from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
 from plab.sizes import require_memory
 
@@ -80,6 +80,7 @@ class ForwardSimulator:
         self._skips = skips
         self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient, deterministic)
         self._engine.attach(terms)
+        self._engine.fill_parameters(self.scenes)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64
         self._scratch_terms = ti.ndarray(ti.f64, shape=self._engine.measures * self.batch)
@@ -166,7 +167,7 @@ class ForwardSimulator:
             if name == "soft" and not rate > 0:
                 raise ArgumentError(f"softness {rate:g} must be positive")
         self._version += 1
-        self._engine.alpha.from_numpy(np.where(models == "soft", decay, 0.0).astype(self._numpy_real))
+        self._engine.write(self._engine.alpha, np.where(models == "soft", decay, 0.0))
 
     def set_weights(self, weights: Mapping[str, float]) -> None:
         """Set weights of terms in the trajectory loss and its gradient; nothing is compiled anew.
@@ -178,11 +179,13 @@ class ForwardSimulator:
             ValueError: If the simulator was built without a term.
         """
         columns = {term.name: column for column, term in enumerate(self._engine.terms) if term.weighted}
+        held = self._engine.read(self._engine.term_weights)
         for name, weight in weights.items():
             if name not in columns:
                 known = ", ".join(columns) or "none"
                 raise ArgumentError(f"this simulator was built without a term '{name}'; it has: {known}")
-            self._engine.term_weights[columns[name]] = weight
+            held[columns[name]] = weight
+        self._engine.write(self._engine.term_weights, held)
 
     def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
         """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
@@ -249,7 +252,7 @@ class ForwardSimulator:
                 raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
         held = {"mass": np.asarray(mass, self._numpy_real), "sdf": np.asarray(sdf, self._numpy_real)}
         for name, field in self._engine.references.items():
-            field.from_numpy(held[name].reshape(-1))
+            self._engine.write(field, held[name])
         for term in self._engine.terms:
             term.set_target(held["mass"].astype(np.float64), held["sdf"])
 
@@ -262,10 +265,7 @@ class ForwardSimulator:
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
         self._particles.order.reset()
         self._place(self._initial_poses)
-        self._engine.fault.fill(0)
-        self._taken = 0
         self._checked = True
-        self._engine.touched.fill(0)
 
     def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
         """Advance all environments by one environment step, without keeping history.
@@ -285,7 +285,8 @@ class ForwardSimulator:
         self._taken += 1
         self._checked = check
         if check:
-            require_none(broken_states(self._engine.fault.to_numpy(), self.substeps, self._taken))
+            faults = self._engine.read(self._engine.fault)
+            require_none(broken_states(faults, self.substeps, self._taken))
 
     def measure(self, like: torch.Tensor | None = None) -> Measures:
         """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type.
@@ -300,7 +301,7 @@ class ForwardSimulator:
             values = values.reshape(self.batch, -1)
         else:
             self._particles.losses(self._scratch_terms, 0)
-            values = self._scratch_terms.to_numpy().reshape(self.batch, -1)
+            values = numbers_of(self._scratch_terms, (self.batch, self._engine.measures), None)
         checked, self._checked = self._checked, True
         if not checked:
             require_none(broken_states(values[:, -1], self.substeps, self._taken))
@@ -386,8 +387,6 @@ class ForwardSimulator:
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()
         self._place(np.asarray(state.poses, np.float64))
-        self._engine.fault.fill(0)
-        self._taken = 0
 
     def set_initial_state(self, state: State) -> None:
         """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
@@ -418,9 +417,11 @@ class ForwardSimulator:
         self._initial.from_numpy(self._particles.pack(start))
 
     def _place(self, poses: np.ndarray) -> None:
+        """Place the manipulators for a start, at which nothing has gone wrong."""
         if self.manipulator_count:
-            self._pose.from_numpy(np.ascontiguousarray(poses).reshape(-1))
-            self._engine.place(self._pose, 0)
+            copy_numbers(self._pose, 0, np.array(poses).reshape(-1), poses.size, 1)
+        self._engine.place(self._pose, 0, self._pose, 1)
+        self._taken = 0
 
     def _require_runtime(self) -> None:
         if not is_current(self._runtime):

@@ -112,20 +112,22 @@ class ParticleOrder:
     def reset(self) -> None:
         """Return to the initial order."""
         if self._changed:
-            self.numbers.from_numpy(self._start)
+            copy_numbers(self.numbers, 0, self._start, self.places, 1)
             self._changed = False
 
     def current(self) -> np.ndarray:
         """The order at present, shape [batch, particle]."""
         batch, particles = self.initial.shape
-        return self.numbers.to_numpy().reshape(batch, -1)[:, :particles].astype(np.int64)
+        out = np.zeros(self.places, np.int32)
+        copy_numbers(self.numbers, 0, out, self.places, 0)
+        return out.reshape(batch, -1)[:, :particles].astype(np.int64)
 
     def noted(self) -> ti.Ndarray:
         """Return :attr:`numbers` as they are now, whatever order comes next."""
         if not self._engine.sorts:
             return self.numbers
         copy = self.allocate(1)
-        copy_numbers(self.numbers, 0, copy, 0, self.places)
+        copy_numbers(copy, 0, self.numbers, self.places, 1)
         return copy
 
     def sort(

@@ -10,7 +10,6 @@ import taichi as ti
 from plab.sim.order import ParticleOrder
 from plab.sim.state import State
 from plab.sim.storage import AT_C, AT_F, AT_V, STATE
-from plab.sim.tensors import clear
 
 if TYPE_CHECKING:
     from plab.sim.engine import CpuEngine
@@ -40,13 +39,9 @@ class Particles:
         self._stamp = 0
 
     def array(self, slots: int) -> ti.Ndarray:
-        """Allocate an array of states."""
+        """Allocate an array of states, all 0."""
         engine = self.engine
         return ti.ndarray(engine.lane_type, shape=slots * engine.batch * engine.tiles * STATE)
-
-    def clear(self, array: ti.Ndarray) -> None:
-        """Set an array of states to 0."""
-        clear(array, self.engine.lanes)
 
     @property
     def slot_entries(self) -> int:

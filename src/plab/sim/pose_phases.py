@@ -74,11 +74,18 @@ class PosePhases(Storage):
         return pose
 
     @ti.kernel
-    def place(self, poses: Array, slot: ti.i32):
-        """Take slot ``slot`` of the pose history as the end of an environment step, for the losses."""
+    def place(self, poses: Array, slot: ti.i32, now: Array, fresh: ti.i32):
+        """Take slot ``slot`` of the pose history as the end of an environment step, for the losses, and copy
+        it to slot 0 of ``now``; if ``fresh``, nothing has gone wrong or been touched before."""
         for e in range(self.batch):
+            if fresh != 0:
+                self.fault[e] = 0
+                self.touched[e] = 0
             for m in range(self.manipulators):
                 self.pose[e, self.substeps, m] = self.given_pose(poses, slot, e, m)
+                at = (e * self.manipulators + m) * 8
+                for i in ti.static(range(8)):
+                    now[at + i] = poses[slot * self.batch * self.manipulators * 8 + at + i]
 
     @ti.func
     def set_frame(self, e, s, m):

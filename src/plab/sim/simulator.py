@@ -17,7 +17,7 @@ from plab.sim.forward import ForwardSimulator
 from plab.sim.parameters import parameter_gradient
 from plab.sim.recording import Recording, StateRecorder
 from plab.sim.state import Rollout, State
-from plab.sim.tensors import action_array, numbers_of
+from plab.sim.tensors import action_array, copy_numbers, numbers_of
 
 if TYPE_CHECKING:
     import torch
@@ -75,7 +75,7 @@ class Simulator(ForwardSimulator):
             failures = broken_gradients(actions_bar) | failures
             if strict:
                 require_none(failures)
-        self._place_last(poses, steps)
+        self._engine.place(poses, steps, self._pose, 0)
         judged = self._judged(values)
         step_terms, step_iou = judged.terms[1:].swapaxes(0, 1), judged.iou[1:].T
         return Rollout(judged.terms[0], step_terms, judged.iou[0], step_iou, actions_bar, failures)
@@ -112,15 +112,15 @@ class Simulator(ForwardSimulator):
         recorder = StateRecorder(self._particles, actions, every_step, mass, steps)
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         self._tape.forward(array, poses, None, steps, plan, after=recorder.note)
-        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
-        self._place_last(poses, steps)
+        require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
+        self._engine.place(poses, steps, self._pose, 0)
         shown = numbers_of(poses, (steps + 1, self.batch, self.manipulator_count, 8), actions)
 
         def back() -> np.ndarray | torch.Tensor:
             terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
             before = self.steps_before_contact(steps)
             with self._kept_weights():
-                self._engine.term_weights.fill(0)
+                self._engine.write(self._engine.term_weights, np.zeros(self._engine.term_weights.shape))
                 bars = self._tape.backward(array, poses, terms, steps, before, add=recorder.add)
             bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
             require_none(broken_gradients(bar))
@@ -173,7 +173,7 @@ class Simulator(ForwardSimulator):
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
         self._version += 1
         # Contact before this stretch has nothing to do with its actions.
-        self._engine.touched.fill(0)
+        self._engine.write(self._engine.touched, np.zeros(self.batch))
         plan = self._tape.plan(steps, self.memory_mb)
         poses = self._pose_history(steps, cast(np.ndarray, self.poses()))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
@@ -181,14 +181,14 @@ class Simulator(ForwardSimulator):
         loop = ClosedLoop(self._particles, poses, steps, choose, react, observe, stride, discount, like)
         loop.look(0, self._particles.current, 0)
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
-        require_none(broken_states(self._engine.fault.to_numpy(), self.substeps))
+        require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         before = self.steps_before_contact(steps)
         with self._kept_weights() as loop.weights:
             self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
         bars = numbers_of(loop.actions_bar, (steps, self.batch, self.action_dim), like)
         require_none(broken_gradients(bars.swapaxes(0, 1)))
         loop.answer(0)
-        self._place_last(poses, steps)
+        self._engine.place(poses, steps, self._pose, 0)
         values = numbers_of(terms, (steps + 1, self.batch, self._engine.measures), like)
         return self._judged(values).terms[1:].swapaxes(0, 1)
 
@@ -239,7 +239,6 @@ class Simulator(ForwardSimulator):
         self._require_runtime()
         self._engine.allocate_adjoint()
         bar = self._particles.array(1)
-        self._particles.clear(bar)
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)
@@ -251,32 +250,27 @@ class Simulator(ForwardSimulator):
         any environment's body; 0 where the whole gradient is asked for."""
         if self._engine.full_gradient or not self._skips.adjoints:
             return 0
-        touched = self._engine.touched.to_numpy() != 0
-        return int(np.where(touched, self._engine.untouched_step.to_numpy(), steps).min())
+        engine = self._engine
+        touched, untouched = engine.read(engine.touched), engine.read(engine.untouched_step)
+        return int(np.where(touched != 0, untouched, steps).min())
 
     # -- internals ----------------------------------------------------------------------------------
 
     @contextmanager
     def _kept_weights(self) -> Iterator[np.ndarray]:
         """Put the weights of the terms back after the ``with`` block, however it ends."""
-        weights = self._engine.term_weights.to_numpy()
+        weights = self._engine.read(self._engine.term_weights)
         try:
             yield weights
         finally:
-            self._engine.term_weights.from_numpy(weights)
+            self._engine.write(self._engine.term_weights, weights)
 
     def _pose_history(self, steps: int, first: np.ndarray) -> ti.Ndarray:
         """Room for the manipulators' poses before and after each environment step; the first ones are set."""
         poses = ti.ndarray(ti.f64, shape=max(1, (steps + 1) * self.batch * self.manipulator_count * 8))
-        whole = np.zeros((steps + 1, self.batch, self.manipulator_count, 8))
-        whole[0] = first
-        poses.from_numpy(np.resize(whole.reshape(-1), poses.shape))
+        if first.size:
+            copy_numbers(poses, 0, np.array(first).reshape(-1), first.size, 1)
         return poses
-
-    def _place_last(self, poses: ti.Ndarray, steps: int) -> None:
-        """Place the manipulators as they are after the last step of a history."""
-        shape = steps + 1, self.batch, self.manipulator_count, 8
-        self._place(poses.to_numpy()[: int(np.prod(shape))].reshape(shape)[-1])
 
     def _require_gradient(self) -> None:
         self._require_runtime()

@@ -20,6 +20,7 @@ import numpy as np
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.sim.exchange import Exchange
 from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.series import Series
@@ -82,12 +83,6 @@ AT_FRAME_VELOCITY, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_GAP = 3, 6, 15, 24
 """Adjoint entries per manipulator and substep, and where they begin: centre (3), velocity (3), rotation (9),
 its rate (9), gap (1)."""
 
-MANIPULATOR = 18
-"""Numbers that say what a manipulator is like, for :meth:`Storage.put_manipulators`; its size is first."""
-
-AT_SCALE, AT_LOWER, AT_UPPER, AT_FRICTION, AT_MINIMAL_GAP = 3, 10, 13, 16, 17
-"""Where the others of these begin."""
-
 STATE_MASK = 2**27 - 1
 """Largest entry of an array of states on the CPU, all bits set; LLVM must see that eight times an entry and
 its successors fit into 32 bits."""
@@ -120,7 +115,7 @@ a2; bars those of k, c2, J; parameters mu, lambda and the yield strain, with adj
 LANES = {"cpu": 8, "cuda": 32}
 
 
-class Storage:
+class Storage(Exchange):
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
     def __init__(
@@ -132,8 +127,11 @@ class Storage:
         deterministic: bool = False,
     ) -> None:
         """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
-        data; gradients include those by initial state and material if ``full_gradient``. The CPU is
-        ``deterministic`` in any case."""
+        data, for :meth:`fill_parameters`; gradients include those by initial state and material if
+        ``full_gradient``. The CPU is ``deterministic`` in any case."""
+        super().__init__()
+        # Adjoints that are sums over a gradient's steps, and the length of their vectors.
+        self.adjoint_sums: list[tuple[ti.Field, int]] = []
         self.full_gradient = full_gradient
         self.deterministic = deterministic
         first = scenes[0]
@@ -159,7 +157,6 @@ class Storage:
         self._set_grid(first)
         self._set_manipulators(first)
         self._allocate()
-        self.fill_parameters(scenes)
 
     def _set_grid(self, scene: Scene) -> None:
         self.n = scene.grid_size
@@ -217,20 +214,21 @@ class Storage:
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         if self.mixed:
             # Each particle's mu, lambda and yield strain, and the number of its body.
-            self.place_material = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 3)
-            self.place_body = ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles)
+            self.place_material = self.share(ti.Vector.field(self.lanes, real, shape=b * self.tiles * 3))
+            self.place_body = self.share(ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles))
+            self._bodies = np.zeros((b, self.tiles, 1, self.lanes), int)
         self.momentum = self.scattered_grid(b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
         # Material per environment: mu, lambda, yield strain (of its first body), floor friction, gravity (3).
-        self.material = ti.Vector.field(7, real, shape=b)
-        self.size = ti.Vector.field(3, real, shape=(b, m))
-        self.friction = ti.field(real, shape=(b, m))
-        self.scale = ti.Vector.field(7, ti.f64, shape=(b, m))
-        self.low = ti.Vector.field(3, ti.f64, shape=(b, m))
-        self.high = ti.Vector.field(3, ti.f64, shape=(b, m))
-        self.minimal_gap = ti.field(ti.f64, shape=(b, m))
+        self.material = self.share(ti.Vector.field(7, real, shape=b))
+        self.size = self.share(ti.Vector.field(3, real, shape=(b, m)))
+        self.friction = self.share(ti.field(real, shape=(b, m)))
+        self.scale = self.share(ti.Vector.field(7, ti.f64, shape=(b, m)))
+        self.low = self.share(ti.Vector.field(3, ti.f64, shape=(b, m)))
+        self.high = self.share(ti.Vector.field(3, ti.f64, shape=(b, m)))
+        self.minimal_gap = self.share(ti.field(ti.f64, shape=(b, m)))
         # Decay rate of the soft contact model; 0 is the hard one.
-        self.alpha = ti.field(real, shape=b)
+        self.alpha = self.share(ti.field(real, shape=b))
         # Poses of one environment step, and what contact needs of them.
         self.pose = ti.Vector.field(8, ti.f64, shape=(b, self.substeps + 1, m))
         self.frame_centre = ti.Vector.field(3, real, shape=(b, self.substeps, m))
@@ -243,11 +241,11 @@ class Storage:
         self.block_list = ti.field(ti.i32, shape=b * self.blocks)
         self.block_count = ti.field(ti.i32, shape=b)
         self.arrivals = ti.field(ti.i32, shape=32 * self.threads)
-        self.fault = ti.field(ti.i32, shape=b)
+        self.fault = self.share(ti.field(ti.i32, shape=b))
         # Whether a moving manipulator has touched the body since the reset, and the last environment step at
         # whose start none had.
-        self.touched = ti.field(ti.i32, shape=b)
-        self.untouched_step = ti.field(ti.i32, shape=b)
+        self.touched = self.share(ti.field(ti.i32, shape=b))
+        self.untouched_step = self.share(ti.field(ti.i32, shape=b))
 
     def scattered_grid(self, nodes: int) -> ti.Field:
         """Allocate a grid of 4-vectors that particles scatter to."""
@@ -259,8 +257,10 @@ class Storage:
 
     def allocate_adjoint(self) -> None:
         """Allocate what only gradients need, once."""
-        if hasattr(self, "velocity_bar"):
-            return
+        if not self.adjoint_sums:
+            self._allocate_adjoint()
+
+    def _allocate_adjoint(self) -> None:
         b = self.batch
         self.velocity_bar = self.scattered_grid(b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
@@ -268,33 +268,39 @@ class Storage:
         # Adjoints of mu, lambda and yield strain, material by material.
         rows = b * self.chunks * self.materials if self.full_gradient else 1
         self.material_bar = ti.field(ti.f64, shape=(rows, 3))
+        self.adjoint_sums += [(self.pose_bar, 8), (self.material_bar, 0)]
 
-    def clear_adjoint(self) -> None:
-        """Begin a gradient: clear the adjoints that are sums over its steps."""
-        self.pose_bar.fill(0)
-        self.material_bar.fill(0)
+    @ti.kernel
+    def clear_adjoint(self, bar: Array):
+        """Begin a gradient: clear the adjoints of particles and those that are sums over its steps."""
+        for i in bar:
+            for k in ti.static(range(self.lanes)):
+                bar[i][k] = 0.0
+        for field, size in ti.static(self.adjoint_sums):
+            for i in ti.grouped(field):
+                if ti.static(size == 0):
+                    field[i] = 0.0
+                for c in ti.static(range(size)):
+                    field[i][c] = 0.0
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
         """Write material, floor friction and gravity of all environments."""
-        numpy_real = np.float32 if self.real == ti.f32 else np.float64
         rows = [[*material_parameters(s.materials[0]), s.floor_friction, *s.gravity] for s in scenes]
-        self.material.from_numpy(np.array(rows, numpy_real))
+        self.write(self.material, rows)
         if self.mixed:
-            by_body = np.array([[material_parameters(m) for m in s.materials] for s in scenes], numpy_real)
-            bodies = self.place_body.to_numpy().reshape(self.batch, self.tiles, 1, self.lanes)
+            by_body = np.array([[material_parameters(m) for m in s.materials] for s in scenes])
             columns = np.arange(3).reshape(1, 1, 3, 1)
             environments = np.arange(self.batch).reshape(-1, 1, 1, 1)
-            values = by_body[environments, bodies, columns]
-            self.place_material.from_numpy(values.reshape(-1, self.lanes))
+            self.write(self.place_material, by_body[environments, self._bodies, columns])
 
     def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:
         """Write whose particles are where, by their numbers at each place, shape [batch, particle], and what
         they are made of; nothing where all are of one material."""
         if not self.mixed:
             return
-        bodies = np.zeros((self.batch, self.tiles * self.lanes), np.int32)
-        bodies[:, : self.particles] = [s.particle_bodies[row] for s, row in zip(scenes, order, strict=True)]
-        self.place_body.from_numpy(bodies.reshape(-1, self.lanes))
+        places = self._bodies.reshape(self.batch, -1)[:, : self.particles]
+        places[:] = [s.particle_bodies[row] for s, row in zip(scenes, order, strict=True)]
+        self.write(self.place_body, self._bodies)
         self.fill_material(scenes)
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
@@ -302,27 +308,10 @@ class Storage:
         self.fill_material(scenes)
         if self.manipulators == 0:
             return
-        rows = np.zeros((self.batch, self.manipulators, MANIPULATOR))
-        for e, scene in enumerate(scenes):
-            for row, tool in zip(rows[e], scene.manipulators, strict=True):
-                row[: len(tool.size)] = tool.size
-                row[AT_SCALE : AT_SCALE + len(tool.scale)] = tool.scale
-                row[AT_LOWER:AT_FRICTION] = *tool.lower_bound, *tool.upper_bound
-                row[AT_FRICTION], row[AT_MINIMAL_GAP] = tool.friction, tool.minimal_gap
-        self.put_manipulators(rows.ravel())
-
-    # One kernel: that of each field's own from_numpy takes 10 ms to come from Taichi's cache.
-    @ti.kernel
-    def put_manipulators(self, rows: Array):
-        """Write what manipulators are like, float64, shape [batch * manipulator * MANIPULATOR]: size (3),
-        scale (7), lower and upper bound (3 each), friction, minimal gap."""
-        for e, m in ti.ndrange(self.batch, self.manipulators):
-            first = (e * self.manipulators + m) * MANIPULATOR
-            for i in ti.static(range(3)):
-                self.size[e, m][i] = ti.cast(rows[first + i], self.real)
-                self.low[e, m][i] = rows[first + AT_LOWER + i]
-                self.high[e, m][i] = rows[first + AT_UPPER + i]
-            for i in ti.static(range(7)):
-                self.scale[e, m][i] = rows[first + AT_SCALE + i]
-            self.friction[e, m] = ti.cast(rows[first + AT_FRICTION], self.real)
-            self.minimal_gap[e, m] = rows[first + AT_MINIMAL_GAP]
+        tools = [tool for scene in scenes for tool in scene.manipulators]
+        self.write(self.size, [[*tool.size, *[0.0] * (3 - len(tool.size))] for tool in tools])
+        self.write(self.scale, [[*tool.scale, *[0.0] * (7 - len(tool.scale))] for tool in tools])
+        self.write(self.low, [tool.lower_bound for tool in tools])
+        self.write(self.high, [tool.upper_bound for tool in tools])
+        self.write(self.friction, [tool.friction for tool in tools])
+        self.write(self.minimal_gap, [tool.minimal_gap for tool in tools])

@@ -219,9 +219,7 @@ class Tape:
         actions_bar = ti.ndarray(ti.f64, shape=actions.shape) if actions_bar is None else actions_bar
         # Allocated on the way forward.
         assert self.bar is not None
-        actions_bar.fill(0)
-        self._particles.clear(self.bar)
-        engine.clear_adjoint()
+        engine.clear_adjoint(self.bar)
         last = (steps - 1) // self._length
         for t in reversed(range(steps)):
             k = t // self._length

@@ -27,7 +27,6 @@ __all__ = [
     "Array",
     "Constants",
     "action_array",
-    "clear",
     "copy_numbers",
     "numbers_of",
     "on_device",
@@ -59,19 +58,14 @@ class Constants:
 
 
 @ti.kernel
-def copy_numbers(source: Array, first: ti.i32, target: Array, at: ti.i32, count: ti.i32):
-    """Copy some numbers of one array, from its entry ``first``, to entry ``at`` of another, in its type."""
+def copy_numbers(array: Array, first: ti.i32, numbers: Array, count: ti.i32, writes: ti.i32):
+    """Write numbers to an array from its entry ``first``, in its type, or read them from there: by one
+    kernel, as :mod:`plab.sim.exchange` has it."""
     for i in range(count):
-        target[at + i] = source[first + i]
-
-
-@ti.kernel
-def clear(array: Array, lanes: ti.template()):
-    """Set all vectors of an array to 0: Taichi's own ``fill`` makes a kernel for each call, and keeps all of
-    them; its ``zero`` multiplies, and leaves NaN."""
-    for i in array:
-        for k in ti.static(range(lanes)):
-            array[i][k] = 0
+        if writes != 0:
+            array[first + i] = numbers[i]
+        else:
+            numbers[i] = array[first + i]
 
 
 def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "torch.Tensor") -> "torch.Tensor":
@@ -93,9 +87,12 @@ def numbers_of(
     of the type of a CUDA tensor ``like``; what is beyond is left out."""
     count = int(np.prod(shape))
     if on_device(like):
-        filled = output_for(lambda out: copy_numbers(array, first, out, 0, count), count, True, like)
+        filled = output_for(lambda out: copy_numbers(array, first, out, count, 0), count, True, like)
         return filled.reshape(shape)
-    return array.to_numpy()[first : first + count].reshape(shape)
+    out = np.zeros(shape)
+    if count:
+        copy_numbers(array, first, out.reshape(-1), count, 0)
+    return out
 
 
 def step_actions(
@@ -169,11 +166,12 @@ def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
     if not numbers.shape[0]:
         return array
     if on_device(numbers) and device == "cuda":
-        copy_numbers(numbers, 0, array, 0, numbers.shape[0])
+        copy_numbers(array, 0, numbers, numbers.shape[0], 1)
         if not _in_default_stream():
             ti.sync()
     else:
-        array.from_numpy(numbers.cpu().numpy() if on_device(numbers) else numbers)
+        held = numbers.cpu().numpy() if on_device(numbers) else numbers
+        copy_numbers(array, 0, held, numbers.shape[0], 1)
     return array
 
 

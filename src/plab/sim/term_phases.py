@@ -76,7 +76,7 @@ class TermPhases(Storage):
         self.node_terms = self._with("empty")
         self.particle_terms = self._with("gradient")
         self.distance_terms = self._with("nearest_only")
-        self.term_weights = ti.field(self.real, shape=max(1, len(self.terms)))
+        self.term_weights = self.share(ti.field(self.real, shape=max(1, len(self.terms))))
         # Sums over nodes and the largest mass; sums over particles; tallies of distances.
         parts, m = (self.batch, self.chunks), max(1, self.manipulators)
         sums, tallies = max(1, len(self.particle_terms)), max(1, len(self.distance_terms))
@@ -101,7 +101,7 @@ class TermPhases(Storage):
         """Field of n^3 numbers per environment with the targets' ``mass`` or ``sdf``, shared by all terms
         that ask."""
         if name not in self.references:
-            self.references[name] = ti.field(self.real, shape=self.batch * self.n**3)
+            self.references[name] = self.share(ti.field(self.real, shape=self.batch * self.n**3))
         return self.references[name]
 
     # -- mass tensor --------------------------------------------------------------------------------
