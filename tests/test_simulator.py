@@ -10,7 +10,7 @@ import pytest
 
 from plab.losses import make_terms
 from plab.scene import Body, Manipulator, Scene, SceneError
-from plab.sim import SimulationError, Simulator
+from plab.sim import SimulationError, Simulator, exchange
 from plab.sim.memory import ENTRIES_MAX, batch_limit
 from plab.sim.order import curve_order, hilbert_index
 from plab.sim.storage import CHUNKS, INDEX_MASK
@@ -309,3 +309,16 @@ def test_particles_outside_the_lowest_nodes_are_put_in_order_too() -> None:
     x = np.random.default_rng(0).random((500, 3)) * (1 - 3 / 16)
     x[:8] = np.indices((2, 2, 2)).reshape(3, -1).T * (1 - 3 / 16)
     assert sorted(curve_order(x, 16)) == list(range(500))
+
+
+def test_fields_are_written_and_read_entry_by_entry_whatever_the_pieces(monkeypatch) -> None:
+    """As Taichi's own way has them; numbers differ, so that no two entries can be taken for each other."""
+    engine = simulator(SCENES, "cpu")._engine
+    monkeypatch.setattr(exchange, "PIECE", 7)
+    for _, field, size in engine.shared:
+        shape = (*field.shape, size) if size else field.shape
+        values = np.arange(1.0, 1.0 + math.prod(shape)).reshape(shape)
+        engine.write(field, values)
+        np.testing.assert_array_equal(field.to_numpy(), values)
+        if not size and len(shape) == 1:
+            np.testing.assert_array_equal(engine.read(field), values)

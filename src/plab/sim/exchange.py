@@ -30,8 +30,7 @@ class Exchange:
 
     def write(self, field: ti.Field, values: ArrayLike) -> None:
         """Write all entries of a shared field."""
-        # A copy: kernels take arrays as something that they might write to.
-        self._exchange(field, np.array(values, np.float64).reshape(-1), 1)
+        self._exchange(field, np.asarray(values).reshape(-1), 1)
 
     def read(self, field: ti.Field) -> np.ndarray:
         """Return all entries of a shared field of numbers and of one dimension."""
@@ -45,7 +44,9 @@ class Exchange:
         size = numbers.size // entries
         for first in range(0, entries, PIECE):
             count = min(PIECE, entries - first)
-            self.exchange(which, writes, numbers[first * size : (first + count) * size], first, count)
+            piece = numbers[first * size : (first + count) * size]
+            # A copy: kernels take arrays as something that they might write to.
+            self.exchange(which, writes, piece.astype(np.float64) if writes else piece, first, count)
 
     @ti.kernel
     def exchange(self, which: ti.i32, writes: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
