@@ -130,6 +130,7 @@ def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
     taken = []
     for process in (0, 1, 1, 0, 1):
         number = choose(waiting, had[process], [had[1 - process]])
+        assert number is not None
         [cfg] = waiting.pop(number)
         had[process] = cfg.task.name, cfg.method.family
         taken.append((process, cfg.seed))
@@ -139,6 +140,16 @@ def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
     assert choose(waiting, ("Move", "trajectory"), []) == 1
     assert choose(waiting, None, [("Move", "rl")]) == 1
     assert choose(waiting, None, [("Move", "rl"), ("Move", "trajectory")]) == 0
+    # Else of which most wait per process that has it; one less where somebody will be free soon.
+    move, rope = ("Move", "trajectory"), ("Rope", "trajectory")
+    waiting = [[load_config([f"task={task}"])] for task in ("Move", "Rope", "Rope")]
+    assert choose(waiting, None, [move, rope]) == 1
+    assert choose(waiting, None, [move, rope, rope, rope]) == 0
+    assert choose(waiting, None, [move, rope], [rope]) == 0
+    assert choose(waiting, None, [move, rope], [move]) == 1
+    assert choose(waiting, move, [rope], [rope]) == 0
+    assert choose(waiting[:1], rope, [move], [move]) is None
+    assert choose(waiting[:1], rope, [("Writer", "trajectory")], [("Writer", "trajectory")]) == 0
 
 
 def test_agents_share_the_memory_of_a_device_that_processes_share(monkeypatch) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
 import sys
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -79,8 +82,11 @@ def _carry(
         while waiting or any(worker.batch for worker in used):
             for worker in used:
                 if waiting and not worker.batch:
-                    had = [other.kind for other in used if other is not worker]
-                    worker.give(waiting.pop(choose(waiting, worker.kind, had)), progress())
+                    others = [other for other in used if other is not worker]
+                    soon = [other.kind for other in others if other.batch and other.left < other.setup]
+                    number = choose(waiting, worker.kind, [other.kind for other in others], soon)
+                    if number is not None:
+                        worker.give(waiting.pop(number), progress())
             for worker in _heard([worker for worker in used if worker.batch]):
                 for kind, *content in worker.messages():
                     if kind == "ended":
@@ -89,19 +95,30 @@ def _carry(
                         report(worker.label, kind, *content)
 
 
-def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
+def choose(
+    waiting: Sequence[Sequence[Config]],
+    own: Kind | None,
+    others: Sequence[Kind | None],
+    soon: Sequence[Kind] = (),
+) -> int | None:
     """Return which batch a process takes: the first of the kind it had before, whose simulator it has; else
-    the first of a kind that no other process has; else the first.
+    the first of a kind that no other process has; else of the kind of which most wait per process that has
+    it. Processes that will be free sooner than another has compiled what they have are left a batch each, so
+    that there may be none to take.
 
     Args:
         waiting: Batches, at least one.
         own: What kind this process had before, if any.
         others: What kinds the others have, or had before.
+        soon: What kinds those have that will be free so soon.
     """
     kinds = [_kind(batch) for batch in waiting]
     if own in kinds:
         return kinds.index(own)
-    return next((number for number, kind in enumerate(kinds) if kind not in others), 0)
+    left, having = Counter(kinds), Counter(others)
+    left.subtract(soon)
+    free = [number for number, kind in enumerate(kinds) if left[kind] > 0]
+    return max(free, key=lambda n: left[kinds[n]] / (having[kinds[n]] or 1e-9), default=None)
 
 
 def _kind(batch: Sequence[Config]) -> Kind:
@@ -117,12 +134,16 @@ class _Worker:
         label: What stands before its progress.
         batch: What it is carrying out, empty if nothing.
         kind: Of what kind that is, or what it has carried out last.
+        setup: How long the first batch of that kind took until its first step was done [s].
+        left: For how long it will be busy yet, by its pace since the first step [s].
     """
 
     def __init__(self, name: str, label: str) -> None:
         self.name, self.label = name, label
         self.batch: list[Config] = []
         self.kind: Kind | None = None
+        self.setup, self.left = 0.0, math.inf
+        self._first: tuple[float, int] | None = None
         self._start()
 
     def _start(self) -> None:
@@ -139,7 +160,9 @@ class _Worker:
         """Let it carry out a batch."""
         if not self.process.is_alive():
             self._start()
-        self.batch, self.kind = batch, _kind(batch)
+        self._same = self.kind == _kind(batch)
+        self.batch, self.kind, self.left = batch, _kind(batch), math.inf
+        self._given, self._first = time.monotonic(), None
         self.connection.send((batch, note))
 
     def messages(self) -> Iterator[tuple[Any, ...]]:
@@ -149,6 +172,8 @@ class _Worker:
                 message = self.connection.recv()
                 if message[0] == "ended":
                     self.batch = []
+                elif message[0] == "progress":
+                    self._note(*message[1:])
                 yield message
         except (EOFError, OSError):
             # Killed: the files know how far it came.
@@ -156,6 +181,17 @@ class _Worker:
             outcomes = [look_up(cfg) for cfg in self.batch]
             self.batch = []
             yield "ended", outcomes
+
+    def _note(self, _title: str, _start: int, total: int, _every: int, done: int, _text: str) -> None:
+        """Note how far it has come."""
+        now = time.monotonic()
+        if self._first is not None:
+            begin, before = self._first
+            self.left = (now - begin) / max(1, done - before) * (total - done)
+            return
+        self._first = now, done
+        if not self._same:
+            self.setup = now - self._given
 
     def end(self) -> None:
         """Let it end; one that is at work is interrupted, and closes its files."""
