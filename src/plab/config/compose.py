@@ -246,7 +246,7 @@ def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool =
         _choose_by_task(composed.method)
         _choose_numbers(composed, overrides)
         _choose_variant(composed, overrides)
-        composed.task = merge_variant(composed.task, composed.variant)
+        merge_variant(composed.task, composed.variant)
         parts = vars(OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
@@ -371,16 +371,25 @@ def _choose_profile(method: DictConfig) -> None:
     if method.profile not in method.profiles:
         chosen, names = str(method.profile), [str(name) for name in method.profiles]
         raise ConfigError(f"method.profile '{chosen}' does not exist; {pick(chosen, names)}")
-    OmegaConf.resolve(method)
-    method.profiles = {}
+    _resolve(method, ["profiles"])
 
 
 def _choose_by_task(method: DictConfig) -> None:
     """Put learning rate, contact weight and limit of the norm where they are referred to, and forget those of
     other tasks and numbers."""
     if "lr_by_task" in method:
-        OmegaConf.resolve(method)
-        method.lr_by_task = method.contact_by_task = method.max_gradient_norm_by_numbers = {}
+        _resolve(method, [*_BY_TASK, "max_gradient_norm_by_numbers"])
+
+
+def _resolve(section: DictConfig, tables: Sequence[str]) -> None:
+    """Put values where they are referred to, except in tables, which are empty afterwards."""
+    for key, node in section.items_ex(resolve=False):
+        if node._is_interpolation():
+            section[key] = section[key]
+        elif key not in tables and OmegaConf.is_config(node):
+            OmegaConf.resolve(node)
+    for table in tables:
+        section[table] = {}
 
 
 def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:
@@ -418,11 +427,12 @@ def _reject_unknown(node: Any, path: str) -> None:
     if not isinstance(node, DictConfig):
         return
     kind = OmegaConf.get_type(node)
-    for key in map(str, node):
-        if dataclasses.is_dataclass(kind) and key not in _field_names(kind):
-            raise ConfigError(f"unknown key '{path}{key}'; {pick(key, _field_names(kind))}")
-        if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
-            _reject_unknown(node[key], f"{path}{key}.")
+    known = _field_names(kind) if dataclasses.is_dataclass(kind) else None
+    for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
+        if known is not None and key not in known:
+            raise ConfigError(f"unknown key '{path}{key}'; {pick(key, known)}")
+        if isinstance(below, DictConfig) and not (below._is_missing() or below._is_interpolation()):
+            _reject_unknown(below, f"{path}{key}.")
 
 
 def _field_names(kind: type) -> list[str]:

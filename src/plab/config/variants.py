@@ -62,17 +62,15 @@ def variant_changes(task: DictConfig, name: str) -> DictConfig:
     return changes
 
 
-def merge_variant(task: DictConfig, name: str) -> DictConfig:
-    """Return a task, which has all its variants, with one merged over it and no other; ConfigError if it
-    does not exist or does not fit."""
+def merge_variant(task: DictConfig, name: str) -> None:
+    """Merge a variant over a task, which has all its variants, and leave no other; ConfigError if it does
+    not exist or does not fit."""
     changes = variant_changes(task, name)
     try:
-        merged = OmegaConf.merge(task, changes)
+        task.merge_with(changes)
     except OmegaConfBaseException as error:
         raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
-    merged.variants = {name: changes}
-    merged.random = {}
-    return cast(DictConfig, merged)
+    task.variants, task.random = {name: changes}, {}
 
 
 def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -58,10 +59,10 @@ def word_list(words: Sequence[str]) -> list[str]:
 def parse(words: Sequence[str]) -> list[Override]:
     """Read overrides; ConfigError if a number has too many digits, or brackets are nested too deeply,
     HydraException if one cannot be parsed."""
-    parser, found = OverridesParser.create(), []
+    found = []
     for word in words:
         try:
-            (override,) = parser.parse_overrides([word])
+            override = _parsed(word)
             if _has_endless_number(override.value()):
                 raise ValueError("a number has too many digits")
             found.append(override)
@@ -71,6 +72,13 @@ def parse(words: Sequence[str]) -> list[Override]:
             reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
             raise ConfigError(f"cannot read '{shortened(word)}': {reason}") from None
     return found
+
+
+@functools.lru_cache(maxsize=1024)
+def _parsed(word: str) -> Override:
+    """Read one override; those of a sweep come again in many of its jobs."""
+    (override,) = OverridesParser.create().parse_overrides([word])
+    return override
 
 
 def _has_endless_number(value: object) -> bool:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, open_dict
 
@@ -15,6 +14,7 @@ from plab.config import Config, ConfigError, finish
 from plab.config.checks import check_sources
 from plab.config.composer import Composer, lines, sets_a_value
 from plab.config.errors import COMPOSE_ERRORS, explain
+from plab.config.words import parse
 from plab.scene import SceneError
 from plab.targets import TargetError
 
@@ -49,7 +49,7 @@ class _Jobs:
 
     def job(self, overrides: Sequence[str]) -> Config | Refused:
         """Return the configuration of a job."""
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        parsed = parse(overrides)
         # Nothing else in a configuration depends on the seed.
         seed = next((o for o in parsed if o.key_or_group == "seed" and sets_a_value(o)), None)
         value = None if seed is None else seed.value()

@@ -68,6 +68,8 @@ def processes_on(names: Sequence[str], per_gpu: int, most: int) -> Iterator[Carr
         yield partial(_carry, workers)
     finally:
         for worker in workers:
+            worker.dismiss()
+        for worker in workers:
             worker.end()
 
 
@@ -83,7 +85,7 @@ def _carry(
             for worker in used:
                 if waiting and not worker.batch:
                     others = [other for other in used if other is not worker]
-                    soon = [other.kind for other in others if other.batch and other.left < other.setup]
+                    soon = [_kind(other.batch) for other in others if other.left < other.setup]
                     number = choose(waiting, worker.kind, [other.kind for other in others], soon)
                     if number is not None:
                         worker.give(waiting.pop(number), progress())
@@ -135,7 +137,7 @@ class _Worker:
         batch: What it is carrying out, empty if nothing.
         kind: Of what kind that is, or what it has carried out last.
         setup: How long the first batch of that kind took until its first step was done [s].
-        left: For how long it will be busy yet, by its pace since the first step [s].
+        left: For how long it will be busy yet, by its pace since the first step [s]; infinite if not known.
     """
 
     def __init__(self, name: str, label: str) -> None:
@@ -161,7 +163,7 @@ class _Worker:
         if not self.process.is_alive():
             self._start()
         self._same = self.kind == _kind(batch)
-        self.batch, self.kind, self.left = batch, _kind(batch), math.inf
+        self.batch, self.kind = batch, _kind(batch)
         self._given, self._first = time.monotonic(), None
         self.connection.send((batch, note))
 
@@ -171,7 +173,7 @@ class _Worker:
             while self.connection.poll():
                 message = self.connection.recv()
                 if message[0] == "ended":
-                    self.batch = []
+                    self.batch, self.left = [], math.inf
                 elif message[0] == "progress":
                     self._note(*message[1:])
                 yield message
@@ -179,7 +181,7 @@ class _Worker:
             # Killed: the files know how far it came.
             self.process.join()
             outcomes = [look_up(cfg) for cfg in self.batch]
-            self.batch = []
+            self.batch, self.left = [], math.inf
             yield "ended", outcomes
 
     def _note(self, _title: str, _start: int, total: int, _every: int, done: int, _text: str) -> None:
@@ -193,11 +195,14 @@ class _Worker:
         if not self._same:
             self.setup = now - self._given
 
-    def end(self) -> None:
-        """Let it end; one that is at work is interrupted, and closes its files."""
+    def dismiss(self) -> None:
+        """Let it end; one that is at work is interrupted."""
         self.connection.close()
         if self.batch:
             self.process.terminate()
+
+    def end(self) -> None:
+        """Wait until it has closed its files, and kept what it has compiled."""
         # One that was never given anything may be loading still.
         if self.kind is not None:
             self.process.join(PATIENCE)
