@@ -384,7 +384,7 @@ def _choose_by_task(method: DictConfig) -> None:
 def _resolve(section: DictConfig, tables: Sequence[str]) -> None:
     """Put values where they are referred to, except in tables, which are empty afterwards."""
     for key, node in section.items_ex(resolve=False):
-        if node._is_interpolation():
+        if OmegaConf.is_interpolation(section, str(key)):
             section[key] = section[key]
         elif key not in tables and OmegaConf.is_config(node):
             OmegaConf.resolve(node)
