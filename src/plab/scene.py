@@ -221,16 +221,6 @@ class Scene:
         return Material(self.youngs_modulus, self.poisson_ratio, self.yield_stress)
 
     @property
-    def shear_modulus(self) -> float:
-        """Lame parameter mu of :attr:`material`."""
-        return self.material.shear_modulus
-
-    @property
-    def lame_lambda(self) -> float:
-        """Lame parameter lambda of :attr:`material`."""
-        return self.material.lame_lambda
-
-    @property
     def materials(self) -> tuple[Material, ...]:
         """Materials of the bodies, one for each, whether they differ or not."""
         return tuple(replace(self.material, **body.own_material) for body in self.bodies)

@@ -40,7 +40,7 @@ def principal_law(scene: Scene, stretch: np.ndarray) -> tuple[np.ndarray, np.nda
     Returns:
         Principal stretches after return mapping and principal Kirchhoff stresses, of the same shape.
     """
-    mu, lam = scene.shear_modulus, scene.lame_lambda
+    mu, lam = scene.material.shear_modulus, scene.material.lame_lambda
     strain = np.log(stretch)
     mean = strain.mean(axis=-1, keepdims=True)
     deviator = strain - mean
@@ -102,7 +102,7 @@ def test_the_yield_surface_holds_and_flow_keeps_volume(free: Simulator, size: fl
         e, scene = index(name), SCENES[name]
         log = np.log(np.linalg.svd(new[e], compute_uv=False))
         length = np.linalg.norm(log - log.mean(axis=1, keepdims=True), axis=1)
-        limit = scene.yield_stress / (2.0 * scene.shear_modulus)
+        limit = scene.yield_stress / (2.0 * scene.material.shear_modulus)
         assert (length <= limit + 1e-13).all(), f"{name}: {length.max() - limit:.1e} above the yield surface"
         ratio = np.linalg.det(new[e]) / np.linalg.det(trial)
         np.testing.assert_allclose(ratio, 1.0, atol=5e-13, err_msg=name)
@@ -136,7 +136,7 @@ def test_cyclic_stretch_draws_the_elastoplastic_loop(free: Simulator) -> None:
     with a scalar a that moves by s and is held by the yield surface.
     """
     e, scene = index("plastic"), SCENES["plastic"]
-    limit, s = scene.yield_stress / (2.0 * scene.shear_modulus), 1e-3
+    limit, s = scene.yield_stress / (2.0 * scene.material.shear_modulus), 1e-3
     direction = np.array([1.0, -0.5, -0.5])
     fields = at_rest()
     a, seen = 0.0, []

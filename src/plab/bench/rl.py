@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -169,17 +170,8 @@ def _memory(population: Population) -> int:
 @contextmanager
 def _timing(parts: Sequence[tuple[Any, str, str]], seconds: dict[str, float]) -> Iterator[None]:
     """Add up the time spent in methods, given with their owners and the parts that they are of."""
-    for owner, name, part in parts:
-        setattr(owner, name, _timer(getattr(owner, name), part, seconds))
-    try:
-        yield
-    finally:
-        for owner, name, _ in parts:
-            delattr(owner, name)
 
-
-def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Callable[..., Any]:
-    def timed(*args: Any, **kwargs: Any) -> Any:
+    def timed(call: Callable[..., Any], part: str, *args: Any, **kwargs: Any) -> Any:
         start = time.perf_counter()
         result = call(*args, **kwargs)
         # Work on CUDA is only queued: the next part that waits would be charged with it.
@@ -187,7 +179,13 @@ def _timer(call: Callable[..., Any], part: str, seconds: dict[str, float]) -> Ca
         seconds[part] += time.perf_counter() - start
         return result
 
-    return timed
+    for owner, name, part in parts:
+        setattr(owner, name, partial(timed, getattr(owner, name), part))
+    try:
+        yield
+    finally:
+        for owner, name, _ in parts:
+            delattr(owner, name)
 
 
 def _synchronise() -> None:

@@ -398,7 +398,7 @@ def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:
     if composed.protocol.numbers == "release":
         if key := undone_key(changes, overrides):
             raise ConfigError(f"task.{key} is set by protocol.numbers=release: override task.release.{key}")
-        composed.task = OmegaConf.merge(composed.task, changes)
+        composed.task.merge_with(changes)
     elif unused := [o for o in overrides if o.lstrip("+").startswith("task.release.")]:
         raise ConfigError(f"'{unused[0]}' has no effect without protocol.numbers=release")
     composed.task.release = {}

@@ -99,6 +99,7 @@ def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:
     if random.variant is not None:
         fixed = variant_changes(task, random.variant)
     base = cast(DictConfig, OmegaConf.merge(task, fixed))
+    base.variants = base.random = {}  # Attempts need not copy what none of them changes.
     if "seed" in base.target.keys():
         fixed = cast(DictConfig, OmegaConf.merge(fixed, {"target": {"seed": _target_seed(seed_scene)}}))
     rng = np.random.default_rng([seed_scene, _NUMBERS])

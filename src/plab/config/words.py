@@ -158,7 +158,7 @@ def _quote_folder(word: str) -> str:
     if not equals or not named or not text.strip() or "${" in text:
         return word
     try:
-        (override,) = OverridesParser.create().parse_overrides([word])
+        override = _parsed(word)
     except Exception:
         return f"{key}={quoted(text)}"
     value = override._value

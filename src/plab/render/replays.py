@@ -48,7 +48,9 @@ def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
     require_graphics()
     troubles: list[str] = []
     for place in {folder.parent for folder in wanted}:
-        _remove_unfinished(place)
+        # What a process that was killed has left of pictures.
+        for folder in place.glob(f"{_UNFINISHED}*"):
+            shutil.rmtree(folder, ignore_errors=True)
     with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
         done = 0
         for folders in _by_task(wanted).values():
@@ -109,12 +111,6 @@ def _replayed(group: Wanted) -> dict[tuple[Path, str], recording.RecordedRollout
         actions = np.stack([actions for _, _, actions in cases])
         made |= zip(names, recording.record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
     return made
-
-
-def _remove_unfinished(place: Path) -> None:
-    """Remove what a process that was killed has left of pictures."""
-    for folder in place.glob(f"{_UNFINISHED}*"):
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

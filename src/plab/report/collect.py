@@ -413,8 +413,10 @@ def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     config = {**config, "method": _with_contact_term(config["method"])}
     by_variant = {f"task.{key}" for key in _changed_by_variant(config)}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
-    own = {key: (value, _present(config, key)) for key, value in expected.items() if key not in by_variant}
-    return {key: mine for key, (value, mine) in own.items() if mine != value}
+    own = {key: lookup(config, key) for key in expected if key not in by_variant}
+    # None where the run is older than the setting: that it did without, as null says.
+    own = {key: None if value != value else value for key, value in own.items()}
+    return {key: value for key, value in own.items() if value != expected[key]}
 
 
 @functools.cache
@@ -426,12 +428,6 @@ def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
     exact = usual["protocol.numbers"] == "release"
     usual |= {f"task.{key}": value for key, value in _usual_task(task, exact).items()}
     return {key: value for key, value in usual.items() if key not in _HARMLESS}
-
-
-def _present(config: Mapping[str, Any], key: str) -> Any:
-    """Return a setting, None where the run is older than it: that it did without, as null says."""
-    value = lookup(config, key)
-    return None if value != value else value
 
 
 @functools.cache

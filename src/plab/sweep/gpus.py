@@ -76,7 +76,7 @@ def processes_on(names: Sequence[str], per_gpu: int, most: int) -> Iterator[Carr
 def _carry(
     workers: Sequence[_Worker], batches: list[list[Config]], progress: Callable[[], str]
 ) -> Iterator[Outcome]:
-    """Give batches to whoever is free, and yield how their runs ended."""
+    """Give batches to whoever is free, say which runs have finished, and yield how each ended."""
     waiting = list(batches)
     used = workers[: len(batches)]
     shown = any(cfg.progress for batch in batches for cfg in batch)
@@ -89,12 +89,17 @@ def _carry(
                     number = choose(waiting, worker.kind, [other.kind for other in others], soon)
                     if number is not None:
                         worker.give(waiting.pop(number), progress())
-            for worker in _heard([worker for worker in used if worker.batch]):
+            # Until one that is at work has said something.
+            heard = wait([worker.connection for worker in used if worker.batch])
+            for worker in (worker for worker in used if worker.connection in heard):
                 for kind, *content in worker.messages():
-                    if kind == "ended":
-                        yield from _told(*content)
-                    else:
+                    if kind != "ended":
                         report(worker.label, kind, *content)
+                        continue
+                    for one in content[0]:
+                        if one.status == "finished":
+                            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
+                        yield one
 
 
 def choose(
@@ -187,13 +192,12 @@ class _Worker:
     def _note(self, _title: str, _start: int, total: int, _every: int, done: int, _text: str) -> None:
         """Note how far it has come."""
         now = time.monotonic()
-        if self._first is not None:
+        if self._first is None:
+            self._first = now, done
+            self.setup = self.setup if self._same else now - self._given
+        else:
             begin, before = self._first
             self.left = (now - begin) / max(1, done - before) * (total - done)
-            return
-        self._first = now, done
-        if not self._same:
-            self.setup = now - self._given
 
     def dismiss(self) -> None:
         """Let it end; one that is at work is interrupted."""
@@ -204,23 +208,8 @@ class _Worker:
     def end(self) -> None:
         """Wait until it has closed its files, and kept what it has compiled."""
         # One that was never given anything may be loading still.
-        if self.kind is not None:
-            self.process.join(PATIENCE)
+        self.process.join(PATIENCE if self.kind else 0.0)
         self.process.kill()
-
-
-def _told(outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
-    """Say which runs have finished, and pass on how each ended."""
-    for one in outcomes:
-        if one.status == "finished":
-            print(f"finished: score {one.score:.4f}, {one.path}", flush=True)
-        yield one
-
-
-def _heard(workers: Sequence[_Worker]) -> list[_Worker]:
-    """Wait until workers have said something, and return those that have."""
-    ready = wait([worker.connection for worker in workers])
-    return [worker for worker in workers if worker.connection in ready]
 
 
 def _work(name: str, connection: Connection) -> None:
@@ -228,7 +217,7 @@ def _work(name: str, connection: Connection) -> None:
     os.environ[VISIBLE] = name
     # Where what ignores Ctrl-C is not inherited.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # What is to be seen is shown by the process that has started this one.
     sys.stdout = open(os.devnull, "w")
@@ -241,10 +230,6 @@ def _work(name: str, connection: Connection) -> None:
     except (EOFError, OSError, KeyboardInterrupt):
         # Nobody is there any more, or nobody wants more.
         return
-
-
-def _interrupt(_number: int, _frame: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:

@@ -168,13 +168,10 @@ def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float]
     head = f"{_PHONES}\n<title>{html.escape(title)}</title>"
     snapshot = re.sub("<title>.*?</title>", lambda _: head, snapshot, count=1)
     snapshot = snapshot.replace("<body>", f"<body>\n{bar}", 1)
-    return snapshot.replace("<head>", f"<head>\n<!--\n{_licences()}\n-->", 1)
-
-
-def _licences() -> str:
-    """Return the licences of K3D-jupyter and of what it brings along: they ask to be passed on."""
-    found = [path for path in installed_files("k3d") or [] if path.name in _LICENCES]
-    return "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in sorted(found))
+    # Those of K3D-jupyter and of what it brings along ask to be passed on.
+    found = sorted(path for path in installed_files("k3d") or [] if path.name in _LICENCES)
+    licences = "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in found)
+    return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)
 
 
 def _number(color: str) -> int:
