@@ -10,6 +10,7 @@ import functools
 import hashlib
 import io
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -147,7 +148,8 @@ def _find(file: str, known: bool) -> Path:
     if path.is_absolute() and known:
         places += [folder / path.name for folder in folders]
     for place in places:
-        if _is_there(place):
+        # Path.exists raises for a name that is too long, or a folder that may not be entered.
+        if os.path.exists(place):
             # Not resolved: what a link leads to may be named otherwise, without the ending.
             return place.absolute()
     if path.is_absolute():
@@ -156,14 +158,6 @@ def _find(file: str, known: bool) -> Path:
     raise ShapeError(
         f"there is no file {file} in the working directory, the config folder or the folder above it"
     )
-
-
-def _is_there(place: Path) -> bool:
-    try:
-        return place.exists()
-    except OSError:
-        # A name that is too long, or a folder that may not be entered.
-        return False
 
 
 def _of_kind(path: Path, suffixes: tuple[str, ...], what: str) -> Path:

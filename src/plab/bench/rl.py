@@ -139,6 +139,9 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
             total = _seconds(lambda: population.train(population.episodes + more))
         parts["rest"] = total - sum(parts.values())
     share = more / method.evaluate_every
+    held = sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
+    if torch.cuda.is_initialized():
+        held = torch.cuda.max_memory_allocated()
     return {
         "task": cfg.task.name,
         "device": f"{cfg.sim.device}/{method.torch_device}",
@@ -148,7 +151,7 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
         "steps_per_s": round(agents * more * horizon / (trained + share * (evaluated + stated)), 1),
         "evaluate_s": round(evaluated, 3),
         "state_s": round(stated, 3),
-        "agent_mb": round(_memory(population) / agents / 1e6, 1),
+        "agent_mb": round(held / agents / 1e6, 1),
     } | {f"{part}_ms": round(parts[part] / (batches * horizon) * 1e3, 2) for part in PARTS}
 
 
@@ -159,12 +162,6 @@ def _seconds(call: Callable[[], object]) -> float:
     call()
     _synchronise()
     return time.perf_counter() - start
-
-
-def _memory(population: Population) -> int:
-    if torch.cuda.is_initialized():
-        return torch.cuda.max_memory_allocated()
-    return sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
 
 
 @contextmanager

@@ -68,8 +68,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         check_sources(cfgs[0])
     runs = [] if args.source is None else readable_rows(args.source)[0]
     for cfgs in tasks:
-        if args.record:
-            _require_own_resolution(cfgs[0])
+        own = [f"task={cfgs[0].task.name}", f"variant={cfgs[0].variant}"]
+        if args.record and build_scene(cfgs[0]) != build_scene(load_config(own)):
+            why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
+            raise ConfigError(why)
         replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
         found = [_found(cfg, runs) for cfg in cfgs]
         if any(actions is not None for actions in found):
@@ -108,14 +110,6 @@ def _found(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
             if build_scene(run) == build_scene(cfg):
                 return np.round(actions, DECIMALS)
     return None
-
-
-def _require_own_resolution(cfg: Config) -> None:
-    """Refuse to record what was found on another grid than the suite's."""
-    own = load_config([f"task={cfg.task.name}", f"variant={cfg.variant}"])
-    if build_scene(cfg) != build_scene(own):
-        why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
-        raise ConfigError(why)
 
 
 def _row(item: ReplayedDemonstration) -> dict[str, object]:

@@ -86,18 +86,13 @@ def compose_configs(
     if len(own) != num_envs:
         raise ArgumentError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
     for entries in (overrides, *own):
-        _check_overrides(entries, task)
+        if own_task := [word for word in word_list(entries) if word.partition("=")[0] == "task"]:
+            raise ArgumentError(
+                f"'{own_task[0]}' in an environment of task {task}: make that task's environment"
+            )
     lists = [(f"task={task}", f"variant={variant}", *overrides, *entries) for entries in own]
     made = {entries: load_config(entries, config_dir) for entries in dict.fromkeys(lists)}
     return [made[entries] for entries in lists]
-
-
-def _check_overrides(overrides: Sequence[str], task: str) -> None:
-    for override in word_list(overrides):
-        if override.partition("=")[0] == "task":
-            raise ArgumentError(
-                f"'{override}' in an environment of task {task}: make that task's environment"
-            )
 
 
 def action_array(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
