@@ -84,7 +84,7 @@ def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
     assert np.all(found["yielding"] == 1.0)
     elastic = dataclasses.replace(scene, yield_stress=float("inf"))
     assert np.all(files.quantities(dataclasses.replace(recording, F=F, scene=elastic), 2)["yielding"] == 0.0)
-    limit = 4 * strain * 2 * scene.shear_modulus
+    limit = 4 * strain * 2 * scene.material.shear_modulus
     stiff = dataclasses.replace(scene, yield_stress=limit)
     found = files.quantities(dataclasses.replace(recording, F=F, scene=stiff), 2)
     assert found["yielding"] == pytest.approx(0.25)

@@ -142,7 +142,7 @@ def test_plastic_flow_keeps_volume_and_lands_on_the_yield_surface() -> None:
     F, R = ref.return_mapping(scene, F_trial)
     strain = torch.linalg.svdvals(F).log()
     deviator = (strain - strain.mean(dim=-1, keepdim=True)).norm(dim=-1)
-    radius = scene.yield_stress / (2.0 * scene.shear_modulus)
+    radius = scene.yield_stress / (2.0 * scene.material.shear_modulus)
     flows = (F != F_trial).any(dim=(1, 2))
     assert flows.sum() > 40
     torch.testing.assert_close(torch.linalg.det(F), torch.linalg.det(F_trial), rtol=1e-12, atol=0)
@@ -174,8 +174,8 @@ def test_inverted_element_has_a_proper_rotation_and_leaves_uninverted() -> None:
 def test_stress_is_the_derivative_of_the_fixed_corotated_energy() -> None:
     scene = make_scene()
     F = (IDENTITY + random_matrices((4, 3, 3), 0.1)).requires_grad_()
-    strain_energy = scene.shear_modulus * ((torch.linalg.svdvals(F) - 1.0) ** 2).sum()
-    volume_energy = scene.lame_lambda / 2.0 * ((torch.linalg.det(F) - 1.0) ** 2).sum()
+    strain_energy = scene.material.shear_modulus * ((torch.linalg.svdvals(F) - 1.0) ** 2).sum()
+    volume_energy = scene.material.lame_lambda / 2.0 * ((torch.linalg.det(F) - 1.0) ** 2).sum()
     (P,) = torch.autograd.grad(strain_energy + volume_energy, F)
     U, _, Vt = ref.proper_svd(F)
     torch.testing.assert_close(ref.kirchhoff_stress(scene, F, U @ Vt), P @ F.mT, rtol=1e-10, atol=1e-9)

@@ -83,7 +83,7 @@ def test_elsewhere_than_on_a_terminal_nothing_watches_the_compiler(capsys) -> No
         pass
     with progress.show_progress("Rope", 0, 8, compiling=compiler) as report:
         report(8, "loss 2")
-    assert capsys.readouterr().out == "Rope 8/8, compiled, loss 2\n"
+    assert capsys.readouterr().out == "Rope 8/8, started, loss 2\n"
 
 
 @pytest.mark.physics

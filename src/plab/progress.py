@@ -174,7 +174,7 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
         now = time.monotonic()
         if first is None:
             # The first step compiles the simulator: it says nothing about the pace.
-            first, left = (now, done), "compiled"
+            first, left = (now, done), "started"
         else:
             begin, before = first
             left = f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"

@@ -17,10 +17,11 @@ from scipy import stats
 
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVED
-from plab.envs.core import EpisodeBatch
 from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
+from plab.reuse import SimulatorCache
+from plab.runners.environments import shared_batches
 from plab.runners.policy import Policy, load_policy
 
 __all__ = ["COLUMNS", "FIRST", "rows", "scores_of"]
@@ -32,19 +33,19 @@ FIRST = 10_000
 (:mod:`plab.submissions.schema`)."""
 
 
-def scores_of(policy: Policy, cfgs: Sequence[Config], together: int) -> np.ndarray:
+def scores_of(policy: Policy, cfgs: Sequence[Config], together: int, cache: SimulatorCache) -> np.ndarray:
     """Return the scores of a policy, shape [configuration], so many of them simulated at a time."""
     found: list[float] = []
     for first in range(0, len(cfgs), together):
-        batch = EpisodeBatch(cfgs[first : first + together])
+        own = cfgs[first : first + together]
+        (batch,) = shared_batches(cache, (own, min(together, len(cfgs)), "hard"))
         observation, info = batch.reset()
         for _ in range(batch.horizon):
             step = batch.step(policy(observation), strict=False)
             observation, info = step.observation, step.info
             # What breaks off scores nothing.
             info["score"][list(step.failures)] = 0.0
-        found += info["score"].tolist()
-        batch.close()
+        found += info["score"][: len(own)].tolist()
     return np.array(found)
 
 
@@ -59,6 +60,7 @@ def rows(
         together: Scenes simulated at a time.
         words: Overrides of the configurations.
     """
+    cache = SimulatorCache()
     for path in paths:
         policy, config = load_policy(path), read(Path(path)).config
         sim = [f"sim.{key}={value}" for key, value in config["sim"].items() if value is not None]
@@ -71,7 +73,7 @@ def rows(
             raise ArgumentError(
                 f"{len(drawn)} of {count} scenes fit into a grid of {cfg.sim.grid_size}: too few"
             )
-        scores = scores_of(policy, drawn, together)
+        scores = scores_of(policy, drawn, together, cache)
         mean, error = scores.mean(), stats.sem(scores)
         lower, upper = stats.t.interval(0.95, len(drawn) - 1, mean, error) if error > 0 else (mean, mean)
         numbers = mean, lower, upper, np.median(scores), (scores >= 0.9).mean()
