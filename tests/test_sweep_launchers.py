@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from plab.cli.run import main
 from plab.config import Config, load_config
 from plab.results import read, result_path
 from plab.runners import run_batch
-from plab.sweep.gpus import choose
+from plab.sweep.gpus import _Worker, choose
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
 
@@ -150,6 +152,28 @@ def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
     assert choose(waiting, move, [rope], [rope]) == 0
     assert choose(waiting[:1], rope, [move], [move]) is None
     assert choose(waiting[:1], rope, [("Writer", "trajectory")], [("Writer", "trajectory")]) == 0
+
+
+def test_how_long_a_process_is_busy_and_compiled_is_told_by_its_progress(monkeypatch) -> None:
+    monkeypatch.setattr(_Worker, "_start", lambda self: None)
+    worker, now = _Worker("0", "GPU 0"), [100.0]
+    monkeypatch.setattr("plab.sweep.gpus.time", SimpleNamespace(monotonic=lambda: now[0]))
+    said = [("progress", "Move", 0, 200, 10, done, "") for done in (1, 51)]
+    worker.process = SimpleNamespace(is_alive=lambda: True)  # type: ignore[assignment]
+    sent = SimpleNamespace(send=lambda _: None, poll=lambda: bool(said), recv=lambda: said.pop(0))
+    worker.connection = sent  # type: ignore[assignment]
+    for first in (12.0, 1.0):
+        worker.give([load_config(["task=Move"])], "")
+        messages, now[0] = worker.messages(), now[0] + first
+        next(messages)
+        assert worker.setup == 12.0 and worker.left == math.inf
+        now[0] += 5.0
+        next(messages)
+        # Fifty steps took five seconds, 149 are left; what was compiled is known from the first batch.
+        assert worker.setup == 12.0 and worker.left == pytest.approx(14.9)
+        said += [("ended", []), *(("progress", "Move", 0, 200, 10, done, "") for done in (1, 51))]
+        next(messages)
+        assert worker.batch == [] and worker.left == math.inf
 
 
 def test_agents_share_the_memory_of_a_device_that_processes_share(monkeypatch) -> None:

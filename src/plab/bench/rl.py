@@ -139,9 +139,10 @@ def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, obje
             total = _seconds(lambda: population.train(population.episodes + more))
         parts["rest"] = total - sum(parts.values())
     share = more / method.evaluate_every
-    held = sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
     if torch.cuda.is_initialized():
         held = torch.cuda.max_memory_allocated()
+    else:
+        held = sum(s.replay.nbytes for s in population.stacks if isinstance(s, OffPolicyAgents))
     return {
         "task": cfg.task.name,
         "device": f"{cfg.sim.device}/{method.torch_device}",
