@@ -9,7 +9,6 @@ import taichi as ti
 from plab.sim.cpu_material import MaterialTiles
 from plab.sim.cpu_transfer import KEY, NODE, TransferTiles
 from plab.sim.grid_phases import GridPhases
-from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases
 from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STENCILS, STRAINS
 from plab.sim.term_phases import TermPhases
@@ -201,23 +200,12 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
 
     @ti.func
     def advance_manipulators(self, e, actions: ti.template(), poses: ti.template(), t, before, after):
-        """Poses of all substeps of environment step t, from slot ``before`` of the pose history to slot
-        ``after``."""
-        self.note_step(e, t)
+        """Poses and frames of all manipulators in all substeps of environment step t."""
         for _shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
-                pose = self.given_pose(poses, before, e, m)
-                self.pose[e, 0, m] = pose
-                u = self.substep_motion(e, start, m, actions, t)
+                self.advance_manipulator(e, start, m, actions, poses, t, before, after)
                 for s in range(self.substeps):
-                    pose = advance_pose(
-                        self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
-                    )
-                    self.pose[e, s + 1, m] = pose
                     self.set_frame(e, s, m)
-                entry = (after * self.batch + e) * self.manipulators + m
-                for i in ti.static(range(8)):
-                    poses[entry * 8 + i] = pose[i]
 
     @ti.func
     def accumulate_frame(self, grid_index, m, entry, value):

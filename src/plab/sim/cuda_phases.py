@@ -14,7 +14,6 @@ import taichi as ti
 from plab.sim.cuda_bitcode import gather_sums, particle, particle_adjoint
 from plab.sim.cuda_order import OrderPhases
 from plab.sim.cuda_warp import RUN_BITS, WARP
-from plab.sim.motion import advance_pose
 from plab.sim.pose_phases import PosePhases, vec7
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
@@ -232,25 +231,6 @@ class CudaPhases(OrderPhases, PosePhases):
         self.add_up(self.frame_sums, at, ti.cast(value, ti.f64))
 
     # -- poses --------------------------------------------------------------------------------------
-
-    @ti.func
-    def advance_manipulator(
-        self, e, start: ti.template(), m, actions: ti.template(), poses: ti.template(), t, before, after
-    ):
-        """Poses of one manipulator in all substeps of environment step t."""
-        if m == 0:
-            self.note_step(e, t)
-        pose = self.given_pose(poses, before, e, m)
-        self.pose[e, 0, m] = pose
-        u = self.substep_motion(e, start, m, actions, t)
-        for s in range(self.substeps):
-            pose = advance_pose(
-                self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
-            )
-            self.pose[e, s + 1, m] = pose
-        entry = (after * self.batch + e) * self.manipulators + m
-        for i in ti.static(range(8)):
-            poses[entry * 8 + i] = pose[i]
 
     @ti.func
     def retreat_through(

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.motion import advance_pose_adjoint, rotation_matrix, rotation_matrix_adjoint
+from plab.sim.motion import advance_pose, advance_pose_adjoint, rotation_matrix, rotation_matrix_adjoint
 from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 
@@ -72,6 +72,26 @@ class PosePhases(Storage):
         if ti.static(self.rotations_as_given):
             pose = with_unit_rotation(pose)
         return pose
+
+    @ti.func
+    def advance_manipulator(
+        self, e, start: ti.template(), m, actions: ti.template(), poses: ti.template(), t, before, after
+    ):
+        """Poses of one manipulator in all substeps of environment step t, from slot ``before`` of the pose
+        history to slot ``after``."""
+        if m == 0:
+            self.note_step(e, t)
+        pose = self.given_pose(poses, before, e, m)
+        self.pose[e, 0, m] = pose
+        u = self.substep_motion(e, start, m, actions, t)
+        for s in range(self.substeps):
+            pose = advance_pose(
+                self.motions[start], pose, u, self.low[e, m], self.high[e, m], self.minimal_gap[e, m]
+            )
+            self.pose[e, s + 1, m] = pose
+        entry = (after * self.batch + e) * self.manipulators + m
+        for i in ti.static(range(8)):
+            poses[entry * 8 + i] = pose[i]
 
     @ti.kernel
     def place(self, poses: Array, slot: ti.i32, now: Array, fresh: ti.i32):
