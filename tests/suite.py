@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,6 +91,11 @@ def scene(near: tuple[str, ...], *, particles: int = 150, floor: bool = False, *
     body = Body("box", center, (WIDTH,) * 3, particles)
     values = {"yield_stress": 60.0, "grid_size": 32, "substeps": 7, **changes}
     return Scene("test", (body,), tuple(manipulator(kind, kind in near) for kind in KINDS), **values)
+
+
+def tools(made: Scene, kinds: Sequence[str]) -> tuple[Manipulator, ...]:
+    """The manipulators of some shapes among a scene's."""
+    return tuple(m for m in made.manipulators if m.shape in kinds)
 
 
 def batch() -> list[Scene]:

@@ -14,6 +14,7 @@ import pytest
 import taichi as ti
 from taichi.lang import _ndarray
 
+from plab.sim import runtime
 from plab.sim.runtime import available_threads, free_abandoned_cache, start_runtime
 
 
@@ -82,6 +83,33 @@ def test_a_function_is_read_once_and_errors_still_name_its_line(monkeypatch) -> 
     assert read.count("def half(x):") == 1
     with pytest.raises(ti.TaichiNameError, match=r"in broken:\n *return half\(x\) \+ unknown"):
         fails(1.0)
+
+
+class User:
+    """In a cycle, so that it has to be collected."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def test_what_waits_to_be_collected_does_not_keep_the_count_of_fields(monkeypatch) -> None:
+    """A simulator after one that is gone finds its kernels in Taichi's cache, also if that was in a cycle."""
+    monkeypatch.setattr(runtime, "_users", weakref.WeakSet())
+    first = start_runtime("cpu", "float32")
+    left, kept = User(), User()
+    for user in (left, kept):
+        runtime.register_user(user)
+    gc.disable()
+    try:
+        del user, left
+        assert start_runtime("cpu", "float32") is first
+        del kept
+        # The first is collected by now: with nothing left there is a fresh start.
+        assert start_runtime("cpu", "float32").generation == first.generation + 1
+        runtime.register_user(User())
+        assert start_runtime("cpu", "float32").generation == first.generation + 2
+    finally:
+        gc.enable()
 
 
 @pytest.mark.physics

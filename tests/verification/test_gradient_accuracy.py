@@ -30,11 +30,6 @@ YIELD_STRAIN = MATERIAL[2] * (1.0 + MATERIAL[1]) / MATERIAL[0]
 ELASTIC = (*MATERIAL[:2], math.inf)
 
 
-@pytest.fixture(scope="module")
-def touched() -> Simulator:
-    return tb.build()
-
-
 def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
     """Normal random numbers, the same ones at every call."""
     return np.random.default_rng(3).normal(scale=scale, size=shape)

@@ -31,11 +31,6 @@ DRIFT = (0.3, -0.2, 0.1)
 CASES = list(TOUCHING)
 
 
-@pytest.fixture(scope="module")
-def touched() -> Simulator:
-    return tb.build()
-
-
 def pressing(case: str) -> np.ndarray:
     """Action of one environment step that presses a case's moving manipulator into the block, shape [A]."""
     action = np.zeros(SCENE.action_dim)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import gc
 import inspect
 import io
 import linecache
@@ -115,7 +116,10 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     # that the next one starts from a fresh count when nothing is left of those before.
     if _current is not None and len(_users) > 0:
         if (_current.device, _current.precision, _current.threads) == (device, precision, wanted):
-            return _current
+            # Some may only wait for Python to collect them.
+            gc.collect()
+            if len(_users) > 0:
+                return _current
     if device == "cuda" and not cuda_available():
         raise DeviceError(
             "no CUDA device was found: use sim.device=cpu, or check the NVIDIA driver with nvidia-smi"
