@@ -85,11 +85,13 @@ def test_a_function_is_read_once_and_errors_still_name_its_line(monkeypatch) -> 
         fails(1.0)
 
 
-class User:
-    """In a cycle, so that it has to be collected."""
+class User(list):
+    """In a cycle with itself, so that it has to be collected."""
+
+    __hash__ = object.__hash__
 
     def __init__(self) -> None:
-        self.itself = self
+        self.append(self)
 
 
 def test_what_waits_to_be_collected_does_not_keep_the_count_of_fields(monkeypatch) -> None:
