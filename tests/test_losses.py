@@ -254,9 +254,12 @@ def test_environments_have_terms_of_ones_own() -> None:
 
 @pytest.fixture(scope="module")
 def full(device: str) -> Simulator:
-    """With all gradients, a term of the mass tensor and one of distances, three kinds of motion."""
+    """With all gradients, a term of the mass tensor and one of distances, every kind of motion."""
     terms = make_terms({"sdf": 5.0, "contact": 1.0}, {"contact": "soft"})
-    scenes = with_tools("Sphere", "Chopsticks", "RollingPin")
+    scenes = with_tools("Sphere", "RollingPin", "Chopsticks", "Box", "Cylinder")
+    assert {MANIPULATOR_SHAPES[m.shape].motion for m in scenes[0].manipulators} == {
+        one.motion for one in MANIPULATOR_SHAPES.values()
+    }
     simulator = Simulator(scenes, terms=terms, precision="float64", device=device, full_gradient=True)
     sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
     simulator.set_target(np.zeros_like(sdf), sdf)
