@@ -65,20 +65,23 @@ class CudaPhases(OrderPhases, PosePhases):
         mx = m0
         my = m0
         mz = m0
-        for i in ti.static(range(3)):
+        # A plane at a time: all 27 nodes at once take so many registers that fewer threads are resident.
+        for i in range(3):
+            wi = ti.select(i == 0, w[0][0], ti.select(i == 1, w[1][0], w[2][0]))
+            plane = ti.Vector([0.0, 0.0, 0.0, 0.0])
             for j in ti.static(range(3)):
                 # Masked, so that LLVM can tell that sums with it do not wrap: one address for three nodes.
                 row = (node + (i * self.axis + j) * self.axis) & ti.static(self.node_mask)
-                wij = w[i][0] * w[j][1]
+                wij = wi * w[j][1]
                 g1 = (wij * w[1][2]) * self.node4(grid, row + 1)
                 g2 = (wij * w[2][2]) * self.node4(grid, row + 2)
                 s = (wij * w[0][2]) * self.node4(grid, row) + g1 + g2
-                m0 += s
+                plane += s
                 mz += g1 + 2.0 * g2
-                if ti.static(i > 0):
-                    mx += float(i) * s
                 if ti.static(j > 0):
                     my += float(j) * s
+            m0 += plane
+            mx += ti.cast(i, self.real) * plane
         return m0, mx, my, mz
 
     @ti.func
