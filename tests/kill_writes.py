@@ -215,11 +215,11 @@ def died(case: str, folder: Path, at: int, cache: SimulatorCache) -> bool:
 
 
 def loop(wanted: Wanted, rounds: int, rng: random.Random, ended_early: Ended) -> Counter[str]:
-    """End runs at least ``rounds`` times, the cases in turns; returns how often what happened.
+    """End runs ``rounds`` times, the cases in turns; returns how often what happened.
 
     Args:
         wanted: What is to come out.
-        rounds: How many ends, at least.
+        rounds: How many ends.
         rng: Chooses the events.
         ended_early: Carries out runs, given their folder and the number of an event; says whether they ended
             there.
@@ -233,8 +233,9 @@ def loop(wanted: Wanted, rounds: int, rng: random.Random, ended_early: Ended) ->
         for case, (want, kinds) in wanted.items():
             folder = home / "killed"
             folder.mkdir()
-            # Up to two thirds of an undisturbed run's events: most end several times.
-            while ended_early(case, folder, rng.randrange(kinds.total() * 2 // 3)):
+            # Up to two thirds of an undisturbed run's events: most end several times. Nothing ends the last.
+            events = kinds.total() * 2 // 3
+            while ended_early(case, folder, rng.randrange(events) if count["ended early"] < rounds else -1):
                 count["ended early"] += 1
                 count[f"{case} ended early"] += 1
                 _assert_readable(folder)

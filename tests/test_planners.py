@@ -179,8 +179,7 @@ def test_a_run_killed_at_a_random_moment_resumes_to_the_same_numbers(finished, t
     finally:
         process.kill()
         process.wait()
-    subprocess.run(command, check=True)
-    assert_same_numbers(read(result_path(cfg)), finished[method])
+    assert_same_numbers(run(cfg), finished[method])
 
 
 def break_candidates(monkeypatch: pytest.MonkeyPatch, which: list[int]) -> None:
