@@ -211,8 +211,9 @@ def test_a_file_of_tests_runs_in_one_process(tmp_path):
     for name in ("test_one", "test_two", "test_three"):
         (tmp_path / f"{name}.py").write_text(TESTS)
     paths = os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider"]
-    subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, check=True)
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "-p", "xdist"]
+    environment = os.environ | {"PYTHONPATH": paths, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True)
     lines = (tmp_path / "workers").read_text().splitlines()
     assert len(lines) == 12 and len(set(lines)) == 3
     assert {line.split()[1] for line in lines} == {"gw0", "gw1"}
