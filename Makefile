@@ -1,11 +1,11 @@
 # make run    set up .venv and run the main job; other runs: make run ARGS="task=Move variant=3"
-# make test   set up .venv and run the tests but the slow ones (those marked gpu skip themselves without a GPU)
+# make test   set up .venv and run the tests, in five minutes on two cores
 # make dev    set up .venv for work on plab itself: development tools, tools of the docs, commit hooks
 #
 # With the development tools; CONTRIBUTING.md has more about them:
-# make test-quick  only the unit tests, in two minutes, for the loop while working
-# make test-gpu    all that needs a CUDA device: the tests marked gpu, and the simulator's own on CUDA
-# make test-slow   the slow ones: all fifty configurations at full size, half an hour on two cores at least
+# make test-all    the tests of make test, and those worth running nightly: kills, disks, fuzzing, launchers, browser,
+#                  all fifty configurations
+# make test-gpu    the tests that need a CUDA device, and the simulator's own tests on CUDA
 # make lint        style, spelling, imports, unused code and dependencies
 # make typecheck   types of src/
 # make coverage    which lines of src/ the tests run, kernels left out
@@ -32,11 +32,10 @@ REPORTS ?= reports
 
 BIN := $(VENV)/bin
 
-# A file of tests per process and core at a time (tests/scheduling.py): kernels are compiled once per process.
-# A test that hangs is ended after a quarter of an hour, and told with where it hung.
-PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
+# A file of tests stays in one process, which compiles its kernels once. A test that hangs is ended after 15 minutes.
+PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
-.PHONY: run dev test test-quick test-gpu test-slow lint typecheck coverage benchmark docs docs-serve bitcode build clean system-packages \
+.PHONY: run dev test test-all test-gpu lint typecheck coverage benchmark docs docs-serve bitcode build clean system-packages \
 	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
@@ -46,16 +45,13 @@ dev: $(VENV)/.dev.stamp $(VENV)/.docs.stamp
 	$(BIN)/pre-commit install
 
 test: $(VENV)/.dev.stamp
-	$(PARALLEL) -m "not slow"
+	$(PARALLEL)
 
-test-quick: $(VENV)/.dev.stamp
-	$(PARALLEL) -m "not physics and not whole and not slow and not gpu"
+test-all: $(VENV)/.dev.stamp
+	$(PARALLEL) -m "not gpu"
 
 test-gpu: $(VENV)/.dev.stamp
-	PLAB_TEST_DEVICE=cuda $(PARALLEL) -m "gpu and not slow"
-
-test-slow: $(VENV)/.dev.stamp
-	$(BIN)/python -m pytest -m slow
+	PLAB_TEST_DEVICE=cuda $(PARALLEL) -m "gpu and not nightly"
 
 lint: $(VENV)/.dev.stamp
 	$(BIN)/python -m ruff check .
@@ -69,7 +65,7 @@ typecheck: $(VENV)/.dev.stamp
 	$(BIN)/python -m mypy
 
 coverage: $(VENV)/.dev.stamp
-	$(PARALLEL) -m "not slow" --cov --cov-report=term --cov-report=html
+	$(PARALLEL) --cov --cov-report=term --cov-report=html
 
 benchmark: $(VENV)/.dev.stamp
 	$(BIN)/python -m pytest benchmarks --benchmark-autosave --benchmark-compare --benchmark-columns=min,median,rounds

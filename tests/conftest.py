@@ -16,7 +16,6 @@ from plab.config.checks import cuda_is_usable
 from plab.reuse import SimulatorCache
 from plab.tally import Outcome
 from refusals import ending, refusal, snapshot
-from scheduling import pytest_xdist_make_scheduler  # noqa: F401
 from suite import DEVICE
 
 # A bug is to be seen as what it is, also by the processes that tests start: the last net counts as a failure.

@@ -16,8 +16,6 @@ from plab.report.costs import diagrams
 from plab.report.figures import save, style
 from plab.scene import Body
 
-pytestmark = pytest.mark.physics
-
 
 def test_angle_is_exact_for_small_and_large_ones() -> None:
     a = np.random.default_rng(0).normal(size=(5, 3))
@@ -79,7 +77,7 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
     assert all((tmp_path / f"Move_substeps.{kind}").stat().st_size > 5000 for kind in ("png", "pdf"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_finer_steps_come_closer_to_the_reference() -> None:
     plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(24, 32), steps=6, particles=200)
     table = pd.DataFrame(rows(["Move"], plan))
@@ -91,7 +89,7 @@ def test_finer_steps_come_closer_to_the_reference() -> None:
         assert errors[20] < errors[5], precision
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_float32_is_close_to_float64(tmp_path: Path) -> None:
     rows, summary = tmp_path / "rows.csv", tmp_path / "new" / "summary.md"
     command = ["--task", "Move", "--variant", "1", "--particles", "200", "--csv", str(rows)]

@@ -82,7 +82,6 @@ def name_of(result: RunResult) -> str:
     return result.config["method"]["name"]
 
 
-@pytest.mark.physics
 def test_rows_policy_and_budgets(finished: RunResult) -> None:
     rows, name = finished.iterations, name_of(finished)
     # Rounds of three episodes: 6 are as many as 5, 12 as many as 10. Of pods' rounds, of five episodes in two
@@ -122,7 +121,6 @@ def test_on_cuda_it_begins_as_on_the_cpu_and_learns(finished: RunResult, tmp_pat
     assert np.isfinite(trained.to_numpy()).all() and rows["loss"].nunique() == 3
 
 
-@pytest.mark.physics
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, name_of(finished))
     # Simulators are kept from run to run, that of the drawn scenes included.
@@ -138,7 +136,6 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunRe
         np.testing.assert_array_equal(got[name], known[name])
 
 
-@pytest.mark.physics
 def test_an_evaluation_that_breaks_off_ends_nothing(
     tmp_path: Path, finished: RunResult, monkeypatch, caplog
 ) -> None:
@@ -151,7 +148,6 @@ def test_an_evaluation_that_breaks_off_ends_nothing(
     assert "the evaluation of iteration 1 broke off" in told
 
 
-@pytest.mark.physics
 def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
     cfg = make_config(tmp_path)
     with stopped_at(1):
@@ -165,7 +161,6 @@ def test_a_state_of_other_networks_is_refused(tmp_path: Path) -> None:
         ShacTraining(other, batch).restore(state)
 
 
-@pytest.mark.physics
 def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     finished: RunResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,7 +173,6 @@ def test_a_policy_is_tried_in_scenes_that_it_has_not_seen(
     assert str(finished.path) in capsys.readouterr().out
 
 
-@pytest.mark.physics
 def test_it_is_not_tried_in_scenes_that_do_not_fit(
     finished: RunResult, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:
@@ -190,7 +184,6 @@ def test_it_is_not_tried_in_scenes_that_do_not_fit(
     assert "1 of 3 scenes fit into a grid of 32: too few" in capsys.readouterr().err
 
 
-@pytest.mark.physics
 def test_older_files_of_policies_are_read(finished: RunResult, tmp_path: Path) -> None:
     """Those of shac had profiles, without any in them."""
     kept = dict(np.load(policy_path(finished.path)))
@@ -260,7 +253,6 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch)
     assert not list(tmp_path.rglob("*.h5"))
 
 
-@pytest.mark.physics
 def test_rounds_take_the_drawn_scenes_in_turn(tmp_path: Path) -> None:
     cfg = make_config(tmp_path, "pods", "method.epochs=1")
     (batch,) = shared_batches(CACHE, ([cfg], 2, cfg.method.contact))
@@ -297,7 +289,6 @@ def training() -> PodsTraining:
     return PodsTraining(cfg, batch)
 
 
-@pytest.mark.physics
 def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monkeypatch) -> None:
     plans, tried = [], []
     improve, try_out = training._improved, training._batch.problem.try_out
@@ -320,7 +311,6 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monk
     assert distance < 0.2 * np.abs(tried[0] - plans[0].numpy()).mean()
 
 
-@pytest.mark.physics
 def test_what_is_observed_is_moved_together(monkeypatch) -> None:
     words = "method.shift=0.1", "method.observation_noise=0", "method.scenes=0", "observe_target=true"
     cfg = make_config("results", "pods", *words)
@@ -347,7 +337,6 @@ def test_what_is_observed_is_moved_together(monkeypatch) -> None:
     assert moved.abs().max() < 1e-5
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("broken", [[1], [0, 1]])
 def test_environments_that_break_off_teach_nothing(
     training: PodsTraining, broken: list[int], monkeypatch

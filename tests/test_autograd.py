@@ -21,8 +21,6 @@ from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
 from same_runs import assert_same_numbers, stopped_at
 
-pytestmark = pytest.mark.physics
-
 HORIZON = 3
 COARSE = [
     "task=Rope",

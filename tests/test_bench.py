@@ -28,8 +28,6 @@ from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator, Skips
 from plab.sim.memory import array_bytes
 
-pytestmark = pytest.mark.physics
-
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
 STEPS = 6
 PARTICLES = 25_000
@@ -206,7 +204,7 @@ def usual(device: str) -> Simulator:
     return simulator(device=device)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_skips_change_nothing(usual: Simulator, device: str) -> None:
     """In a scene that has something to skip for each of them."""
     nothing = Skips(**{field.name: False for field in fields(Skips)})
@@ -255,7 +253,7 @@ def resident_mb() -> float:
     return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) * 1024 / 1e6
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads the resident memory from /proc")
 def test_memory_is_what_it_is_said_to_be() -> None:
     """A gradient needs no more than its budget, and what it allocates is what appears in the process: on the

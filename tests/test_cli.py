@@ -285,7 +285,6 @@ def test_the_process_is_left_as_it_was(seen, monkeypatch):
     assert sys.argv == argv and "HYDRA_FULL_ERROR" not in os.environ
 
 
-@pytest.mark.physics
 def test_a_real_run_and_the_same_command_again(tmp_path):
     command = ("task=Rope", "method=adam", *COARSE, "method.iterations=2")
     first, again = (plab(*command, cwd=tmp_path) for _ in range(2))

@@ -20,7 +20,7 @@ STEPS = 2
 RUNS = 4
 TOLERANCE = 1e-10
 
-pytestmark = [pytest.mark.physics, pytest.mark.gpu]
+pytestmark = [pytest.mark.gpu]
 
 
 def random_actions() -> np.ndarray:

@@ -13,8 +13,6 @@ import taichi as ti
 from plab.sim.cuda_sums import LARGEST_TERM, WORD_UNITS, SumPhases
 from plab.sim.runtime import start_runtime
 
-pytestmark = pytest.mark.physics
-
 
 @ti.data_oriented
 class Adder(SumPhases):

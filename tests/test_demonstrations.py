@@ -17,8 +17,6 @@ from plab.demonstrations import action_names, known_actions, load_actions, recor
 from plab.results import config_dict
 from plab.targets import demonstration
 
-pytestmark = pytest.mark.physics
-
 TASKS = (
     "Assembly", "Chopsticks", "Move", "Pinch", "RollingPin", "Rope", "Table", "Torus", "TripleMove", "Writer",
 )  # fmt: skip
@@ -133,7 +131,7 @@ def test_mistakes_are_told_in_one_line(arguments, message, capsys):
     assert message in error and error.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_demonstrations_reach_what_is_recorded(task, device):
     """At full resolution; float32 differs from float64 by up to 0.005, CUDA runs from each other by less."""

@@ -22,7 +22,7 @@ Results = dict[str, np.ndarray]
 SCENES = batch()
 STEPS = 3
 
-pytestmark = [pytest.mark.physics, pytest.mark.gpu]
+pytestmark = [pytest.mark.gpu]
 
 
 def simulator_of(scenes: list[int], precision: str, contact: str, *, device: str = "cuda") -> Simulator:

@@ -26,8 +26,6 @@ from plab.runners import run_batch
 from refusals import snapshot
 from rights import ordinary_rights
 
-pytestmark = pytest.mark.whole
-
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SWEEP = ("-m", *COARSE, "seed=0,1,2", "checkpoint_seconds=0")
 
@@ -405,7 +403,7 @@ def _start(argv: Sequence[str], said: Path) -> int:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-@pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.nightly)])
 def test_many_processes_on_one_sweep_compute_nothing_twice(toy: Configs, monkeypatch, count: int) -> None:
     monkeypatch.setattr(toy_runner, "PAUSE", 0.005)
     seeds = tuple(range(10))

@@ -32,8 +32,6 @@ from plab.objective import OBSERVED_PARTICLES, observation, target_observation, 
 from plab.sim import SimulationError
 from suite import make_not_finite
 
-pytestmark = pytest.mark.physics
-
 HORIZON = 4
 COARSE = [
     "sim.grid_size=32",
@@ -530,7 +528,7 @@ def test_closing_lets_go_of_the_simulator() -> None:
         env.reset()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_another_precision_invalidates() -> None:
     # In a process of its own: it would invalidate the other tests' simulators, too.
     code = f"""
@@ -550,7 +548,7 @@ second.step(second.action_space.sample())
     assert done.stdout.startswith("this simulator's memory is gone") and done.stdout.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_worker_processes() -> None:
     arguments = {"num_envs": 2, "overrides": COARSE, "vectorization_mode": "async"}
     env = gymnasium.make_vec("plab/Move-v1", vector_kwargs={"context": "spawn"}, **arguments)
@@ -560,7 +558,7 @@ def test_worker_processes() -> None:
     env.close()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("task", suite_tasks())
 def test_every_task(task: str, tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))

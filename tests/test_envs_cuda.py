@@ -16,7 +16,7 @@ from suite import make_not_finite
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
 
-pytestmark = [pytest.mark.physics, pytest.mark.gpu]
+pytestmark = [pytest.mark.gpu]
 
 
 def episode(device: str) -> list[tuple]:

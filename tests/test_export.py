@@ -16,7 +16,6 @@ from plab.render.recording import RecordedRollout, record_with_motion
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.files")
 
-pytestmark = pytest.mark.physics
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

@@ -19,12 +19,10 @@ from plab.errors import PlabError
 from plab.report.collect import collect
 from plab.status import NAMES, survey
 
-pytestmark = pytest.mark.whole
-
 FEW, MANY = 200, 2000
 """Cases that are tried each time, and in the slow tests."""
 
-cases = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+cases = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.nightly)])
 
 
 @pytest.fixture(autouse=True)

@@ -40,8 +40,6 @@ from plab.scene import SceneError
 from plab.shape_files import ShapeError
 from plab.targets import TargetError, load_release_target
 
-pytestmark = pytest.mark.whole
-
 OWN = (ResultsError, TargetError, ConfigError, SceneError, SelectionError, MixedRunsError, ShapeError)
 
 CASES = {"few": 34, "many": 334}
@@ -585,7 +583,7 @@ def test_some_changes(sound: dict[str, Path], tmp_path: Path, kind: str) -> None
     fuzz(kind, sound[kind], tmp_path, CASES["few"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_changes(sound: dict[str, Path], tmp_path: Path, kind: str) -> None:
     fuzz(kind, sound[kind], tmp_path, CASES["many"])

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 from importlinter import cli
+from scheduling import group
 
 import plab
-from scheduling import group
 
 ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "src").rglob("*.py"))
@@ -205,7 +205,6 @@ def test_it(number):
 """
 
 
-@pytest.mark.whole
 def test_a_file_of_tests_runs_in_one_process(tmp_path):
     (tmp_path / "conftest.py").write_text("from scheduling import pytest_xdist_make_scheduler\n")
     for name in ("test_one", "test_two", "test_three"):

@@ -22,7 +22,6 @@ from plab.sim.storage import FRAME_ADJOINT, STATE
 from plab.sim.transfer import spline
 
 pytestmark = [
-    pytest.mark.physics,
     pytest.mark.skipif(
         suite.DEVICE != "cpu", reason="what runs on CUDA is compared with the reference there"
     ),

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 pytestmark = [
-    pytest.mark.physics,
     pytest.mark.skipif(sys.platform != "linux", reason="forks, and follows descriptors in /proc"),
 ]
 
@@ -36,6 +35,6 @@ def test_a_few_kills_of_a_run_with_a_replay_buffer() -> None:
     rounds(12, 2, "sac")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_kills_at_any_write_of_every_kind_of_run() -> None:
     rounds(210, 30)

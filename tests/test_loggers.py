@@ -74,7 +74,6 @@ def assert_rows_are_shown(result: RunResult) -> dict[str, list[tuple[int, float]
     return got
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_tensorboard_shows_the_rows_of_every_method(tmp_path: Path, method: str, cache) -> None:
     pytest.importorskip("tensorboard")
@@ -88,7 +87,6 @@ def test_tensorboard_shows_the_rows_of_every_method(tmp_path: Path, method: str,
     finished_as(plain, result)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["adam", "sac"])
 def test_tensorboard_shows_each_run_of_a_batch_or_population(tmp_path: Path, method: str, cache) -> None:
     pytest.importorskip("tensorboard")
@@ -101,7 +99,6 @@ def test_tensorboard_shows_each_run_of_a_batch_or_population(tmp_path: Path, met
     assert shown[0]["loss"] != shown[1]["loss"]
 
 
-@pytest.mark.physics
 def test_a_run_that_was_killed_goes_on_as_one_curve(tmp_path: Path, monkeypatch, cache) -> None:
     pytest.importorskip("tensorboard")
     cfg = make_config(tmp_path, "adam", "logger=tensorboard", "checkpoint_seconds=1e6")
@@ -115,7 +112,6 @@ def test_a_run_that_was_killed_goes_on_as_one_curve(tmp_path: Path, monkeypatch,
     assert_rows_are_shown(result)
 
 
-@pytest.mark.physics
 def test_a_log_that_cannot_be_written_ends_the_run_in_one_line(tmp_path: Path, cache) -> None:
     pytest.importorskip("tensorboard")
     cfg = make_config(tmp_path, "adam", "logger=tensorboard")
@@ -164,7 +160,6 @@ def records(path: Path) -> Iterator[Any]:
             text = b""
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["adam", "sac"])
 def test_wandb_gets_the_rows_of_each_run_of_a_batch(
     tmp_path: Path, monkeypatch, method: str, cache, wandb
@@ -195,7 +190,6 @@ def test_wandb_gets_the_rows_of_each_run_of_a_batch(
         assert float(rows[-1]["final/score"]) == result.evaluation["score"]
 
 
-@pytest.mark.physics
 def test_what_wandb_refuses_is_one_line(tmp_path: Path, monkeypatch, cache, wandb) -> None:
     monkeypatch.setenv("WANDB_MODE", "online")
     monkeypatch.setenv("WANDB_API_KEY", "short")

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 pytestmark = [
-    pytest.mark.physics,
     pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
 ]
 
@@ -47,7 +46,7 @@ def test_memory_threads_files_and_locks_do_not_grow(tmp_path: Path, what: str, c
     live(tmp_path, what, count, SHORT)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(("what", "count"), [("runs", 2000), ("resets", 10_000)])
 def test_nothing_grows_in_a_long_life(tmp_path: Path, what: str, count: int) -> None:
     live(tmp_path, what, count, GROWTH)

@@ -30,8 +30,6 @@ OWN = ROOT / "examples" / "own_loss"
 SCENES = [scene(KINDS), scene(("Sphere", "Chopsticks"))]
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
-physics = pytest.mark.physics
-
 
 class Close(DistanceTerm):
     """How many particles are close to a manipulator, smoothly counted."""
@@ -83,7 +81,6 @@ def distances(simulator: Simulator, e: int) -> tuple[np.ndarray, np.ndarray]:
 # gradients
 
 
-@physics
 @pytest.mark.parametrize("name", [name for name in TERMS if name != "all"])
 def test_gradients_of_terms_are_those_of_their_measures(name: str, device: str) -> None:
     (term, _overlap) = make_terms({"any": 1.0}, {"any": name})
@@ -91,14 +88,12 @@ def test_gradients_of_terms_are_those_of_their_measures(name: str, device: str) 
     assert max(errors.values()) < 1e-6, errors
 
 
-@physics
 @pytest.mark.parametrize("kind", [Kinetic, Close])
 def test_gradients_of_terms_of_ones_own(kind: type, device: str) -> None:
     errors = check_gradient(kind(), SCENES, device=device)
     assert max(errors.values()) < 1e-6, errors
 
 
-@physics
 def test_a_wrong_gradient_is_noticed(device: str) -> None:
     class Wrong(Kinetic):
         @ti.func
@@ -109,7 +104,6 @@ def test_a_wrong_gradient_is_noticed(device: str) -> None:
     assert errors["x"] > 0.5 and errors["v"] > 0.1 and errors["poses"] < 1e-6
 
 
-@physics
 def test_the_summed_gradient_is_no_gradient_and_what_it_is_said_to_be(device: str) -> None:
     """2 w D sum of grad d_p over the particles outside, and D as its measure."""
     (term, _overlap) = make_terms({"contact": 1.0}, {"contact": "all"})
@@ -135,7 +129,6 @@ def test_the_summed_gradient_is_no_gradient_and_what_it_is_said_to_be(device: st
 # measures
 
 
-@physics
 def test_measures_are_the_formulas(device: str) -> None:
     weights, choices = {"density": 1.0, "near": 1.0, "soft": 1.0, "energy": 1.0}, {"near": "nearest"}
     terms = make_terms(weights, choices | {"energy": "suite:Kinetic"})
@@ -161,7 +154,6 @@ def test_measures_are_the_formulas(device: str) -> None:
 # there
 
 
-@physics
 def test_a_term_of_weight_0_is_not_there() -> None:
     simulator = Simulator(SCENES, terms=make_terms({"density": 0.0, "contact": 2.0}))
     assert [term.name for term in simulator.terms] == ["contact"]
@@ -205,7 +197,6 @@ def test_classes_that_are_no_terms_are_named(place: str, line: str) -> None:
 # own
 
 
-@physics
 @pytest.mark.parametrize("words", [["method=adam_height", "method.iterations=2"], ["method=ppo"]])
 def test_a_term_of_ones_own_is_a_file_and_a_weight(tmp_path: Path, words: list[str]) -> None:
     if words == ["method=ppo"]:
@@ -235,7 +226,6 @@ def test_a_term_of_ones_own_is_a_file_and_a_weight(tmp_path: Path, words: list[s
     assert subprocess.run(check, cwd=tmp_path, check=False, capture_output=True).returncode == 0
 
 
-@physics
 def test_environments_have_terms_of_ones_own() -> None:
     cfg = load_config(["task=RollingPin", "method=adam_height", *COARSE], config_dir=OWN / "conf")
     env = EpisodeBatch([cfg])
@@ -266,7 +256,6 @@ def full(device: str) -> Simulator:
     return simulator
 
 
-@physics
 def test_the_gradient_of_a_rollout_with_a_soft_minimum(full: Simulator) -> None:
     full.reset()
     full.set_weights({"sdf": 0.0, "contact": 1.0})
@@ -278,7 +267,6 @@ def test_the_gradient_of_a_rollout_with_a_soft_minimum(full: Simulator) -> None:
     assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
 
 
-@physics
 @pytest.mark.parametrize("every_step", [True, False])
 def test_functions_of_states_are_differentiated(every_step: bool, full: Simulator) -> None:
     """By actions, initial positions and material, against central differences."""
@@ -311,7 +299,6 @@ def test_functions_of_states_are_differentiated(every_step: bool, full: Simulato
         assert got == pytest.approx(want, rel=2e-6), name
 
 
-@physics
 def test_functions_of_states_agree_with_the_terms(full: Simulator) -> None:
     """The SDF term, once compiled in and once as a function of the mass tensor."""
     simulator = full
@@ -329,7 +316,6 @@ def test_functions_of_states_agree_with_the_terms(full: Simulator) -> None:
     np.testing.assert_array_equal(simulator.rollout(u).gradient, want.gradient)
 
 
-@physics
 def test_the_way_back_is_refused_once_it_is_gone(device: str) -> None:
     simulator = Simulator(with_tools("Sphere"), device=device)
     u = torch.zeros((2, 2, simulator.action_dim), requires_grad=True)
@@ -348,7 +334,6 @@ def test_the_way_back_is_refused_once_it_is_gone(device: str) -> None:
         recording.pullback(v=np.zeros((2, 1)))
 
 
-@physics
 def test_a_state_that_breaks_is_an_error(device: str) -> None:
     simulator = Simulator(with_tools("Sphere"), device=device)
     state = simulator.state()

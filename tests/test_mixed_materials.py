@@ -17,8 +17,6 @@ from plab.losses import make_terms
 from plab.scene import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
 
-pytestmark = pytest.mark.physics
-
 WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}
 WEIGHT = np.array(list(WEIGHTS.values()))
 STEPS = 2
@@ -342,7 +340,7 @@ def test_equal_materials_are_one_material(simulator, device):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
 
-@pytest.mark.slow  # compiles three simulators
+@pytest.mark.nightly  # compiles three simulators
 def test_float32_is_float64_to_rounding_with_the_same_bits_for_any_batch_and_threads(simulator, device):
     start_at, u = start(simulator, 0.02), actions()
     found = []

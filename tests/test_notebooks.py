@@ -23,8 +23,6 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 NAMES = ("first_run", "own_task", "own_loss", "differentiable_policy", "identification")
 
-physics = pytest.mark.physics
-
 
 class Outputs:
     """What an executed notebook shows.
@@ -96,7 +94,6 @@ def test_links_of_a_notebook_lead_somewhere(name):
 # -------------------------------------------------------------------------------- run from top to bottom
 
 
-@physics
 def test_a_first_run(tmp_path):
     shown = execute("first_run", tmp_path)
     (score,) = shown.numbers("best actions: (50, 3), score: #")
@@ -112,7 +109,6 @@ def test_a_first_run(tmp_path):
     assert learned["scores"][-1] == pytest.approx(score, abs=1e-3)
 
 
-@physics
 def test_a_task_of_ones_own(tmp_path):
     shown = execute("own_task", tmp_path)
     assert "bodies[0]: reaches z = 0.91 .. 1.07, outside the domain" in shown.text
@@ -122,8 +118,7 @@ def test_a_task_of_ones_own(tmp_path):
     assert [view["steps"] for view in shown.views] == [30, 30]
 
 
-@pytest.mark.slow
-@physics
+@pytest.mark.nightly
 def test_a_loss_of_ones_own(tmp_path):
     shown = execute("own_loss", tmp_path)
     assert "class HeightMap(NodeTerm):" in shown.text
@@ -137,8 +132,7 @@ def test_a_loss_of_ones_own(tmp_path):
     assert [view["steps"] for view in shown.views] == [50]
 
 
-@pytest.mark.slow
-@physics
+@pytest.mark.nightly
 def test_a_differentiable_policy(tmp_path):
     shown = execute("differentiable_policy", tmp_path)
     first, last = shown.numbers("loss: # -> #")
@@ -151,8 +145,7 @@ def test_a_differentiable_policy(tmp_path):
     assert view["scores"][-1] == pytest.approx(one, abs=1e-3)
 
 
-@pytest.mark.slow
-@physics
+@pytest.mark.nightly
 def test_the_yield_stress_is_found_again(tmp_path):
     shown = execute("identification", tmp_path)
     slope, difference = shown.numbers("slope: #, by differences: #")

@@ -65,7 +65,6 @@ def test_answers_to_mistakes(capsys, command, answer):
     assert capsys.readouterr().err == f"{answer}\n"
 
 
-@pytest.mark.physics
 def test_what_the_cushions_do_is_what_the_page_prints(monkeypatch):
     monkeypatch.chdir(ROOT)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -73,8 +72,7 @@ def test_what_the_cushions_do_is_what_the_page_prints(monkeypatch):
     assert printed.getvalue() == blocks("text")[0]
 
 
-@pytest.mark.physics
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_gradient_of_the_page_says_which_way_to_go(monkeypatch):
     monkeypatch.chdir(ROOT)
     names: dict = {}
@@ -133,7 +131,6 @@ def test_runs_of_one_material_and_of_several_are_not_of_one_batch():
     assert plan(cfgs) == [cfgs[:2], cfgs[2:]]
 
 
-@pytest.mark.physics
 def test_a_run_is_recorded_and_replayed_with_its_materials(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = ["--config-dir", str(CONF), "task=Cushion", *QUICK, "method.iterations=2", "progress=false"]

@@ -121,7 +121,6 @@ def test_the_commands_are_runs_of_each_kind_of_target(seen, files, monkeypatch):
     assert {cfg.task.bodies["star"].file for cfg in seen} == {str(files / "star.obj")}
 
 
-@pytest.mark.physics
 def test_a_run_of_each_kind_is_recorded_and_read_without_the_files(files, tmp_path, monkeypatch):
     for path in files.iterdir():
         shutil.copy(path, tmp_path)

@@ -15,8 +15,6 @@ from plab.config import ConfigError, build_scene, choices, load_config
 from plab.results import load
 from plab.targets import build_target
 
-pytestmark = pytest.mark.whole
-
 ROOT = Path(__file__).resolve().parents[1]
 OWN = ROOT / "examples" / "own_task" / "conf"
 DUMBBELL = (OWN / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
@@ -82,7 +80,7 @@ def test_commands_are_accepted(seen, line):
     assert (cfg.task.name, cfg.sim.grid_size) == ("Dumbbell", 32)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_commands_run():
     for line in COMMANDS:
         assert main([*arguments(line), *COARSE]) == 0

@@ -86,7 +86,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
 # ---------------------------------------------------------------- what they find
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_it_improves_on_its_random_start(finished, method: str) -> None:
     result = finished[method]
@@ -96,7 +95,6 @@ def test_it_improves_on_its_random_start(finished, method: str) -> None:
     assert result.best_actions.shape == (STEPS, 6)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_rows_are_of_the_hard_model_and_the_best_has_the_highest_score(finished, method: str) -> None:
     result = finished[method]
@@ -106,7 +104,6 @@ def test_rows_are_of_the_hard_model_and_the_best_has_the_highest_score(finished,
         assert best[name] == pytest.approx(result.evaluation[name], rel=1e-6), name
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize(
     ("objective", "low", "high"), [("loss", 8.0, 20.0), ("final", 2.0, 4.0), ("score", -1.0, 1.0)]
 )
@@ -141,7 +138,6 @@ def test_curves() -> None:
 # ---------------------------------------------------------------- interruptions, failures
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_a_resumed_run_equals_an_undisturbed_one(finished, tmp_path: Path, monkeypatch, method: str) -> None:
     cfg = make_config(tmp_path, method, "checkpoint_seconds=0")
@@ -165,7 +161,6 @@ def test_a_resumed_run_equals_an_undisturbed_one(finished, tmp_path: Path, monke
     assert resumed.provenance["resumed"] == rows - 1
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["cmaes", "solve"])
 def test_a_run_killed_at_a_random_moment_resumes_to_the_same_numbers(finished, tmp_path, method) -> None:
     cfg = make_config(tmp_path, method)
@@ -195,7 +190,6 @@ def break_candidates(monkeypatch: pytest.MonkeyPatch, which: list[int]) -> None:
     monkeypatch.setattr(Problem, "try_out", try_out)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypatch, method: str) -> None:
     break_candidates(monkeypatch, [1])
@@ -203,7 +197,6 @@ def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypa
     assert faults(result) == []
 
 
-@pytest.mark.physics
 def test_a_run_without_candidates_ends(tmp_path: Path, monkeypatch) -> None:
     break_candidates(monkeypatch, [0, 1, 2, 3])
     cfg = make_config(tmp_path, "cem")
@@ -219,7 +212,6 @@ def test_a_run_without_candidates_ends(tmp_path: Path, monkeypatch) -> None:
 BATCH = (("variant=1",), ("variant=1", "seed=1"), ("variant=3", "seed=2", "task.yield_stress=20"))
 
 
-@pytest.mark.physics
 def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, monkeypatch) -> None:
     # In this order a simulator serves all methods, and another one all batches.
     alone = {
@@ -240,7 +232,6 @@ def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, monkeypatch)
             assert (got.provenance["batch"], want.provenance["batch"]) == (3, 1)
 
 
-@pytest.mark.physics
 def test_a_batch_goes_on_where_each_of_its_runs_stands(finished, tmp_path: Path, monkeypatch) -> None:
     first, other = (make_config(tmp_path, "solve", f"seed={seed}", "checkpoint_seconds=0") for seed in (0, 1))
     intact = planner.PlannerRunner.iterate
@@ -259,7 +250,6 @@ def test_a_batch_goes_on_where_each_of_its_runs_stands(finished, tmp_path: Path,
     assert_same_numbers(read(result_path(other)), run(make_config(tmp_path / "alone", "solve", "seed=1")))
 
 
-@pytest.mark.physics
 def test_a_run_ends_when_it_is_solved(finished, tmp_path: Path, monkeypatch) -> None:
     undisturbed = [finished["cem"], run(make_config(tmp_path / "alone", "cem", "seed=1"))]
     scores = np.stack([result.iterations["score"] for result in undisturbed])
@@ -287,7 +277,6 @@ def rows_until(scores: np.ndarray, enough: float) -> list[int]:
 # ---------------------------------------------------------------- budgets
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_budgets_add_up(tmp_path: Path, monkeypatch, method: str) -> None:
     simulated = dict.fromkeys(BUDGETS, 0)
@@ -318,7 +307,6 @@ def _unseen(patch, intact, runner, actions):
     return super(planner.PlannerRunner, runner).judge(np.concatenate([actions] * runner._width))
 
 
-@pytest.mark.physics
 def test_what_a_planner_costs(finished) -> None:
     columns = ["steps_forward", "steps_gradient"]
     last = {method: finished[method].iterations[columns].iloc[-1].tolist() for method in METHODS}
@@ -330,7 +318,6 @@ def test_what_a_planner_costs(finished) -> None:
     assert last["solve"] == [4 * population, 6 * population]
 
 
-@pytest.mark.physics
 def test_files_without_budgets_are_read_and_gone_on_with(finished, tmp_path: Path, monkeypatch) -> None:
     cfg = load_config([*COARSE, "method.iterations=2", f"results_dir={tmp_path}", "checkpoint_seconds=0"])
     with monkeypatch.context() as patch, pytest.raises(OSError, match="gone"):
@@ -359,7 +346,6 @@ def _second_fails(intact):
     return rollout
 
 
-@pytest.mark.physics
 def test_the_check_finds_a_best_row_that_is_not_the_best(finished) -> None:
     result = finished["cem"]
     worst = int(result.iterations["score"].argmin())
@@ -372,7 +358,6 @@ def test_the_check_finds_a_best_row_that_is_not_the_best(finished) -> None:
 # ---------------------------------------------------------------- contact starts
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("task", ["Move", "Table", "RollingPin", "Torus", "Assembly"])
 def test_contact_starts_reach_the_body(task: str) -> None:
     words = [f"task={task}", "sim.grid_size=32", "sim.particles_scale=0.1", "sim.horizon=40"]

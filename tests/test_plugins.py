@@ -128,7 +128,6 @@ optimizer: rprop
 """
 
 
-@pytest.mark.physics
 def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folder: Path) -> None:
     (folder.parent / "zz_rprop.py").write_text(OPTIMISER)
     (folder / "method" / "rprop.yaml").write_text(RPROP)
@@ -144,7 +143,6 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
     assert [found for _, found in check(folder)] == [None, None]
 
 
-@pytest.mark.physics
 def test_a_runner_that_is_none_is_said(folder: Path) -> None:
     wrong = "from plab.families import *\nFAMILY = Family('', 'plab.config:ApgConfig', dict)\n"
     (folder / "zz_wrong.py").write_text(wrong)
@@ -156,7 +154,6 @@ def test_a_runner_that_is_none_is_said(folder: Path) -> None:
     assert ended.message == "the runner of method.family 'zz_wrong:FAMILY' is no plab.runners.Runner"
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("hook", ["build", "step", "iterate"])
 def test_a_runner_that_lacks_hooks_is_refused(hook: str, folder: Path) -> None:
     (folder / f"zz_lacks_{hook}.py").write_text(

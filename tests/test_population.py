@@ -383,7 +383,6 @@ def lone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[RunRe
     return results
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, method) -> None:
     alone = lone(method)
@@ -400,7 +399,6 @@ def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, meth
     assert files(tmp_path) == {path.name for one in alone for path in (one.path, policy_path(one.path))}
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, lone, method) -> None:
     """The single run is Stable-Baselines3's: the same first policy, the same rows, other random numbers."""
@@ -417,7 +415,6 @@ def test_a_population_begins_and_counts_as_a_single_run_does(tmp_path: Path, lon
     assert not np.allclose(single.iterations["loss"][1:], alone[0].iterations["loss"][1:], rtol=1e-9)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_the_trained_policy_is_beside_the_result(tmp_path: Path, lone, method) -> None:
     """Its episode is that of the last row, but for rounding: the library multiplies otherwise."""
@@ -441,7 +438,6 @@ def break_off(monkeypatch: pytest.MonkeyPatch, after: int, error: BaseException)
     monkeypatch.setattr(Population, "_step", step)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_a_population_that_breaks_off_goes_on_to_the_same_numbers(
     tmp_path, lone, monkeypatch, method
@@ -458,7 +454,6 @@ def test_a_population_that_breaks_off_goes_on_to_the_same_numbers(
         assert assert_same_numbers(cfg, want).provenance["resumed"] == 1
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["sac", "ppo"])
 def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone, method, monkeypatch) -> None:
     alone = lone(method)
@@ -474,7 +469,6 @@ def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone,
         assert_same_numbers(cfg, want)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["td3"])
 def test_states_are_written_as_often_as_asked_for(tmp_path, lone, method, monkeypatch) -> None:
     """What is lost is done again, to the same numbers; a replay buffer may hold more than the state knows."""
@@ -505,7 +499,6 @@ def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None
     monkeypatch.setattr(Population, "_step", step)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["sac", "ppo"])
 def test_episodes_that_break_off_are_counted_and_end_nothing(
     tmp_path, lone, method, monkeypatch, caplog
@@ -527,7 +520,6 @@ def test_episodes_that_break_off_are_counted_and_end_nothing(
     )
 
 
-@pytest.mark.physics
 def test_an_evaluation_that_breaks_off_ends_nothing(tmp_path, lone, monkeypatch, caplog) -> None:
     alone = lone("ppo")
     cfgs = configs(tmp_path, "ppo")
@@ -552,7 +544,6 @@ def test_an_evaluation_that_breaks_off_ends_nothing(tmp_path, lone, monkeypatch,
     assert str(result.path) in told and "the evaluation of iteration 1 broke off" in told
 
 
-@pytest.mark.physics
 def test_a_run_whose_episodes_all_break_off_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
     alone = lone("sac")
     cfgs = configs(tmp_path, "sac")
@@ -570,7 +561,6 @@ def test_a_run_whose_episodes_all_break_off_leaves_the_others_alone(tmp_path, lo
     assert_same_numbers(cfgs[1], alone[1])
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["td3"])
 def test_networks_that_are_not_finite_end_their_run_only(tmp_path, lone, method, monkeypatch) -> None:
     alone = lone(method)
@@ -593,7 +583,6 @@ def test_networks_that_are_not_finite_end_their_run_only(tmp_path, lone, method,
         assert_same_numbers(cfgs[k], alone[k])
 
 
-@pytest.mark.physics
 def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, monkeypatch) -> None:
     cfgs = configs(tmp_path, "sac")
     with monkeypatch.context() as patch:
@@ -608,7 +597,6 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, monkeypatch) -> None:
     assert read(result_path(cfgs[1])).status == "finished"
 
 
-@pytest.mark.physics
 def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
     """Until they fit ``sim.memory_mb``; one is always tried."""
     first = configs(tmp_path, "sac", "sim.memory_mb=0.01")[0]
@@ -617,7 +605,6 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
     assert {read(result_path(cfg)).provenance["batch"] for cfg in cfgs} == {1}
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", ["sac"])
 def test_a_full_disk_ends_its_run_only(tmp_path, lone, method, monkeypatch) -> None:
     alone = lone(method)
@@ -672,7 +659,6 @@ def test_a_single_run_is_a_population_of_one_where_its_networks_are_on_cuda(tmp_
     )
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("method", METHODS)
 def test_losses_of_each_agent_are_logged(tmp_path: Path, method: str) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -693,7 +679,6 @@ def test_losses_of_each_agent_are_logged(tmp_path: Path, method: str) -> None:
     assert means[0] != means[1] != means[2]
 
 
-@pytest.mark.physics
 def test_benchmark_measures_every_part(tmp_path: Path) -> None:
     table = tmp_path / "agents.csv"
     words = [*COARSE[:6], "method.hidden=[8]", "--methods", "ppo", "sac", "--agents", "2", "--envs", "1"]
@@ -707,8 +692,7 @@ def test_benchmark_measures_every_part(tmp_path: Path) -> None:
     assert rows["agent_mb"].tolist() == pytest.approx(expected, abs=0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.physics
+@pytest.mark.nightly
 @pytest.mark.parametrize("method", METHODS)
 def test_a_sweep_killed_at_random_moments_ends_with_the_same_numbers(tmp_path, lone, method) -> None:
     alone = lone(method)

@@ -96,7 +96,6 @@ def reference_state(state: State, e: int) -> reference.State:
 # ---------------------------------------------------------------------------------------------- the simulator
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_states_agree_with_the_reference(simulator: Simulator, contact: str) -> None:
     simulator.reset()
@@ -120,7 +119,6 @@ def test_states_agree_with_the_reference(simulator: Simulator, contact: str) -> 
         np.testing.assert_allclose(tensors[e], reference.mass_tensor(world, want.x).numpy(), atol=1e-12)
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("contact", ["soft", "hard"])
 def test_gradients_agree_with_the_reference(simulator: Simulator, contact: str) -> None:
     simulator.reset()
@@ -154,7 +152,6 @@ def test_the_mass_tensor_has_negative_masses_and_sums_up(simulator: Simulator) -
         np.testing.assert_allclose(got[e].sum(), world.particle_count * world.particle_mass)
 
 
-@pytest.mark.physics
 def test_rotations_are_of_unit_length_after_the_start(simulator: Simulator) -> None:
     simulator.set_scenes(SCENES)
     pin = KINDS.index("RollingPin")
@@ -210,7 +207,6 @@ def test_the_default_is_plabs_own() -> None:
 
 
 @pytest.mark.parametrize("method", choices("method"))
-@pytest.mark.whole
 def test_the_release_is_for_all_methods(method: str) -> None:
     cfg = load_config(["protocol=release", f"method={method}", "task=Rope"])
     world = build_scene(cfg)
@@ -223,7 +219,6 @@ def test_the_release_is_for_all_methods(method: str) -> None:
 
 
 @pytest.mark.parametrize("task", choices("task"))
-@pytest.mark.whole
 def test_the_release_is_for_all_tasks(task: str) -> None:
     for variant in "12345":
         ours = build_scene(load_config([f"task={task}", f"variant={variant}"]))
@@ -278,7 +273,6 @@ def test_results_without_the_score_are_their_protocols() -> None:
         assert stored_config(text)["protocol"]["score"] == score
 
 
-@pytest.mark.whole
 def test_numbers_have_all_digits() -> None:
     def exact(task: str, variant: int) -> Scene:
         return build_scene(load_config([f"task={task}", f"variant={variant}", "protocol.numbers=release"]))
@@ -333,7 +327,7 @@ def test_protocols_do_not_share_a_simulator() -> None:
 # ----------------------------------------------------------------------------------------------- known values
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(FILES is None, reason="PLAB_RELEASE_TARGETS names no folder with the release's files")
 @pytest.mark.parametrize(
     ("protocol", "loss", "norm"),
@@ -351,7 +345,6 @@ def test_loss_and_gradient_of_torus_are_known(protocol: str, loss: float, norm: 
 # --------------------------------------------------------------------------------------------------- results
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize(("floor", "breaks_off"), [("release", True), ("plab", False)])
 def test_on_the_releases_floor_a_sphere_can_throw_particles_away(floor: str, breaks_off: bool) -> None:
     """It is pressed against the floor and pushed into the block: some nodes there have masses close to 0. In
@@ -368,7 +361,6 @@ def test_on_the_releases_floor_a_sphere_can_throw_particles_away(floor: str, bre
     assert bool(done.failures) == breaks_off
 
 
-@pytest.mark.physics
 def test_a_run_on_the_users_targets(tmp_path: Path, device: str) -> None:
     coarse = [
         "sim.grid_size=16",

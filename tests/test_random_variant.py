@@ -15,8 +15,6 @@ from plab.config import ConfigError, TaskConfig, build_scene, choices, conf_fold
 from plab.config.variants import FIRST_TARGET_SEED, draw_variant
 from plab.results import result_path
 
-pytestmark = pytest.mark.whole
-
 SCENES = 30
 SCRIPTED = [task for task, path in choices("task").items() if "seed" in OmegaConf.load(path).target.keys()]
 

@@ -12,8 +12,6 @@ from torch import Tensor
 import reference_mpm as ref
 from plab.scene import Body, Manipulator, Scene
 
-pytestmark = pytest.mark.physics
-
 torch.set_num_threads(1)
 
 IDENTITY = torch.eye(3, dtype=torch.float64)

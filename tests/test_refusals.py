@@ -25,8 +25,6 @@ from plab.results import load
 from plab.sim import Simulator
 from suite import scene
 
-pytestmark = pytest.mark.whole
-
 ROOM = 16e9
 """Bytes of memory that the computer of these tests has."""
 
@@ -246,7 +244,6 @@ def test_calls_from_python(call, line):
     assert str(caught.value) == line
 
 
-@pytest.mark.physics
 def test_rollouts_of_no_steps_and_of_no_numbers():
     from plab.envs.core import EpisodeBatch
 

@@ -27,8 +27,6 @@ from plab.render.surface import BodySurface, target_field
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
 from suite import SCALES, SIZES
 
-pytestmark = pytest.mark.physics
-
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SIZE = (160, 120)
 CUBE = Body("box", (0.4, 0.1, 0.5), (0.2, 0.2, 0.2), 800)

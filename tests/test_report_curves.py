@@ -24,8 +24,6 @@ from plab.report.figures import grid, legend_of_methods, log_axis, style
 from plab.report.methods import method, ordered
 from plab.report.series import band, load_series, rows_on_axes
 
-pytestmark = pytest.mark.whole
-
 # ------------------------------------------------------------------------------------------------------ bands
 
 

@@ -23,8 +23,6 @@ from plab.report.table import MINUS, NOTHING
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
 
-pytestmark = pytest.mark.whole
-
 # ------------------------------------------------------------------------------------------------- verdicts
 
 
@@ -269,7 +267,7 @@ def test_missing_packages_are_named(results: Path, tmp_path: Path, monkeypatch, 
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_notebooks_become_pages(tmp_path: Path) -> None:
     """Execute all four in Jupyter's own way on what comes with plab."""
     pytest.importorskip("nbclient")

@@ -27,8 +27,6 @@ from plab.report.media import best_runs, present
 from plab.report.methods import method
 from plab.results import load
 
-pytestmark = pytest.mark.whole
-
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 drawing = pytest.mark.skipif(missing_graphics() is not None, reason=str(missing_graphics()))
@@ -347,7 +345,6 @@ def test_an_open_page_loads_itself_again_while_runs_are_under_way(browser, tmp_p
 
 @browsing
 @drawing
-@pytest.mark.physics
 def test_a_click_opens_a_configuration_and_its_pictures_load(browser, results: Path, tmp_path: Path) -> None:
     page = write(results, tmp_path / "page", "--every-run")
     browser.get(page.as_uri())
@@ -374,7 +371,6 @@ def test_a_click_opens_a_configuration_and_its_pictures_load(browser, results: P
 
 
 @drawing
-@pytest.mark.physics
 def test_pictures_are_drawn_once(results: Path, tmp_path: Path) -> None:
     out = write(results, tmp_path, "variant=2").parent
     (shown,) = best_runs(collect(results, select(["task=Rope", "variant=2"], NAMES)))
@@ -387,7 +383,6 @@ def test_pictures_are_drawn_once(results: Path, tmp_path: Path) -> None:
 
 
 @drawing
-@pytest.mark.physics
 def test_pictures_of_runs_that_are_no_longer_the_best_are_replaced(tmp_path: Path) -> None:
     coarse_run(tmp_path / "results", "1", "adam", 0, 0.3)
     out = write(tmp_path / "results", tmp_path / "page").parent
@@ -399,7 +394,6 @@ def test_pictures_of_runs_that_are_no_longer_the_best_are_replaced(tmp_path: Pat
 
 
 @drawing
-@pytest.mark.physics
 def test_a_build_that_is_stopped_has_its_pictures(results: Path, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "media" / ".unfinished-killed").mkdir(parents=True)
     (tmp_path / "data").mkdir()
@@ -425,7 +419,6 @@ def test_a_build_that_is_stopped_has_its_pictures(results: Path, tmp_path: Path,
 
 
 @drawing
-@pytest.mark.physics
 def test_the_page_is_written_again_with_each_configuration(
     results: Path, tmp_path: Path, monkeypatch
 ) -> None:

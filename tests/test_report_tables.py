@@ -32,8 +32,6 @@ from plab.report.times import timing
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load, pack
 
-pytestmark = pytest.mark.whole
-
 GOLDEN = Path(__file__).parent / "golden"
 PAGE = Path(__file__).parents[1] / "docs" / "methods.md"
 README = PAGE.parents[1] / "README.md"

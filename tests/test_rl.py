@@ -39,8 +39,6 @@ from plab.sim import SimulationError
 from same_runs import KeepsAll, assert_same_numbers
 from suite import make_not_finite
 
-pytestmark = pytest.mark.physics
-
 CACHE = KeepsAll()
 
 HORIZON = 4
@@ -322,7 +320,7 @@ def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
     assert_same_numbers(run(cfg), finished["sac"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("method", METHODS)
 def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, finished, method) -> None:
     cfg = make_config(tmp_path, method)
@@ -518,7 +516,7 @@ def test_a_policy_from_outside_needs_its_module(finished: dict[str, RunResult], 
 # ---------------------------------------------------------------- learning, speed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
     """On Torus, coarse: after 200 episodes better than any of 32 random ones, with noise and without."""
     fast = ("sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10", "sim.particles_scale=0.2")

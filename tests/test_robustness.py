@@ -33,8 +33,6 @@ from plab.scene import SceneError
 from plab.targets import TargetError
 from refusals import snapshot
 
-pytestmark = pytest.mark.whole
-
 ROOT = Path(__file__).resolve().parents[1]
 DUMBBELL = (ROOT / "examples" / "own_task" / "conf" / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
 

@@ -22,8 +22,6 @@ from plab.sim import Simulator
 from refusals import refusal
 from rights import ordinary_rights
 
-pytestmark = pytest.mark.whole
-
 missing = graphics.missing_graphics()
 drawing = pytest.mark.skipif(missing is not None, reason=str(missing))
 

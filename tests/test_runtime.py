@@ -56,7 +56,6 @@ def test_taichi_does_not_tell_its_makers() -> None:
     assert subprocess.run(command, env=given, check=False).returncode == 0
 
 
-@pytest.mark.physics
 def test_a_function_is_read_once_and_errors_still_name_its_line(monkeypatch) -> None:
     start_runtime("cpu", "float32")
     read = []
@@ -114,7 +113,6 @@ def test_what_waits_to_be_collected_does_not_keep_the_count_of_fields(monkeypatc
         gc.enable()
 
 
-@pytest.mark.physics
 def test_taichis_own_kernels_forget_the_fields_of_a_runtime_that_has_ended() -> None:
     start_runtime("cpu", "float32")
     field = ti.field(ti.f32, shape=3)
@@ -141,7 +139,6 @@ def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
     assert freed == [kept]
 
 
-@pytest.mark.physics
 def test_a_simulator_that_is_there_at_the_end_says_nothing() -> None:
     script = """
 from plab.bench import workload

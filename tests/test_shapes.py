@@ -14,8 +14,6 @@ from plab.objective import target_sdf
 from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 from plab.sim import Simulator, shapes
 
-pytestmark = pytest.mark.physics
-
 STEPS = 3
 ROTATIONS = (3, 4, 5, 9, 10, 11)
 """Action components that turn the paddle and the globe."""

@@ -15,8 +15,6 @@ from plab.sim.memory import ENTRIES_MAX, batch_limit
 from plab.sim.order import curve_order, hilbert_index
 from plab.sim.storage import CHUNKS, INDEX_MASK
 
-pytestmark = pytest.mark.physics
-
 STEPS = 4
 
 

@@ -14,8 +14,6 @@ from plab.scene import sample_particles
 from plab.sim import Simulator, State
 from suite import assert_same_state, batch
 
-pytestmark = pytest.mark.physics
-
 SCENES = batch()
 STEPS = 1
 TERMS = ("density", "sdf", "contact")

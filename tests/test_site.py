@@ -13,7 +13,7 @@ import pytest
 from browsing import browsing, until
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.nightly,
     pytest.mark.skipif(find_spec("properdocs") is None, reason="the tools of the docs are not installed"),
 ]
 

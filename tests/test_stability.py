@@ -15,8 +15,6 @@ from plab.cli import bench
 from plab.config import build_scene, load_config
 from plab.scene import SceneError
 
-pytestmark = pytest.mark.physics
-
 
 @pytest.mark.parametrize("name", refusals())
 def test_what_cannot_be_simulated_is_refused(name: str) -> None:
@@ -84,6 +82,6 @@ def test_few_particles_survive(tmp_path: Path) -> None:
     assert path.with_suffix(".png").stat().st_size > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_quick_case_survives() -> None:
     assert bench.stability(["--quick", "--precision", "float32"]) == 0

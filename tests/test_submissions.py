@@ -51,8 +51,6 @@ from plab.submissions.verifying import (
     write_verification,
 )
 
-pytestmark = pytest.mark.whole
-
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)
 DIGESTS = Digests("a" * 64, "b" * 64)

@@ -27,8 +27,6 @@ from plab.submissions.schema import Submission, SubmissionError
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, read_verification
 from plab.submissions.verifying import verify as simulate_again
 
-pytestmark = pytest.mark.physics
-
 ROOT = Path(__file__).resolve().parents[1]
 COARSE = ("sim.grid_size=32", "sim.horizon=6", "sim.substeps=7", "sim.dt=2.7e-4", "sim.particles_scale=0.03")
 CARD = ROOT / "examples" / "outside_agent" / "card.yaml"
@@ -310,7 +308,7 @@ def test_policies_that_do_not_do(tmp_path: Path, told: Callable[..., str]) -> No
 # ---------------------------------------------------------------------------------------- from start to end
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_agent_from_outside_gets_to_the_leaderboard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

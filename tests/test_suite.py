@@ -16,8 +16,6 @@ from plab.demonstrations import known_actions
 from plab.problem import Problem
 from plab.scene import Scene
 
-pytestmark = pytest.mark.physics
-
 TASKS = suite_tasks()
 COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")
 # The sticks and the rope are thinner than two cells of the coarse grid: they would not hold it.
@@ -62,7 +60,7 @@ def test_the_suite_has_ten_tasks():
     assert len(TASKS) == 10 and len(SUITE_VARIANTS) == 5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_all_configurations_step_score_and_differentiate(task, device):
     batch, actions = problem(task, SUITE_VARIANTS, f"sim.device={device}")
@@ -72,7 +70,7 @@ def test_all_configurations_step_score_and_differentiate(task, device):
         assert scores.score == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("task", TASKS)
 def test_targets_are_those_that_were_published(task, device):
     """Against ``tests/target_moments.csv``, made by ``python -m plab.targets --csv``.

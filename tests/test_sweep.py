@@ -22,8 +22,6 @@ from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin
 
-pytestmark = pytest.mark.whole
-
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 
@@ -98,7 +96,7 @@ def test_a_small_experiment(seen) -> None:
     assert {cfg.method.name for cfg in seen} == {"adam", "gd", "adam_h"}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("experiment", "methods"),
     [("paper_gradient", ("adam", "gd", "adam_h")), ("paper_rl", ("sac", "td3", "ppo"))],

@@ -16,8 +16,6 @@ from plab.config import Config, load_config
 from plab.families import FAMILIES
 from plab.results import SCHEMA_VERSION, read, result_path
 
-pytestmark = pytest.mark.whole
-
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
 HERE = Path(__file__).parent
@@ -39,7 +37,7 @@ def is_complete(wanted: list[Config]) -> bool:
     return all(toy_runner.is_right(read(result_path(cfg)), cfg) for cfg in wanted)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
 @pytest.mark.parametrize("processes", [1, 2])
 def test_kills_at_random_moments_lose_and_repeat_nothing(processes: int) -> None:

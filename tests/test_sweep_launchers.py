@@ -31,8 +31,6 @@ from plab.sweep.gpus import _Worker, choose
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
 
-pytestmark = pytest.mark.physics
-
 LAUNCHERS = {
     "batch_joblib": "loky",
     "batch_submitit_local": "submitit",
@@ -278,7 +276,7 @@ def kill_a_job(sweep: subprocess.Popen, word: str, folder: Path, rng: np.random.
     return bool(computing)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the jobs' processes in /proc")
 def test_a_sweep_whose_jobs_are_killed_is_completed_by_the_same_command(
     tmp_path: Path, launcher: str

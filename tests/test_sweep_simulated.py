@@ -16,8 +16,6 @@ from plab.runners import run_batch, run_config
 from plab.sim import Simulator
 from same_runs import finished_as, stopped_at
 
-pytestmark = pytest.mark.physics
-
 COARSE = (
     "sim.grid_size=16",
     "sim.horizon=3",

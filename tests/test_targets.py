@@ -30,8 +30,6 @@ from plab.targets import (
 )
 from plab.targets.store import TargetStore
 
-pytestmark = pytest.mark.physics
-
 FILES = os.environ.get("PLAB_RELEASE_TARGETS")
 """Folder of the release's target files, if there is one."""
 
@@ -304,7 +302,7 @@ def test_release_files_may_have_small_negative_masses(tmp_path, released):
     assert np.array_equal(load_release_target(tmp_path, scene, "1"), changed)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(FILES is None, reason="PLAB_RELEASE_TARGETS names no folder with the release's files")
 def test_all_fifty_release_files_are_loaded():
     for task in suite_tasks():

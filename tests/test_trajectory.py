@@ -25,8 +25,6 @@ from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
 from same_runs import KeepsAll, assert_same_numbers
 
-pytestmark = pytest.mark.physics
-
 CACHE = KeepsAll()
 
 ITERATIONS = 4

@@ -96,19 +96,16 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr(f"{module}.load_config", coarse)
 
 
-@pytest.mark.physics
 def test_quick_start():
     assert run_page("index.md")["result"].gradient.shape == (4, 10, 6)
 
 
-@pytest.mark.physics
 @pytest.mark.usefixtures("small")
 def test_readme():
     names = run_page("../README.md")
     assert names["result"].gradient.shape == (4, 10, 6) and names["envs"].num_envs == 64
 
 
-@pytest.mark.physics
 @pytest.mark.usefixtures("small")
 def test_environments():
     """With four environments instead of 64 or 16, and one update of the agent."""
@@ -121,7 +118,6 @@ def test_environments():
     assert names["done"].reward.shape == (4,) and names["done"].truncated
 
 
-@pytest.mark.physics
 @pytest.mark.usefixtures("small")
 def test_results(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
@@ -131,7 +127,6 @@ def test_results(monkeypatch):
     assert len(names["run"].iterations) == 2
 
 
-@pytest.mark.physics
 @pytest.mark.usefixtures("small")
 def test_rendering():
     pytest.importorskip("k3d")
@@ -161,7 +156,6 @@ def plab(folder: Path, *words: str, path: Path | None = None) -> subprocess.Comp
 SEARCH = ("--config-dir", str(METHOD / "conf"), "method=random_search", *COARSE, "method.iterations=4")
 
 
-@pytest.mark.physics
 def test_a_method_of_ones_own(tmp_path):
     first = plab(tmp_path, "plab.run", *SEARCH)
     assert (first.returncode, first.stderr) == (0, "")
@@ -177,7 +171,6 @@ def test_a_method_of_ones_own(tmp_path):
     assert refused.returncode == 2 and refused.stderr == "plab: method.spread must be positive, not 0\n"
 
 
-@pytest.mark.physics
 def test_an_interrupted_search_goes_on(tmp_path):
     def result(folder: str) -> RunResult:
         run_config(
@@ -195,7 +188,6 @@ def test_an_interrupted_search_goes_on(tmp_path):
     assert parts.evaluation == whole.evaluation
 
 
-@pytest.mark.physics
 @pytest.mark.parametrize("launcher", ["batch", "batch_joblib", "batch_submitit_local"])
 def test_a_sweep_over_a_method_of_ones_own(tmp_path, launcher):
     """In this process, and in others, which have to find the module, too."""
@@ -241,7 +233,7 @@ def test_the_changes_for_a_manipulator_fit_the_source(tmp_path):
     assert done.stdout == "('radius', 'r')\n"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_manipulator_of_ones_own(tmp_path):
     source = copy_with_the_disc(tmp_path)
     script = tmp_path / "disc.py"

@@ -34,7 +34,6 @@ from plab.view import Viewer, show
 msgpack = pytest.importorskip("msgpack")
 viewer = pytest.importorskip("plab.view.page")
 
-pytestmark = pytest.mark.physics
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 ACTIONS = np.full((3, 6), 0.5)

@@ -86,7 +86,6 @@ def test_elsewhere_than_on_a_terminal_nothing_watches_the_compiler(capsys) -> No
     assert capsys.readouterr().out == "Rope 8/8, started, loss 2\n"
 
 
-@pytest.mark.physics
 def test_kernels_are_told_when_they_are_compiled_and_cost_nothing_after() -> None:
     from taichi.lang import kernel_impl
 
@@ -111,7 +110,6 @@ def test_kernels_are_told_when_they_are_compiled_and_cost_nothing_after() -> Non
     assert all("launch_kernel" not in vars(kernel._primal) for kernel in kernels)
 
 
-@pytest.mark.physics
 def test_the_bar_of_a_run_says_what_is_compiled_and_the_contact_model(tmp_path, screen, capsys) -> None:
     argv = ["task=Rope", *COARSE, "sim.horizon=2", "method.iterations=2", f"results_dir={tmp_path}"]
     assert main(argv) == 0
@@ -201,7 +199,6 @@ def test_the_full_run_of_ones_own_task_keeps_the_folder() -> None:
     assert second.endswith(f"plab.run task=Dumbbell --config-dir {own}")
 
 
-@pytest.mark.physics
 def test_the_last_lines_of_a_real_run(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     argv = ["task=Rope", *COARSE, "sim.horizon=2", "method.iterations=1"]
@@ -217,7 +214,6 @@ def test_the_last_lines_of_a_real_run(tmp_path, capsys, monkeypatch) -> None:
 # ------------------------------------------------------------------------------------------ what a kill keeps
 
 
-@pytest.mark.physics
 def test_the_first_iteration_is_kept_at_once(tmp_path, monkeypatch, capsys) -> None:
     kept: list[int] = []
     record = RunFile.record

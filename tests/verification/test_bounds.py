@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-pytestmark = [pytest.mark.physics, pytest.mark.slow]
+pytestmark = [pytest.mark.nightly]
 
 SCRIPT = """
 import numpy as np

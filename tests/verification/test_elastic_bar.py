@@ -11,8 +11,6 @@ from free_bodies import BAR_LENGTH, GRID, bar, index
 from plab.sim import Simulator, State
 from suite import DEVICE
 
-pytestmark = pytest.mark.physics
-
 SPEED = 1e-3
 """Velocity amplitude: strains of 1e-5, so that the bar is linear."""
 
@@ -58,7 +56,7 @@ def test_the_frequency_converges_at_second_order(errors: dict[int, float]) -> No
     assert rate > 1.8, f"order {rate:.2f}, errors {errors}"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_frequency_goes_on_to_converge(errors: dict[int, float]) -> None:
     finest = refined_error(64)
     rate = math.log2(abs(errors[32] / finest))

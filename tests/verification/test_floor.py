@@ -21,8 +21,6 @@ from free_bodies import (
 )
 from plab.sim import Simulator
 
-pytestmark = pytest.mark.physics
-
 TOTAL = MASS * START.shape[1]
 SETTLED = 500
 """Substeps after which vibrations have died out."""

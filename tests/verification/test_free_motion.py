@@ -20,8 +20,6 @@ from free_bodies import (
 )
 from plab.sim import Simulator
 
-pytestmark = pytest.mark.physics
-
 IN_SPACE = [index(name) for name in MATERIALS]
 
 

@@ -19,8 +19,6 @@ from plab.sim import Simulator
 from suite import DEVICE
 from touched_bodies import ACTIONS, MATERIAL, TOUCHING, Point, X, components, differences, put, start
 
-pytestmark = pytest.mark.physics
-
 SIZES = 10.0 ** -np.arange(2.0, 7.1, 0.5)
 BOTTOM = 1e-6 if DEVICE == "cpu" else 2e-6
 """Largest relative error at the bottom of the V; on CUDA losses differ by rounding from run to run."""

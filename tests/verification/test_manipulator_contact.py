@@ -11,8 +11,6 @@ import touched_bodies as tb
 from plab.sim import Simulator, State
 from touched_bodies import ACTIONS, BATCH, KINDS, SCENE, TOUCHING, Point, components, put, start
 
-pytestmark = pytest.mark.physics
-
 PENETRATION = 0.75
 """Deepest that a particle gets into a manipulator that presses, in cells."""
 

@@ -9,8 +9,6 @@ from free_bodies import DT, MATERIALS, SCENES, START, at_rest, index, kirchhoff_
 from plab.scene import Scene
 from plab.sim import Simulator
 
-pytestmark = pytest.mark.physics
-
 NORM_SHIFT = 1e-8
 """Shift under the root of the deviator's norm, see docs/physics.md."""
 

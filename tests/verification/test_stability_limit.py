@@ -13,8 +13,6 @@ from plab.scene import Body
 from plab.sim import Simulator, State
 from suite import DEVICE
 
-pytestmark = pytest.mark.physics
-
 GRID, DT, SUBSTEPS, STEPS = 16, 2e-4, 4, 6
 AMPLITUDE = 1e-9
 RATIOS = (0.9, 0.99, 1.01, 1.05)
