@@ -1,4 +1,4 @@
-"""The folder of what plab can make again: simulated targets, databases of results, copies of bitcode."""
+"""The folder of what plab can make again: simulated targets, indices of results, copies of bitcode."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ THINGS: Mapping[str, Sequence[str]] = {
 COLUMNS = ("what", "source", "cpu_s", "cpu_max_s", "wall_s")
 
 _FRESH = "load, first time"
-"""What is measured without a database."""
+"""What is measured without an index."""
 
 
 def rows(
@@ -79,7 +79,7 @@ def measure(
     places = [folder / f"source{number}" for number in range(len(sources))]
     for source, place in zip(sources, places, strict=True):
         _set_up(folder, place)
-        # Whichever thing is the first finds a database.
+        # Whichever thing is the first finds an index.
         _timed(("-c", _LOAD), place, source)
     for what in things:
         taken: dict[Path, list[tuple[float, float]]] = {source: [] for source in sources}

@@ -1,10 +1,10 @@
-"""Time and memory that thousands of result files take, with and without the database, and from an archive.
+"""Time and memory that thousands of result files take, with and without the index, and from an archive.
 
     python -m plab.bench.results --runs 10000 --rows 5
     python -m plab.bench.results --runs 1000 --archive
 
 writes so many small result files to a folder that is removed afterwards, and loads them: for the first time,
-again, after one of them has changed. Status, tables and a query follow. Databases go to that folder, too. At
+again, after one of them has changed. Status, tables and a query follow. The index goes to that folder, too. At
 the end it says how much memory all of this took.
 """
 
@@ -163,7 +163,7 @@ def measure(runs: int, rows: int, packed: bool) -> Iterator[dict[str, object]]:
         Path(changed).touch()
         yield timed("one changed", lambda: load(results))
         yield timed("with a key", lambda: load(results, keys=["method.family"]))
-        yield timed("without database", lambda: load(results, database=False))
+        yield timed("without index", lambda: load(results, index=False))
         yield timed("scores", lambda: scores(results, every, ["method.lr"], ["score"])[0])
         yield timed("sql", lambda: query(results, "select task, avg(score) from runs group by task")[1])
         yield timed("plab.status", lambda: survey(results, every).runs)

@@ -62,7 +62,7 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
         dict(zip(columns, map(str, own), strict=True))
         for own in runs.table[list(columns)].itertuples(index=False, name=None)
     ]
-    found = map(rows_on_axes, runs.configs, read_curves(runs.source, runs.table["path"]))
+    found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]))
     return list(zip(names, found, strict=True))
 
 
@@ -75,8 +75,7 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> 
     """Return the iterations of a run that has been read as :func:`load_series` does."""
     rows = {str(name): np.asarray(iterations[name]) for name in iterations}
     sim, known = config["sim"], known_family(config["method"]["family"])
-    own = [rows[name] for name in BUDGETS if name in rows]
-    simulated = np.sum(own, axis=0) if own else rows["steps"] + sim["horizon"]
+    simulated = np.sum([rows[name] for name in BUDGETS], axis=0)
     if known is not None and known.ranking == "score":
         best = np.maximum.accumulate(rows["score"])
     else:

@@ -3,9 +3,9 @@
 The layout is described in docs/developers/format.md. A run that is under way keeps its state in
 ``<name>.partial.h5``, rewritten as a whole now and then: a process killed at any moment leaves the previous,
 readable version behind, from which the same command resumes. Finished runs can be packed into archives, which
-load like folders; ``python -m plab.results`` packs, checks and shows scores. What is loaded is kept in a
-database (``database.py``), for the next time and for SQL. This package imports neither torch nor taichi, so
-that reading results is quick.
+load like folders; ``python -m plab.results`` packs, checks and shows scores. Loaded rows are kept in an index
+(``index.py``); DuckDB answers SQL. This package imports neither torch nor taichi, so that reading results is
+quick.
 """
 
 from importlib import import_module
@@ -31,9 +31,8 @@ from plab.results.schema import (
 if TYPE_CHECKING:
     from plab.results.archive import pack, unpack
     from plab.results.checking import Fault, check
-    from plab.results.curves import read_curves
-    from plab.results.database import Row
-    from plab.results.loading import load, rows
+    from plab.results.index import Row
+    from plab.results.loading import load, read_curves, rows
     from plab.results.query import connect
 
 __all__ = [
@@ -67,7 +66,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import what is for many results when it is asked for: a run does without it, and without pandas."""
-    parts = ("database", "loading", "archive", "checking", "curves", "query")
+    parts = ("index", "loading", "archive", "checking", "query")
     for part in parts if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")
         if name in module.__all__:

@@ -130,7 +130,7 @@ def unpack(archive: str | Path, folder: str | Path) -> tuple[int, int]:
     Raises:
         ResultsError: If the archive cannot be read or a file cannot be written.
     """
-    found, unreadable = rows(archive, database=False)
+    found, unreadable = rows(archive, index=False)
     if unreadable:
         raise unreadable[0]
     written = 0

@@ -148,7 +148,7 @@ def _iterations(run: RunResult) -> Iterator[str]:
     wanted = common if family is None else (*common, *family.columns)
     # What further columns mean that a family outside plab has, only its record says.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
-    if missing := [name for name in wanted if name not in table and name not in BUDGETS]:
+    if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
     if strange := [name for name in table if table[name].dtype.kind not in "iuf"]:

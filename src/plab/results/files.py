@@ -8,7 +8,6 @@ import io
 import itertools
 import json
 import math
-import mmap
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -21,12 +20,9 @@ import numpy as np
 
 from plab.config.selection import lookup
 from plab.reading import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
-from plab.results.hdf5 import array, attributes, check_heaps, columns, groups, numbers, take, tree
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
-    BUDGETS,
     COLUMNS,
-    OLD_ARCHIVE_SUFFIX,
     SCHEMA_VERSION,
     NewerSchemaError,
     ResultsError,
@@ -40,6 +36,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "cause",
+    "columns_of",
+    "config_of",
     "encode",
     "explained",
     "make_folder",
@@ -51,6 +49,7 @@ __all__ = [
     "remove_folders",
     "replace_file",
     "split_archive",
+    "summary_of",
     "write",
     "zipped",
 ]
@@ -153,23 +152,14 @@ def read(path: str | Path) -> RunResult:
     """
     path = Path(path)
     with opened(path) as file:
-        own, best, there = attributes(file), attributes(file, "best"), groups(file, "/")
+        summary = summary_of(file)
         return RunResult(
-            config=stored_config(take(own, "config", str)),
-            config_hash=stored_hash(take(own, "config_hash", str)),
-            status=take(own, "status", str),
-            message=take(own, "message", str),
-            provenance=_scalars(attributes(file, "provenance")),
-            wall_time=numbers(attributes(file, "wall_time")),
-            columns=columns(file, "iterations"),
-            best_actions=array(file, "best", "actions"),
-            best_iteration=take(best, "iteration", int),
-            best_loss=take(best, "loss", float),
-            evaluation=numbers(attributes(file, "evaluation")),
-            # Files of plab 0.1 have none.
-            labels=_scalars(attributes(file, "labels")) if "labels" in there else {},
-            masses={name: _read_sparse(file, f"mass/{name}") for name in groups(file, "mass")},
-            resume=tree(file, "resume") if "resume" in there else None,
+            config=config_of(file),
+            **{name: summary[name] for name in _SUMMARY},
+            columns=columns_of(file),
+            best_actions=_numbers(file, "best/actions") if "best/actions" in file else None,
+            masses={name: _sparse(file, f"mass/{name}") for name in _group(file, "mass")},
+            resume=_tree(_group(file, "resume"), 0) if "resume" in file else None,
             path=path,
         )
 
@@ -191,13 +181,10 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
 
     path = Path(path)
     with opened(path) as file:
-        config = stored_config(take(attributes(file, names=("config",)), "config", str))
-        table = pd.DataFrame(columns(file, "iterations"))
-        if missing := [name for name in COLUMNS if len(table) and name not in (*table, *BUDGETS)]:
+        table = pd.DataFrame(columns_of(file))
+        if missing := [name for name in COLUMNS if len(table) and name not in table]:
             raise ValueError(f"iterations lack {missing[0]}")
-        for name in ("horizon", "substeps"):
-            take(config["sim"], name, int)
-        return config, table
+        return config_of(file), table
 
 
 def encode(result: RunResult, *, compress: bool) -> bytes:
@@ -205,27 +192,19 @@ def encode(result: RunResult, *, compress: bool) -> bytes:
 
     The target is left out if it came from a file of the user's: whose it is and who may have it is not known.
     """
-    options = {"compression": "gzip", "shuffle": True} if compress else {}
+    options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if compress else {}
     # A name of its own: Ctrl-C inside h5py can leave the previous image open, under its name.
     name = f"image{next(_images)}"
     with h5py.File(name, "w", driver="core", backing_store=False, libver=_COMPACT) as file:
         file.attrs["format"] = "plab-run"
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["config"] = json.dumps(result.config)
-        file.attrs["config_hash"] = result.config_hash
-        file.attrs["status"] = result.status
-        file.attrs["message"] = result.message
-        for name in ("provenance", "wall_time", "evaluation", "labels"):
-            file.create_group(name).attrs.update(getattr(result, name))
-        table = file.create_group("iterations")
-        table.attrs["columns"] = list(result.columns)
+        summary = {name: getattr(result, name) for name in _SUMMARY}
+        file.attrs["summary"] = json.dumps(summary | {"columns": list(result.columns)}, default=_plain)
         for column, values in result.columns.items():
-            table.create_dataset(column, data=values, **options)
-        best = file.create_group("best")
-        best.attrs["iteration"] = result.best_iteration
-        best.attrs["loss"] = result.best_loss
+            file.create_dataset(f"iterations/{column}", data=values, **options)
         if result.best_actions is not None:
-            best.create_dataset("actions", data=result.best_actions, **options)
+            file.create_dataset("best/actions", data=result.best_actions, **options)
         masses = file.create_group("mass")
         given = isinstance(lookup(result.config, "targets.source"), str)
         for name, mass in result.masses.items():
@@ -256,15 +235,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     inside = split_archive(path)
     with explained(path):
         if inside is None:
-            found = regular_file(path)
-            if path.name.endswith(OLD_ARCHIVE_SUFFIX):
-                raise ResultsError(
-                    f"{path} was packed by an older plab: unpack it with a zip program, it holds result files"
-                )
-            # Of nothing no memory is mapped.
-            if found.st_size:
-                with path.open("rb") as raw, mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                    check_heaps(content)
+            regular_file(path)
             with h5py.File(path, "r") as file:
                 yield _of_this_version(file, path)
             return
@@ -289,7 +260,6 @@ def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 def opened_image(image: bytes, path: Path) -> Iterator[h5py.File]:
     """Open the bytes of a run, as :func:`opened` does a file; ``path`` is for messages."""
     with explained(path):
-        check_heaps(image)
         with h5py.File(h5py.h5f.open_file_image(image)) as file:
             yield _of_this_version(file, path)
 
@@ -312,13 +282,10 @@ def explained(path: Path) -> Iterator[None]:
 
 
 def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
-    if file.id.get_create_plist().get_sizes() != (8, 8):
-        raise ValueError("its addresses have another length")
-    own = attributes(file, names=("format", "schema_version"))
-    if own.get("format") != "plab-run" or not isinstance(own["format"], str):
+    if file.attrs.get("format") != "plab-run":
         raise ResultsError(f"{path} is not a plab result file")
-    version = own.get("schema_version")
-    if type(version) is not int:
+    version = file.attrs.get("schema_version")
+    if not isinstance(version, int | np.integer):
         raise ValueError("its schema version is no number")
     if version > SCHEMA_VERSION:
         raise NewerSchemaError(
@@ -330,26 +297,154 @@ def _of_this_version(file: h5py.File, path: Path) -> h5py.File:
     return file
 
 
-def _scalars(values: dict[str, Any]) -> dict[str, Any]:
-    if strange := [name for name, value in values.items() if not isinstance(value, str | int | float)]:
-        raise ValueError(f"{strange[0]} is neither number nor text")
-    if "resumed" in values:
-        take(values, "resumed", int)
-    return values
+def config_of(file: h5py.File) -> dict[str, Any]:
+    """Return the configuration of an open run; ValueError if it has none."""
+    return stored_config(_text(file, "config"))
 
 
-def _read_sparse(file: h5py.File, group: str) -> np.ndarray:
-    shape = np.asarray(attributes(file, group, ("shape",))["shape"])
-    index, values = array(file, group, "index"), array(file, group, "value")
-    if index is None or values is None or index.shape != values.shape or index.ndim != 1:
-        raise ValueError(f"{group} is no sparse tensor")
+def summary_of(file: h5py.File) -> dict[str, Any]:
+    """Return everything that an open run holds beside its configuration and its arrays, by the names of
+    :class:`RunResult`; ``columns`` lists the columns of the iterations.
+
+    Raises:
+        ValueError: If a part is missing or of another type.
+    """
+    summary = json.loads(_text(file, "summary"))
+    if not isinstance(summary, dict):
+        raise ValueError("its summary is no table")
+    for name, kind in (_SUMMARY | {"columns": list}).items():
+        value = summary.get(name)
+        if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
+            raise ValueError(f"{name} in its summary is {value!r:.80}")
+    for name in ("wall_time", "evaluation"):
+        if strange := [key for key, value in summary[name].items() if not isinstance(value, int | float)]:
+            raise ValueError(f"{name}.{strange[0]} in its summary is no number")
+    for name in ("provenance", "labels"):
+        if strange := [
+            key for key, value in summary[name].items() if not isinstance(value, str | int | float)
+        ]:
+            raise ValueError(f"{name}.{strange[0]} in its summary is neither number nor text")
+    if not all(isinstance(name, str) for name in summary["columns"]):
+        raise ValueError("columns in its summary is no list of names")
+    stored_hash(summary["config_hash"])
+    return summary
+
+
+def columns_of(file: h5py.File) -> dict[str, np.ndarray]:
+    """Return the columns of the iterations of an open run, shape [iteration] each; ValueError if one is
+    missing, holds no numbers, or is of another length than the others."""
+    group, names = _group(file, "iterations"), summary_of(file)["columns"]
+    found = {name: _numbers(group, name) for name in names}
+    if len({values.shape for values in found.values()}) > 1 or any(v.ndim != 1 for v in found.values()):
+        raise ValueError("the columns of iterations differ in length")
+    return found
+
+
+_SUMMARY: dict[str, type] = {
+    "config_hash": str,
+    "status": str,
+    "message": str,
+    "provenance": dict,
+    "wall_time": dict,
+    "best_iteration": int,
+    "best_loss": float,
+    "evaluation": dict,
+    "labels": dict,
+}
+"""Fields of :class:`RunResult` in the attribute ``summary``, and their types."""
+
+_DEPTH = 16
+"""Maximum number of nested groups of a resume state."""
+
+_RATIO, _SMALL = 1_100, 1 << 16
+"""Maximum number of bytes that a stored byte of a dataset may stand for (deflate reaches 1,032), and the size
+below which it may be anything."""
+
+
+def _plain(value: Any) -> Any:
+    """Return a NumPy scalar as a Python number, for JSON."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is no value of a summary")
+
+
+def _text(file: h5py.File, name: str) -> str:
+    value = file.attrs.get(name)
+    if not isinstance(value, str):
+        raise ValueError(f"it has no {name}")
+    return value
+
+
+def _member(file: h5py.Group, path: str) -> h5py.Group | h5py.Dataset:
+    """Return a group or dataset of this very file: no link leads to another file."""
+    place: Any = file
+    for part in path.split("/"):
+        # KeyError if there is none.
+        if not isinstance(place.get(part, getlink=True), h5py.HardLink):
+            raise ValueError(f"{path} is a link to another place")
+        place = place[part]
+    return place
+
+
+def _group(file: h5py.Group, path: str) -> h5py.Group | dict[str, Any]:
+    if path not in file:
+        return {}
+    found = _member(file, path)
+    if not isinstance(found, h5py.Group):
+        raise ValueError(f"{path} is no group")
+    return found
+
+
+def _dataset(file: h5py.Group, path: str) -> h5py.Dataset:
+    """Return a dataset whose values are in this file, and are no more than its bytes can stand for."""
+    found = _member(file, path)
+    if not isinstance(found, h5py.Dataset) or found.shape is None:
+        raise ValueError(f"{path} is no dataset")
+    if found.is_virtual or found.external:
+        raise ValueError(f"{path} has its numbers in another file")
+    if found.nbytes > min(LARGEST, _SMALL + _RATIO * found.id.get_storage_size()):
+        raise ValueError(f"{path} claims {found.nbytes} bytes, which the file does not hold")
+    return found
+
+
+def _numbers(file: h5py.Group, path: str) -> np.ndarray:
+    found = _dataset(file, path)
+    if found.dtype.kind not in "biufc":
+        raise ValueError(f"{path} holds no numbers")
+    return np.asarray(found[()])
+
+
+def _tree(group: h5py.Group, depth: int) -> dict[str, Any]:
+    """Return all that is in a group: nested dictionaries of arrays of numbers and of texts."""
+    if depth > _DEPTH:
+        raise ValueError(f"it has more than {_DEPTH} groups in each other")
+    found: dict[str, Any] = {}
+    for name in group:
+        member = _member(group, name)
+        if isinstance(member, h5py.Group):
+            found[name] = _tree(member, depth + 1)
+        elif h5py.check_string_dtype(member.dtype) is None:
+            found[name] = _numbers(group, name)
+        elif member.shape == ():
+            found[name] = _dataset(group, name).asstr()[()]
+        else:
+            raise ValueError(f"{name} is a list of texts")
+    return found
+
+
+def _sparse(file: h5py.File, path: str) -> np.ndarray:
+    """Return a mass tensor, shape [n, n, n]."""
+    index, values = _numbers(file, f"{path}/index"), _numbers(file, f"{path}/value")
+    shape = np.asarray(_group(file, path).attrs["shape"])
+    if index.shape != values.shape or index.ndim != 1:
+        raise ValueError(f"{path} is no sparse tensor")
     if shape.ndim != 1 or shape.dtype.kind not in "iu" or index.dtype.kind not in "iu" or (shape < 0).any():
-        raise ValueError(f"{group} has no shape")
+        raise ValueError(f"{path} has no shape")
     lengths = [int(size) for size in shape]
     if (size := math.prod(lengths)) * values.itemsize > LARGEST:
-        raise ValueError(f"{group} claims {size} entries")
+        raise ValueError(f"{path} claims {size} entries")
     if len(index) and not 0 <= index.min() <= index.max() < size:
-        raise ValueError(f"{group} has entries outside of its shape")
+        raise ValueError(f"{path} has entries outside of its shape")
     flat = np.zeros(size, dtype=values.dtype)
     flat[index] = values
     return flat.reshape(lengths)

@@ -7,8 +7,8 @@ import stat
 import warnings
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,56 +18,59 @@ import pandas as pd
 
 from plab.config.selection import lookup
 from plab.reading import member_bytes
-from plab.results.database import COLUMNS, Database, Row
-from plab.results.files import explained, opened, opened_archive, opened_image, split_archive
-from plab.results.hdf5 import attributes, columns, length, numbers, take
+from plab.results.files import (
+    columns_of,
+    config_of,
+    explained,
+    opened,
+    opened_archive,
+    opened_image,
+    split_archive,
+    summary_of,
+)
+from plab.results.index import COLUMNS, File, Row, indexed_rows
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
-    OLD_ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
     SUFFIX,
     ResultsError,
     counts_last,
     final_path,
     last_score,
-    stored_config,
-    stored_hash,
 )
-from plab.results.store import File
-from plab.results.workers import each
 
 __all__ = [
     "Row",
-    "counting_files",
     "load",
     "members",
+    "read_curves",
     "read_each",
     "read_rows",
     "readable_rows",
     "rows",
     "run_files",
     "sources_of",
-    "up_to_date",
     "warn_of",
 ]
 
 T = TypeVar("T")
 
-_SUFFIXES = (SUFFIX, ARCHIVE_SUFFIX, OLD_ARCHIVE_SUFFIX)
+Curves = dict[str, np.ndarray]
+"""Columns of a run's iterations, shape [iteration] each."""
 
-_LOOKS = 3
-"""How often a folder is looked through at most while runs end in it."""
+_SUFFIXES = (SUFFIX, ARCHIVE_SUFFIX)
+
+_ATTEMPTS = 3
+"""Maximum number of times that a folder is listed while runs end in it."""
 
 _ALIKE = ("device", "precision", "batch", "plab", "git_commit")
 
 _ORIGIN = {"started": "start_time"} | {name: name for name in _ALIKE}
 """Column to attribute of the group ``provenance``."""
 
-_NAMES = frozenset(_ORIGIN.values())
-
 
 def load(
-    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, database: bool = True
+    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
 ) -> pd.DataFrame:
     """Load results, a row per run.
 
@@ -78,7 +81,7 @@ def load(
     Args:
         source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
         keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
-        database: Take rows of unchanged files from the folder's database, and keep it up to date.
+        index: Take rows of unchanged files from the folder's index, and keep it up to date.
 
     Returns:
         Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
@@ -92,7 +95,7 @@ def load(
     """
     if isinstance(keys, str):
         raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
-    found, unreadable = rows(source, database=database)
+    found, unreadable = rows(source, index=index)
     warn_of(unreadable)
     table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
     return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
@@ -106,14 +109,14 @@ def warn_of(unreadable: Sequence[ResultsError]) -> None:
 
 
 def rows(
-    source: str | Path | Sequence[str | Path] = "results", *, database: bool = True
+    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
 ) -> tuple[list[Row], list[ResultsError]]:
     """Return the rows of :func:`load` with their configurations, and what could not be read.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
-    entries = [entry for root in sources_of(source) for entry in _all_rows(root, database)]
+    entries = [entry for root in sources_of(source) for entry in _all_rows(root, index)]
     found = [entry for entry in entries if isinstance(entry, Row)]
     return _without_repetitions(found), [entry for entry in entries if isinstance(entry, ResultsError)]
 
@@ -141,17 +144,31 @@ def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
     return [Path(source)] if isinstance(source, str | Path) else list(map(Path, source))
 
 
-@contextmanager
-def up_to_date(root: Path) -> Iterator[Database]:
-    """Open the database of a folder, and read the files that it does not know."""
-    for left in reversed(range(_LOOKS)):
-        with closing(Database(root, counting_files(root))) as known:
-            known.take(each(_read, known.changed))
-            if not known.missed or not left:
-                yield known
-                return
-            # Where a partial file was, there is a final one now; the others need not be read again.
-            known.save()
+def read_curves(paths: Iterable[str | Path]) -> list[Curves]:
+    """Read the iterations of many runs.
+
+    Args:
+        paths: The runs' files or places in archives, as :func:`plab.results.load` gives them.
+
+    Returns:
+        The columns of each run, in the order of ``paths``.
+
+    Raises:
+        ResultsError: If one cannot be read.
+    """
+    wanted = list(map(str, paths))
+    archives = dict.fromkeys(inside[0] for path in wanted if (inside := split_archive(Path(path))))
+    found: dict[str, Curves] = {}
+    asked = set(wanted)
+    for archive in archives:
+        # An archive is unpacked once for all of its runs.
+        for entry in read_each(archive, lambda file, place: (str(place), columns_of(file))):
+            if not isinstance(entry, ResultsError) and entry[0] in asked:
+                found[entry[0]] = entry[1]
+    for path in asked - found.keys():
+        with opened(Path(path)) as file:
+            found[path] = columns_of(file)
+    return [found[path] for path in wanted]
 
 
 def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
@@ -191,7 +208,7 @@ def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
     yield from ((path, os.lstat(path)) for path in sorted(closed))
 
 
-def counting_files(root: Path) -> list[File]:
+def _counting_files(root: Path) -> list[File]:
     """Return the files below a folder but for what is left of runs that have finished since."""
     files = list(run_files(root))
     partial = [path for path, _ in files if path.name.endswith(PARTIAL_SUFFIX)]
@@ -237,19 +254,20 @@ def members(archive: zipfile.ZipFile) -> list[str]:
 # ---------------------------------------------------------------------------------------------------- details
 
 
-def _all_rows(root: Path, from_database: bool) -> Iterator[Row | ResultsError]:
-    """Yield the rows of all files below a folder, or of one file, from the database where it knows them."""
-    if not from_database:
-        for entries in each(_read, [path for path, _ in counting_files(root)]):
-            yield from entries or ()
-        return
-    with up_to_date(root) as known:
-        known.save()
-        yield from known.rows()
+def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
+    """Yield the rows of all files below a folder, or of one file, from the index where it has them."""
+    for left in reversed(range(_ATTEMPTS)):
+        files = _counting_files(root)
+        entries = indexed_rows(root, files, _read) if index else [_read(path) for path, _ in files]
+        # A run that ended meanwhile has a final file in place of its partial one.
+        if None not in entries or not left:
+            break
+    for rows in entries:
+        yield from rows or ()
 
 
 def _read(path: Path) -> list[Row | ResultsError] | None:
-    """Return what a file holds, None if it is gone: a run that ends removes its partial file, any moment."""
+    """Return the rows of a file, None if it is gone: a run that ends removes its partial file."""
     entries = list(read_rows(path))
     return entries if os.path.lexists(path) else None
 
@@ -275,28 +293,27 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 
 def _row(file: h5py.File, path: Path) -> Row:
-    """Return the row of an open file, from its attributes; of its arrays it reads the last score alone."""
-    own, best, origin = attributes(file), attributes(file, "best"), attributes(file, "provenance", _NAMES)
-    config = stored_config(take(own, "config", str))
-    evaluation = numbers(attributes(file, "evaluation"))
-    phases = numbers(attributes(file, "wall_time"))
+    """Return the row of an open file."""
+    config, summary = config_of(file), summary_of(file)
+    evaluation, phases, origin = summary["evaluation"], summary["wall_time"], summary["provenance"]
+    names = summary["columns"]
     known = {
         "task": config["task"]["name"],
         "variant": str(config["variant"]),
         "method": config["method"]["name"],
         "seed": config["seed"],
-        "status": take(own, "status", str),
-        "message": take(own, "message", str),
-        "iterations": length(file, "iterations"),
-        "best_iteration": take(best, "iteration", int),
-        "best_loss": take(best, "loss", float),
+        "status": summary["status"],
+        "message": summary["message"],
+        "iterations": len(file[f"iterations/{names[0]}"]) if names else 0,
+        "best_iteration": summary["best_iteration"],
+        "best_loss": summary["best_loss"],
         "seconds": float(sum(phases.values())),
-        "config_hash": stored_hash(take(own, "config_hash", str)),
+        "config_hash": summary["config_hash"],
         "path": str(path),
     } | {name: origin.get(key, np.nan) for name, key in _ORIGIN.items()}
     values = {name: known.get(name, evaluation.get(name, np.nan)) for name in COLUMNS}
     values |= {name: value for name, value in evaluation.items() if name not in values}
     values["score_best"] = values["score"]
     if evaluation and counts_last(config):
-        values["score"] = last_score(columns(file, "iterations"))
+        values["score"] = last_score(columns_of(file))
     return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)

@@ -1,21 +1,22 @@
-"""Questions to the database of results: SQL, and tables of runs with their scores."""
+"""SQL queries over results, and tables of runs with their scores."""
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from plab.config.selection import Selection, SelectionError, lookup
 from plab.errors import PlabError
-from plab.results.curves import add_iterations
-from plab.results.database import Row, tables_of
-from plab.results.loading import readable_rows, sources_of, up_to_date, warn_of
+from plab.results.index import COLUMNS, Row
+from plab.results.loading import read_curves, readable_rows, sources_of, warn_of
 from plab.results.schema import ResultsError
+
+if TYPE_CHECKING:
+    import duckdb
 
 __all__ = ["QueryError", "connect", "query", "scores"]
 
@@ -26,15 +27,15 @@ class QueryError(PlabError, ValueError):
 
 def connect(
     source: str | Path | Sequence[str | Path] = "results", *, iterations: bool = False
-) -> sqlite3.Connection:
-    """Return the tables of results, for SQL and pandas, up to date and only for reading.
+) -> duckdb.DuckDBPyConnection:
+    """Return an in-memory DuckDB database with the tables of docs/results.md; result files are only read.
 
     Args:
         source: A folder, an archive, a single result file, or several of them.
-        iterations: Add the table ``iterations``, which takes longer.
+        iterations: Add the table ``iterations``, for which every file is opened.
 
     Returns:
-        A connection with the tables of docs/results.md; close it when it is done with.
+        A connection; ``connection.sql("select ...").df()`` is a pandas table.
 
     Raises:
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
@@ -47,7 +48,7 @@ def connect(
 def query(
     source: str | Path | Sequence[str | Path], sql: str
 ) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    """Answer an SQL query to the tables of :func:`connect`.
+    """Answer an SQL query over the tables of :func:`connect`.
 
     Returns:
         Names of the columns, the rows, and what could not be read, hence is not in them.
@@ -56,16 +57,24 @@ def query(
         QueryError: If it is no query, or wrong.
         ResultsError: As for :func:`connect`.
     """
+    import duckdb
+
     sources = sources_of(source)
     try:
-        try:
-            return _answer(sources, sql, iterations=False)
-        except sqlite3.OperationalError as error:
-            if str(error) != _NO_ITERATIONS:
-                raise
-            return _answer(sources, sql, iterations=True)
-    except (sqlite3.Error, sqlite3.Warning) as error:
-        raise QueryError(_explained(" ".join(str(error).split()))) from None
+        statements = duckdb.extract_statements(sql)
+        kinds = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+        if len(statements) != 1 or statements[0].type not in kinds:
+            raise QueryError(
+                'write one select, such as "select task, score from runs": results are only read'
+            )
+        connection, unreadable = _connected(sources, "iterations" in sql.lower())
+        with connection:
+            answer = connection.execute(sql)
+            return [column[0] for column in answer.description], answer.fetchall(), unreadable
+    except duckdb.CatalogException as error:
+        raise QueryError(f"{_one_line(error)}; there are {', '.join(_TABLES)}") from None
+    except duckdb.Error as error:
+        raise QueryError(_one_line(error)) from None
 
 
 def scores(
@@ -117,61 +126,84 @@ _NAMES = ("task", "variant", "method", "seed")
 _SETTINGS = {"protocol": "protocol.name", "targets": "targets.source"}
 """Columns to keys of the configuration: runs that differ in them are not to be pooled."""
 
-_NO_ITERATIONS = "no such table: iterations"
-
-_TABLES = "runs, config, evaluations, times and iterations"
-
-_READING = {
-    sqlite3.SQLITE_SELECT,
-    sqlite3.SQLITE_READ,
-    sqlite3.SQLITE_FUNCTION,
-    sqlite3.SQLITE_RECURSIVE,
+_TABLES = {
+    "runs": ["run", *COLUMNS, "score_best", "protocol", "targets", "folder"],
+    "config": ["run", "key", "value", "number"],
+    "evaluations": ["run", "name", "value"],
+    "times": ["run", "phase", "seconds"],
+    "iterations": ["run"],
 }
+"""Tables and their columns; ``iterations`` has those of the runs, too."""
+
+_PHASE = "seconds_"
 
 
-def _connected(sources: Sequence[Path], iterations: bool) -> tuple[sqlite3.Connection, list[ResultsError]]:
-    connections: list[sqlite3.Connection] = []
-    unreadable: list[ResultsError] = []
-    with ExitStack() as opened:
-        for root in sources:
-            with up_to_date(root) as known:
-                connections.append(opened.enter_context(closing(known.connection())))
-                unreadable += known.unreadable
-        connection = opened.enter_context(closing(tables_of(list(map(str, sources)), connections)))
-        if unreadable and not any(root.is_dir() for root in sources):
-            if connection.execute("SELECT 1 FROM runs LIMIT 1").fetchone() is None:
-                raise unreadable[0]
-        if iterations:
-            add_iterations(connection, sources)
-        connection.execute("PRAGMA query_only = ON")
-        connection.set_authorizer(_reads)
-        opened.pop_all()
+def _connected(
+    sources: Sequence[Path], iterations: bool
+) -> tuple[duckdb.DuckDBPyConnection, list[ResultsError]]:
+    import duckdb
+
+    found, unreadable = readable_rows(sources)
+    tables = _tables(list(enumerate(found)), sources)
+    if iterations:
+        curves = read_curves(row.path for row in found)
+        tables["iterations"] = pd.concat(
+            [pd.DataFrame(columns).assign(run=run) for run, columns in enumerate(curves)]
+            or [tables["times"][["run"]]]
+        )
+    connection = duckdb.connect()
+    for name, table in tables.items():
+        connection.register("frame", table)
+        connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
+        connection.unregister("frame")
+    # A query reaches neither files nor variables of this process.
+    connection.execute("SET python_enable_replacements = false")
+    connection.execute("SET enable_external_access = false")
+    connection.execute("SET lock_configuration = true")
     return connection, unreadable
 
 
-def _answer(
-    sources: Sequence[Path], sql: str, *, iterations: bool
-) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    connection, unreadable = _connected(sources, iterations)
-    with closing(connection):
-        cursor = connection.execute(sql)
-        if cursor.description is None:
-            raise QueryError('there is no query: write a select, such as "select task, score from runs"')
-        return [column[0] for column in cursor.description], cursor.fetchall(), unreadable
+def _tables(found: Sequence[tuple[int, Row]], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
+    """Return all tables but that of iterations."""
+    rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
+    for run, row in found:
+        values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
+        values["folder"] = next(str(one) for one in sources if row.path.is_relative_to(one))
+        rows["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
+        for key, value in _leaves(row.config, ""):
+            number = float(value) if isinstance(value, int | float) else None
+            rows["config"].append((run, key, value if isinstance(value, str) else json.dumps(value), number))
+        for name, value in row.values.items():
+            if name.startswith(_PHASE):
+                rows["times"].append((run, name.removeprefix(_PHASE), value))
+            elif value == value and name not in _NO_EVALUATION:
+                rows["evaluations"].append((run, "score" if name == "score_best" else name, value))
+    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in rows.items()}
+    # Types do not depend on which runs there are.
+    for name in ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets"):
+        tables["runs"][name] = tables["runs"][name].astype("string")
+    for name in ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best"):
+        tables["runs"][name] = tables["runs"][name].astype("float64")
+    tables["config"]["number"] = tables["config"]["number"].astype("float64")
+    return tables
 
 
-def _reads(action: int, *details: str | None) -> int:
-    """Let nothing but queries pass, whatever file they would write to."""
-    describes = action == sqlite3.SQLITE_PRAGMA and details[0] in ("table_info", "table_xinfo", "table_list")
-    return sqlite3.SQLITE_OK if action in _READING or describes else sqlite3.SQLITE_DENY
+_NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
+"""Columns of a table of runs that are no scalars of the final evaluation."""
 
 
-def _explained(message: str) -> str:
-    if message in ("not authorized", "authorization denied") or message.startswith("cannot modify"):
-        return "the tables are only for reading: write a select"
-    if message.startswith("no such table"):
-        return f"{message}; there are {_TABLES}"
-    return message
+def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys of a configuration with their values."""
+    if not isinstance(node, Mapping):
+        yield key, node
+        return
+    for name, value in node.items():
+        yield from _leaves(value, f"{key}.{name}" if key else name)
+
+
+def _one_line(error: Exception) -> str:
+    """Return DuckDB's message without its hints and its drawing of the place in the query."""
+    return " ".join(str(error).partition("\n")[0].split())
 
 
 def _value(row: Row, name: str) -> Any:

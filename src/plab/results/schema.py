@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.bodies import MATERIAL_KEYS
-from plab.config.selection import OBSERVED, lookup
+from plab.config.selection import lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
 
@@ -22,11 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ARCHIVE_SUFFIX",
-    "BEFORE",
     "BUDGETS",
     "COLUMNS",
     "EVALUATION",
-    "OLD_ARCHIVE_SUFFIX",
     "PARTIAL_SUFFIX",
     "REPLAY_SUFFIX",
     "SCHEMA_VERSION",
@@ -51,7 +49,7 @@ __all__ = [
     "stored_hash",
 ]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the file layout; files of another version are not read."""
 
 STATUSES = ("running", "finished", "failed", "stopped")
@@ -62,14 +60,11 @@ REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"
 """Ends of the names of result files, of those of runs under way, of their replay buffers, and of archives."""
 
-OLD_ARCHIVE_SUFFIX = ".plab.zip"
-"""End of the names of archives up to plab 0.1."""
-
 _MEASURES = ("loss", "reward", "iou", "score")
 
 BUDGETS = ("steps_forward", "steps_gradient")
 """Columns of what a run has simulated up to the end of a row, in environment steps: without a gradient, and
-with one. Older files have none."""
+with one."""
 
 COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 """Columns that the iterations of every method have, beside those of :func:`loss_columns`;
@@ -81,16 +76,6 @@ EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
-
-BEFORE: dict[str, Any] = {
-    "protocol": {"name": "plab", "start": "plab", "numbers": "plab", "floor": "plab", "contact": "nearest"},
-    "seed_particles": 0,
-    "observe_particles": 200,
-    "observe_target": False,
-}
-"""What the configurations of runs would say that are older than these choices."""
-
-
 _SECTIONS = ("task", "method", "sim", "protocol")
 
 _NEEDED: dict[str, type | tuple[type, ...]] = {
@@ -99,6 +84,7 @@ _NEEDED: dict[str, type | tuple[type, ...]] = {
     "method.name": str,
     "method.family": str,
     "protocol.name": str,
+    "protocol.score": str,
     "sim.device": str,
     "seed": int,
     "seed_particles": int,
@@ -192,7 +178,7 @@ class RunResult:
 def config_dict(cfg: Any) -> dict[str, Any]:
     """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists.
 
-    Bodies without a file or a material of their own have no keys of one, as before there were any.
+    Optional keys of bodies that have no value, such as ``file``, are left out.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
     bodies = lookup(plain, "task.bodies")
@@ -204,15 +190,14 @@ def config_dict(cfg: Any) -> dict[str, Any]:
 
 
 def stored_config(text: str) -> dict[str, Any]:
-    """Return the configuration that a result file holds as ``text``, with what older ones lack.
+    """Return the configuration that a result file holds as ``text``.
 
     Raises:
         ValueError: If it is no configuration of a run.
     """
-    loaded = json.loads(text)
-    if not isinstance(loaded, dict):
-        raise ValueError(f"config is a {type(loaded).__name__}, not sections and values")
-    config = BEFORE | loaded
+    config = json.loads(text)
+    if not isinstance(config, dict):
+        raise ValueError(f"config is a {type(config).__name__}, not sections and values")
     if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
         raise ValueError(f"config has no section {strange[0]}")
     for key, kind in _NEEDED.items():
@@ -221,9 +206,6 @@ def stored_config(text: str) -> dict[str, Any]:
         if isinstance(value, str) and not _NAME.fullmatch(value):
             raise ValueError(f"{key} in config is no name: {value!r:.80}")
     _check_tables(config)
-    usual = "last" if config["protocol"]["name"] == "release" else "best"
-    config["protocol"] = {"score": usual} | config["protocol"]
-    config["sim"] = {"deterministic": False} | config["sim"]
     return config
 
 
@@ -257,27 +239,11 @@ def _check_tables(config: Mapping[str, Any]) -> None:
 def config_hash(cfg: Any) -> str:
     """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
     plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
-    # Checkpoints are spaced by the memory budget; gradients are the same bits for any spacing.
+    # Gradients are the same bits for any spacing of checkpoints.
     plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
-    # Without it runs keep the hashes that they had before there was a choice; the CPU has none.
-    if not plain["sim"].get("deterministic") or plain["sim"]["device"] == "cpu":
-        plain["sim"].pop("deterministic", None)
-    # Where older files say what `logger` says now.
-    plain["method"] = {key: value for key, value in plain["method"].items() if key != "tensorboard"}
-    # Name and score change nothing in a result, and the contact term acts where the method says so. Runs of
-    # plab's own protocol keep the hashes that they had before there was another.
-    protocol = plain.pop("protocol", {})
-    chosen = {key: protocol[key] for key in protocol if key not in ("name", "score", "contact")}
-    if any(choice != "plab" for choice in chosen.values()):
-        plain["protocol"] = chosen
-    # Runs of the first draw and with the paper's observations keep the hashes that they had before there were
-    # others.
-    for key in ("seed_particles", *OBSERVED):
-        if plain.get(key, BEFORE[key]) == BEFORE[key]:
-            plain.pop(key, None)
-    # Always empty.
-    for key in ("contact_by_task", "max_gradient_norm_by_numbers"):
-        plain["method"].pop(key, None)
+    # The protocol's name and score change no number, and its contact term is what the method says.
+    unused = ("name", "score", "contact")
+    plain["protocol"] = {key: value for key, value in plain["protocol"].items() if key not in unused}
     plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
     # What a file holds counts, not where it is.
     plain["task"] = _without_places(plain["task"])
@@ -336,9 +302,9 @@ def resume_fault(run: RunResult) -> str:
         return "it has iterations, but no best actions"
     if not 0 <= run.best_iteration < run.rows:
         return f"there is no iteration {run.best_iteration}, which is to be the best"
-    if missing := [name for name in ("loss", "score") if name not in columns]:
+    if missing := [name for name in ("loss", "score", *BUDGETS) if name not in columns]:
         return f"iterations lack {missing[0]}"
-    if endless := [name for name in BUDGETS if name in columns and not np.isfinite(columns[name]).all()]:
+    if endless := [name for name in BUDGETS if not np.isfinite(columns[name]).all()]:
         return f"iterations are not finite: {endless[0]}"
     if run.config["method"]["family"] == "trajectory":
         state = run.resume.get("actions")

@@ -16,8 +16,7 @@ from plab.config.selection import Selection, SelectionError, one_protocol, requi
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.locks import held
 from plab.results import ResultsError, Row, row_count
-from plab.results.files import opened, split_archive
-from plab.results.hdf5 import attributes, columns, numbers
+from plab.results.files import columns_of, opened, split_archive, summary_of
 from plab.results.loading import readable_rows, sources_of
 from plab.results.schema import parse_member
 from plab.tally import MOST_RUNS
@@ -280,14 +279,14 @@ def _measure(run: Run) -> None:
     """Take speed and rest of a run under way from its latest rows."""
     try:
         with opened(Path(run.path)) as file:
-            table = columns(file, "iterations")
+            table, summary = columns_of(file), summary_of(file)
             seconds = table["seconds"]
             done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
             if not math.isfinite(sum(seconds) + sum(done)):
                 raise ValueError("seconds or episodes are not finite")
             written = Path(run.path).stat().st_mtime
-            run.seconds = float(sum(numbers(attributes(file, "wall_time")).values()))
-            run.together = _together(attributes(file, "provenance"), written, run.seconds)
+            run.seconds = float(sum(summary["wall_time"].values()))
+            run.together = _together(summary["provenance"], written, run.seconds)
     except (ResultsError, OSError):
         # It may just have ended, and its partial file be gone.
         return
