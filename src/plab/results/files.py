@@ -435,7 +435,7 @@ def _tree(group: h5py.Group, depth: int) -> dict[str, Any]:
 def _sparse(file: h5py.File, path: str) -> np.ndarray:
     """Return a mass tensor, shape [n, n, n]."""
     index, values = _numbers(file, f"{path}/index"), _numbers(file, f"{path}/value")
-    shape = np.asarray(_group(file, path).attrs["shape"])
+    shape = np.asarray(_member(file, path).attrs["shape"])
     if index.shape != values.shape or index.ndim != 1:
         raise ValueError(f"{path} is no sparse tensor")
     if shape.ndim != 1 or shape.dtype.kind not in "iu" or index.dtype.kind not in "iu" or (shape < 0).any():
