@@ -23,10 +23,21 @@ from plab.cli.command import command_line
 from plab.cli.tables import measure_table, print_table, write_csv, write_markdown
 from plab.config import DEVICES, PRECISIONS, ConfigError, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.errors import tell
+from plab.errors import ArgumentError, pick, tell
 from plab.families import FAMILIES
 
-__all__ = ["accuracy", "everyday", "precision", "release", "results", "rl", "speed", "stability", "unseen"]
+__all__ = [
+    "accuracy",
+    "everyday",
+    "main",
+    "precision",
+    "release",
+    "results",
+    "rl",
+    "speed",
+    "stability",
+    "unseen",
+]
 
 HEADING = """\
 # Time per environment step
@@ -39,6 +50,19 @@ includes loss and reward.
 
 LABELLED = 12
 """With more cases than this a figure of norms has no legend: colours repeat."""
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark that the first argument names; return its exit code."""
+    names = [name for name in __all__ if name != "main"]
+    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        print(f"plab bench NAME ...: {', '.join(names)}; each has a --help of its own")
+        return 0
+    if name not in names:
+        raise ArgumentError(f"unknown benchmark {name}; {pick(name, names)}")
+    return int(globals()[name](rest))
 
 
 @command_line

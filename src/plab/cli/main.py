@@ -1,0 +1,59 @@
+"""The command ``plab``: one subcommand per module of this package.
+
+plab run task=Rope method=adam seed=0     one run, or a sweep with -m
+plab status                               finished, running, failed and missing runs
+plab report tables                        tables, curves, notebooks or a page of results
+plab results scores                       scores, SQL, checks and archives of results
+plab render task=Rope                     pictures and films of runs
+plab view task=Rope                       a 3-D page of a run
+plab export task=Rope                     a run as files for other programs
+plab demonstrations                       best known actions of the suite
+plab targets                              targets of tasks
+plab submit, verify, leaderboard          results to publish, and tables of them
+plab bench speed                          benchmarks: speed, accuracy, stability and others
+
+Each has a --help of its own, and is also a module: python -m plab.run.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import sys
+from collections.abc import Sequence
+
+from plab.cli.command import command_line
+from plab.errors import ArgumentError, pick
+
+__all__ = ["COMMANDS", "main"]
+
+COMMANDS = (
+    "run",
+    "status",
+    "report",
+    "results",
+    "render",
+    "view",
+    "export",
+    "demonstrations",
+    "targets",
+    "submit",
+    "verify",
+    "leaderboard",
+    "bench",
+)
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a subcommand; return its exit code."""
+    # Compilation allocates many long-lived objects: collecting them often takes seconds.
+    gc.set_threshold(100_000)
+    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        print((__doc__ or "").partition("\n\n")[2].rstrip())
+        return 0
+    if name not in COMMANDS:
+        raise ArgumentError(f"unknown command {name}; {pick(name, COMMANDS)}")
+    module = importlib.import_module(f"plab.cli.{name}")
+    return int(module.main(rest))
