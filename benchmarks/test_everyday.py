@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from plab.bench.results import SETTLE, write_runs
 from plab.config import Config, build_scene, load_config
 from plab.objective import target_sdf
 from plab.problem import Problem
 from plab.results import load
+from synthetic_runs import SETTLE, write_runs
 
 SMALL = (
     "task=Rope",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import resource
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -17,23 +16,17 @@ from typing import cast
 
 import numpy as np
 
-import plab
 from plab.cli.arguments import Parser, folder, positive, sources_and_words, task_list, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import measure_table, print_table, write_csv, write_markdown
 from plab.config import DEVICES, PRECISIONS, ConfigError, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import ArgumentError, pick, tell
-from plab.families import FAMILIES
 
 __all__ = [
     "accuracy",
-    "everyday",
     "main",
     "precision",
-    "release",
-    "results",
-    "rl",
     "speed",
     "stability",
     "unseen",
@@ -99,30 +92,6 @@ def accuracy(argv: Sequence[str] | None = None) -> None:
 
 
 @command_line
-def everyday(argv: Sequence[str] | None = None) -> None:
-    """Time everyday things, print, write a CSV file if asked to."""
-    from plab.bench import everyday as bench
-
-    parser = Parser("plab.bench.everyday", bench.__doc__)
-    things = list(bench.THINGS)
-    parser.add_argument("--runs", type=positive, default=1000, help="number of result files")
-    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
-    parser.add_argument("--repeats", type=positive, default=3, help="times that each thing is done")
-    parser.add_argument("--only", nargs="+", choices=things, default=things, help="what to time")
-    what = "folder of another source tree's packages, to take turns with"
-    parser.add_argument("--against", type=Path, help=what)
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    sources = [Path(plab.__file__).parents[1]]
-    if options.against is not None:
-        if not (options.against / "plab" / "__init__.py").is_file():
-            parser.error(f"--against: {options.against} holds no package plab; name a source tree's src")
-        sources.insert(0, options.against.resolve())
-    rows = bench.rows(options.runs, options.rows, sources, options.repeats, options.only)
-    measure_table(bench.COLUMNS, rows, options.csv, {"what": 18})
-
-
-@command_line
 def precision(argv: Sequence[str] | None = None) -> None:
     """Compare float32 with float64, print, write the files asked for."""
     import pandas as pd
@@ -146,59 +115,6 @@ def precision(argv: Sequence[str] | None = None) -> None:
         worst = precision_summary(pd.DataFrame(table))
         heading = f"float32 against float64, {options.particles} particles, 50 steps.\n\n"
         write_markdown(options.markdown, heading, list(worst.columns), worst.to_dict("records"))
-
-
-@command_line
-def release(argv: Sequence[str] | None = None) -> None:
-    """Compare the release's choices with plab's, print, write a CSV file if asked to."""
-    from plab.bench import release as bench
-
-    parser = Parser("plab.bench.release", bench.__doc__)
-    choices = bench.CHOICES
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
-    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
-    parser.add_argument("--choice", nargs="+", choices=choices, default=list(choices), help="only these")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    measure_table(bench.COLUMNS, bench.rows(options.task, options.particles, options.choice), options.csv)
-
-
-@command_line
-def results(argv: Sequence[str] | None = None) -> None:
-    """Time loading results, print, write a CSV file if asked to."""
-    from plab.bench import results as bench
-
-    parser = Parser("plab.bench.results", bench.__doc__)
-    parser.add_argument("--runs", type=positive, default=5000, help="number of result files")
-    parser.add_argument("--rows", type=positive, default=5, help="iterations of each")
-    parser.add_argument("--archive", action="store_true", help="pack them, too, and load the archive")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
-    rows = bench.measure(options.runs, options.rows, options.archive)
-    measure_table(("what", "count", "seconds", "times_faster"), rows, options.csv)
-    # Linux counts in KiB, macOS in bytes.
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1024.0)
-    print(f"most memory: {peak:.0f} MiB")
-
-
-@command_line
-def rl(argv: Sequence[str] | None = None) -> None:
-    """Time reinforcement learning, print, write a CSV file if asked to."""
-    from plab.bench import rl as bench
-
-    parser = Parser("plab.bench.rl", bench.__doc__)
-    what = "configuration overrides, e.g. task=Move sim.device=cuda"
-    parser.add_argument("overrides", nargs="*", help=what)
-    methods = tuple(FAMILIES["rl"].rules)
-    parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
-    parser.add_argument("--envs", type=positive, nargs="+", default=[1, 16], help="numbers of environments")
-    parser.add_argument("--agents", type=positive, nargs="+", help="numbers of agents of populations")
-    parser.add_argument("--batches", type=positive, default=2, help="batches of episodes to time")
-    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_intermixed_args(argv)
-    columns = bench.POPULATION if options.agents else bench.COLUMNS
-    trainings = itertools.product(options.agents or (None,), options.envs, options.methods)
-    measure_table(columns, bench.rows(options.overrides, trainings, options.batches), options.csv)
 
 
 @command_line

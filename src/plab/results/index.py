@@ -1,7 +1,7 @@
 """Index of result files: one row per run in a Parquet file, so that unchanged files are read once.
 
-The index is never trusted over the files: an entry counts only while its file has the same size, inode and times
-of change. It is replaced atomically as a whole, and can be deleted at any time.
+The index is never trusted over the files: an entry counts only while its file has the same size, inode and
+times of change. It is replaced atomically as a whole, and can be deleted at any time.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ COLUMNS = (
 _NAME = f".plab-index-{SCHEMA_VERSION}.parquet"
 
 _FIELDS = ("file", "identity", "member", "row", "config")
-"""Columns of the index: path below the folder, identity of the file, name in an archive (empty for a file of its
-own), and the two parts of :class:`Row` as JSON."""
+"""Columns of the index: path below the folder, identity of the file, name in an archive (empty for a file of
+its own), and the two parts of :class:`Row` as JSON."""
 
 _SETTLED = 2.0
 """Age from which on a file's times identify its contents [s]: file systems round them."""

@@ -1,8 +1,8 @@
 """Where the time of reinforcement learning goes, and how it grows with the number of environments.
 
-    python -m plab.bench.rl task=Move --methods ppo sac --envs 1 16
-    python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256 --agents 1
-    python -m plab.bench.rl task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
+    python benchmarks/rl.py task=Move --methods ppo sac --envs 1 16
+    python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256 --agents 1
+    python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
 
 prints a row per method and number of environments: transitions per second, and the milliseconds that each
 part takes per step of all environments; each is waited for before the next one begins. What runs is the
@@ -14,8 +14,9 @@ checkpoints included, without their files.
 
 from __future__ import annotations
 
+import argparse
 import gc
-import sys
+import itertools
 import tempfile
 import time
 from collections import defaultdict
@@ -31,9 +32,11 @@ import torch
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import Logger
 
+from plab.cli.tables import measure_table
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
+from plab.families import FAMILIES
 from plab.runners.environments import torch_settings
 from plab.runners.population.agents import OffPolicyAgents
 from plab.runners.population.population import Population, population_settings
@@ -208,7 +211,25 @@ def _config(overrides: Sequence[str], method: str, num_envs: int, batches: int, 
     return cfg
 
 
-if __name__ == "__main__":
-    from plab.cli.bench import rl
+def main() -> None:
+    """Print a row per method, number of environments and number of agents."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "overrides", nargs="*", help="configuration overrides, e.g. task=Move sim.device=cuda"
+    )
+    methods = tuple(FAMILIES["rl"].rules)
+    parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
+    parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], help="numbers of environments")
+    parser.add_argument("--agents", type=int, nargs="+", help="numbers of agents of populations")
+    parser.add_argument("--batches", type=int, default=2, help="batches of episodes to time")
+    parser.add_argument("--csv", type=Path, help="file to write the rows to")
+    options = parser.parse_intermixed_args()
+    columns = POPULATION if options.agents else COLUMNS
+    trainings = itertools.product(options.agents or (None,), options.envs, options.methods)
+    measure_table(columns, rows(options.overrides, trainings, options.batches), options.csv)
 
-    sys.exit(rl())
+
+if __name__ == "__main__":
+    main()

@@ -1,44 +1,27 @@
-"""Time and memory that thousands of result files take, with and without the index, and from an archive.
-
-    python -m plab.bench.results --runs 10000 --rows 5
-    python -m plab.bench.results --runs 1000 --archive
-
-writes so many small result files to a folder that is removed afterwards, and loads them: for the first time,
-again, after one of them has changed. Status, tables and a query follow. The index goes to that folder, too. At
-the end it says how much memory all of this took.
-"""
+"""Made-up results: runs with numbers in the right places, for tests and benchmarks of what reads results."""
 
 from __future__ import annotations
 
 import copy
 import itertools
-import os
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from plab.config import load_config
-from plab.config.selection import Selection
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.families import family
 from plab.objective import scores_from_iou
 from plab.provenance import now, provenance
-from plab.report.collect import collect
-from plab.report.writing import write_tables
-from plab.results import RunResult, config_dict, config_hash, load, pack, result_path, write
-from plab.results.query import query, scores
+from plab.results import RunResult, config_dict, config_hash, result_path, write
 from plab.results.schema import COLUMNS, loss_columns
-from plab.status import survey
 
-__all__ = ["SETTLE", "measure", "synthetic_run", "template", "write_runs"]
+__all__ = ["SETTLE", "synthetic_run", "template", "write_runs"]
 
 SETTLE = 2.5
-"""Seconds to wait after writing: what files hold that have changed just now is not kept."""
+"""Seconds to wait after writing: files that have just changed are not indexed."""
 
 
 def template(method: str, overrides: list[str] | None = None) -> dict[str, Any]:
@@ -138,47 +121,3 @@ def write_runs(runs: int, rows: int, folder: Path) -> None:
         path = result_path(config)
         path.parent.mkdir(parents=True, exist_ok=True)
         write(synthetic_run(config, rows=rows), path, compress=False)
-
-
-def measure(runs: int, rows: int, packed: bool) -> Iterator[dict[str, object]]:
-    """Write the files and measure; yield a row per way to load them, packed ones, too, if asked to."""
-    with tempfile.TemporaryDirectory() as name:
-        folder, results, every = Path(name), Path(name) / "results", Selection()
-        os.environ["PLAB_CACHE_DIR"] = str(folder / "cache")
-        write_runs(runs, rows, results)
-        time.sleep(SETTLE)
-
-        def timed(what: str, call: Callable[[], Sized]) -> dict[str, object]:
-            start = time.perf_counter()
-            count = len(call())
-            seconds = time.perf_counter() - start
-            first.setdefault("seconds", seconds)
-            ratio = round(first["seconds"] / seconds, 1)
-            return {"what": what, "count": count, "seconds": round(seconds, 3), "times_faster": ratio}
-
-        first: dict[str, float] = {}
-        yield timed("first time", lambda: load(results))
-        yield timed("again", lambda: load(results))
-        changed = load(results)["path"].iloc[runs // 2]
-        Path(changed).touch()
-        yield timed("one changed", lambda: load(results))
-        yield timed("with a key", lambda: load(results, keys=["method.family"]))
-        yield timed("without index", lambda: load(results, index=False))
-        yield timed("scores", lambda: scores(results, every, ["method.lr"], ["score"])[0])
-        yield timed("sql", lambda: query(results, "select task, avg(score) from runs group by task")[1])
-        yield timed("plab.status", lambda: survey(results, every).runs)
-        yield timed("tables, first time", lambda: write_tables(collect(results, every), folder / "a", ""))
-        yield timed("tables, again", lambda: write_tables(collect(results, every), folder / "b", ""))
-        if not packed:
-            return
-        archive = folder / "all.plab.zip.xz"
-        yield timed("pack", lambda: range(pack(results, archive).runs))
-        time.sleep(SETTLE)
-        yield timed("archive", lambda: load(archive))
-        yield timed("archive again", lambda: load(archive))
-
-
-if __name__ == "__main__":
-    from plab.cli.bench import results
-
-    sys.exit(results())
