@@ -26,9 +26,12 @@ from plab.bodies import (
 )
 
 __all__ = [
-    "CHOICES",
+    "CONTACTS",
+    "CONVENTIONS",
+    "DEVICES",
     "MANIPULATOR_SHAPES",
     "MATERIAL_KEYS",
+    "PRECISIONS",
     "ROLL_RADIUS",
     "Body",
     "Manipulator",
@@ -42,8 +45,17 @@ __all__ = [
     "vector3",
 ]
 
-CHOICES = ("plab", "release")
-"""Whose way something is done: plab's own, or that of the PlasticineLab release."""
+CONVENTIONS = ("plab", "release")
+"""Reference implementation whose convention applies: plab's own, or the PlasticineLab release's."""
+
+DEVICES = ("cpu", "cuda")
+"""Devices that a scene can be simulated on."""
+
+PRECISIONS = ("float32", "float64")
+"""Floating-point types of the simulation."""
+
+CONTACTS = ("soft", "hard")
+"""Contact models of manipulators and particles."""
 
 STIFFEST = 1e-12
 """Time step [s] below which no scene can be simulated in anybody's life."""
@@ -172,7 +184,7 @@ class Scene:
         substeps: Substeps per environment step.
         horizon: Environment steps per episode.
         particle_seed: Seed of the particles' positions.
-        start: Whose generator draws them, one of :data:`CHOICES`.
+        start: Whose generator draws them, one of :data:`CONVENTIONS`.
         numbers: Whose way with rotations that are not quite of unit length: plab's makes them so, with the
             release's they are the poses at t = 0 as they are, and of unit length once something moves.
         floor: Whose stencil particles within half a cell of a lower face have: plab's reaches the layer of
@@ -310,7 +322,7 @@ class Scene:
         )
         for name in ("start", "numbers", "floor"):
             choice = getattr(self, name)
-            _require(choice in CHOICES, f"{name} '{choice}' is not one of {', '.join(CHOICES)}")
+            _require(choice in CONVENTIONS, f"{name} '{choice}' is not one of {', '.join(CONVENTIONS)}")
         self._validate_gravity()
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):

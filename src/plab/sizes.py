@@ -10,31 +10,26 @@ import ctypes
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from plab.scene import Scene, SceneError
 
 __all__ = [
-    "OBSERVED",
+    "REAL_BYTES",
     "computer_bytes",
     "gigabytes",
-    "largest",
     "most_environments",
     "require_memory",
     "scene_bytes",
 ]
 
-_REAL_BYTES = {"float32": 4, "float64": 8}
+REAL_BYTES = {"float32": 4, "float64": 8}
 
 _PARTICLE_NUMBERS = 3 * 24 + 9
 """Of a particle: its state in three arrays, and its stress."""
 
 _CHUNKS = {"cpu": 8, "cuda": 1}
 """Grids of an environment for the momentum."""
-
-OBSERVED = 200
-"""Particles of an observation, about."""
 
 
 def scene_bytes(
@@ -58,7 +53,7 @@ def scene_bytes(
         precision: ``float32`` or ``float64``.
         device: ``cpu`` or ``cuda``.
     """
-    real = _REAL_BYTES[precision]
+    real = REAL_BYTES[precision]
     # Momentum and velocity, four numbers each; mass tensors of start, target and now, and a distance.
     grid = float(grid_size) ** 3 * (4 * real * (_CHUNKS[device] + 1) + 4 * 8)
     # Pose in float64; centre, rotation, their rates and the gap.
@@ -124,39 +119,6 @@ def require_memory(scenes: int, scene: Scene, precision: str, device: str) -> No
 def gigabytes(count: float) -> str:
     """Return a number of bytes for people."""
     return f"{count / 1e9:.3g} GB"
-
-
-def largest(
-    needed: Callable[[Mapping[str, float]], float],
-    values: Mapping[str, float],
-    smallest: Mapping[str, float],
-    limit: float,
-) -> tuple[str, float]:
-    """Find the quantity that asks for too much, and what it may be.
-
-    Args:
-        needed: Bytes for some values, the more the larger each of them is.
-        values: The values, which need more than there is.
-        smallest: The least that those may be which may be named; of whole numbers an int.
-        limit: Bytes that there are.
-
-    Returns:
-        Name of the quantity that takes the most, and the largest value that would do with the others as they
-        are, or, if none would, with the others as small as may be; its smallest if not even that would do.
-    """
-    name = min(smallest, key=lambda one: needed({**values, one: smallest[one]}))
-    for others in (values, {**values, **smallest}):
-        low, high = smallest[name], values[name]
-        if needed({**others, name: low}) > limit:
-            continue
-        for _ in range(200):
-            middle = (low + high) // 2 if isinstance(low, int) else math.sqrt(low * high)
-            if needed({**others, name: middle}) > limit:
-                high = middle
-            else:
-                low = middle
-        return name, low if isinstance(low, int) else float(f"{0.999 * low:.3g}")
-    return name, smallest[name]
 
 
 def computer_bytes(device: str) -> float:

@@ -38,8 +38,8 @@ from plab.bench.precision import angle
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
-from plab.scene import Body, Scene, sample_particles
-from plab.sim import CONTACT_MODELS, PRECISIONS, Simulator, Skips
+from plab.scene import CONTACTS, PRECISIONS, Body, Scene, sample_particles
+from plab.sim import Simulator, Skips
 
 __all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Resolution", "attempts_at", "lattice", "rows"]
 
@@ -262,7 +262,7 @@ def simulate(setting: Resolution, attempts: Sequence[Attempt], repeats: int, dev
         mass = scene.particle_mass * scene.particle_count
         target = spread_mass(end, scene.grid_size, mass / len(end))
         simulator.set_target(target[None], target_sdf(target, 0.1 * scene.particle_mass)[None])
-        for contact in CONTACT_MODELS:
+        for contact in CONTACTS:
             simulator.set_contact(contact)
             yield attempt, contact, _roll(simulator, attempt, repeats, mass)
 

@@ -19,9 +19,10 @@ import numpy as np
 from plab.cli.arguments import Parser, folder, positive, sources_and_words, task_list, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import measure_table, print_table, write_csv, write_markdown
-from plab.config import DEVICES, PRECISIONS, ConfigError, load_config
+from plab.config import ConfigError, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import ArgumentError, pick, tell
+from plab.scene import DEVICES, PRECISIONS
 
 __all__ = [
     "accuracy",

@@ -18,11 +18,8 @@ if TYPE_CHECKING:
     from plab.config.task import *
 
 __all__ = [
-    "CONTACTS",
-    "DEVICES",
     "EXPERIMENT",
     "GROUPS",
-    "PRECISIONS",
     "ActorConfig",
     "ApgConfig",
     "BodyConfig",

@@ -21,18 +21,17 @@ from hydra.core.override_parser.types import OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.capacity import check_size
 from plab.config.composer import GROUPS, Composer
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.run import Config
 from plab.config.suite import conf_folder
 from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
 from plab.config.words import parse, quote_folders, require_few, shortened, unusable, word_list
-from plab.config.yaml_files import require_plain
 from plab.errors import ConfigError, pick
 from plab.families import family, schemas
 from plab.plugins import search_in
 from plab.scene import Scene, vector3
+from plab.sizes import require_memory
 
 __all__ = [
     "EXPERIMENT",
@@ -81,8 +80,8 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Raise ConfigError for a folder of the user's that is missing, or that has a file that is no text, or
-    one with a name of plab's own, which Hydra would ignore."""
+    """Raise ConfigError for a folder of the user's that is missing, or that has a file with a name of plab's
+    own, which Hydra would ignore."""
     if not isinstance(config_dir, str | Path):
         raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
     if not str(config_dir).strip():
@@ -93,7 +92,6 @@ def _check_config_dir(config_dir: str | Path) -> None:
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
-            require_plain(path)
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
@@ -296,7 +294,7 @@ def build_scene(cfg: Config) -> Scene:
         floor=protocol.floor,
     )
     scene.validate()
-    check_size(cfg, scene)
+    require_memory(1, scene, sim.precision, sim.device)
     return scene
 
 

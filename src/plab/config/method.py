@@ -9,10 +9,9 @@ from plab.config import ranges
 from plab.errors import ConfigError
 from plab.families import family
 from plab.losses.registry import check_terms
+from plab.scene import CONTACTS, DEVICES
 
 __all__ = [
-    "CONTACTS",
-    "DEVICES",
     "ActorConfig",
     "ApgConfig",
     "MethodConfig",
@@ -26,9 +25,6 @@ __all__ = [
     "Td3Config",
     "TrajectoryConfig",
 ]
-
-DEVICES = ("cpu", "cuda")
-CONTACTS = ("soft", "hard")
 
 
 @dataclass

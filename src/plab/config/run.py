@@ -6,20 +6,18 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from plab.config import ranges
-from plab.config.method import DEVICES, MethodConfig
+from plab.config.method import MethodConfig
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
 from plab.losses.registry import check_terms
-from plab.scene import CHOICES
+from plab.scene import CONVENTIONS, DEVICES, PRECISIONS
 
-__all__ = ["PRECISIONS", "Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
+__all__ = ["Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
 
 MOST_MEMORY_MB = 1e9
 """A petabyte: more is a slip of the unit."""
 
 LOGGERS = ("none", "tensorboard", "wandb")
-
-PRECISIONS = ("float32", "float64")
 
 Method = TypeVar("Method", bound=MethodConfig)
 
@@ -78,9 +76,9 @@ class ProtocolConfig(ranges.Section):
     """
 
     name: str = field(metadata=ranges.NAME)
-    start: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
-    numbers: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
-    floor: str = field(metadata=ranges.within(ranges.one_of, CHOICES))
+    start: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
+    numbers: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
+    floor: str = field(metadata=ranges.within(ranges.one_of, CONVENTIONS))
     score: str = field(metadata=ranges.within(ranges.one_of, SCORES))
     contact: str
 

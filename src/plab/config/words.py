@@ -57,20 +57,13 @@ def word_list(words: Sequence[str]) -> list[str]:
 
 
 def parse(words: Sequence[str]) -> list[Override]:
-    """Read overrides; ConfigError if a number has too many digits, or brackets are nested too deeply,
-    HydraException if one cannot be parsed."""
+    """Read overrides; ConfigError or HydraException if one cannot be read."""
     found = []
     for word in words:
         try:
-            override = _parsed(word)
-            if _has_endless_number(override.value()):
-                raise ValueError("a number has too many digits")
-            found.append(override)
-        except HydraException:
-            raise
-        except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
-            reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-            raise ConfigError(f"cannot read '{shortened(word)}': {reason}") from None
+            found.append(_parsed(word))
+        except (ArithmeticError, TypeError, ValueError) as error:
+            raise ConfigError(f"cannot read '{shortened(word)}': {error}") from None
     return found
 
 
@@ -79,15 +72,6 @@ def _parsed(word: str) -> Override:
     """Read one override; those of a sweep come again in many of its jobs."""
     (override,) = OverridesParser.create().parse_overrides([word])
     return override
-
-
-def _has_endless_number(value: object) -> bool:
-    """Return whether there is a whole number that no float could hold, beyond which OmegaConf fails."""
-    if isinstance(value, dict | list | ChoiceSweep):
-        entries = value.list if isinstance(value, ChoiceSweep) else [*value]
-        entries += list(value.values()) if isinstance(value, dict) else []
-        return any(map(_has_endless_number, entries))
-    return isinstance(value, int) and value.bit_length() > 1000
 
 
 def shortened(word: str) -> str:

@@ -21,7 +21,8 @@ from plab.config.words import word_list
 from plab.envs.observations import Observer, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
-from plab.sim import CONTACT_MODELS, SimulationError, Simulator
+from plab.scene import CONTACTS
+from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
 if TYPE_CHECKING:
@@ -182,8 +183,8 @@ class EpisodeBatch:
             plab.sim.DeviceError: If CUDA was asked for and is not there.
             RuntimeError: If this process was forked from one that has made environments.
         """
-        if contact not in CONTACT_MODELS:
-            raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACT_MODELS)}")
+        if contact not in CONTACTS:
+            raise ArgumentError(f"contact '{contact}' is not one of {', '.join(CONTACTS)}")
         _require_alike(cfgs)
         problem = Problem(cfgs)
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon

@@ -1,16 +1,12 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
-from plab.sim.forward import CONTACT_MODELS
 from plab.sim.recording import Recording
-from plab.sim.runtime import DEVICES, PRECISIONS, DeviceError, SimulationError
+from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
 from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State
 
 __all__ = [
-    "CONTACT_MODELS",
-    "DEVICES",
-    "PRECISIONS",
     "DeviceError",
     "Measures",
     "Recording",

@@ -11,7 +11,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
-from plab.scene import Scene, SceneError, sample_particles
+from plab.scene import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, require_alike, with_material
 from plab.sim.engine import CpuEngine
 from plab.sim.failures import broken_states, require_none
@@ -28,9 +28,7 @@ from plab.sizes import require_memory
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["CONTACT_MODELS", "ForwardSimulator"]
-
-CONTACT_MODELS = ("soft", "hard")
+__all__ = ["ForwardSimulator"]
 
 
 class ForwardSimulator:
@@ -162,8 +160,8 @@ class ForwardSimulator:
         models = np.broadcast_to(model, self.batch)
         decay = np.broadcast_to(np.asarray(softness, float), self.batch)
         for name, rate in zip(models, decay, strict=True):
-            if name not in CONTACT_MODELS:
-                raise ArgumentError(f"contact '{name}' is not one of {', '.join(CONTACT_MODELS)}")
+            if name not in CONTACTS:
+                raise ArgumentError(f"contact '{name}' is not one of {', '.join(CONTACTS)}")
             if name == "soft" and not rate > 0:
                 raise ArgumentError(f"softness {rate:g} must be positive")
         self._version += 1

@@ -8,16 +8,16 @@ import taichi as ti
 
 from plab.scene import Scene
 from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
+from plab.sizes import REAL_BYTES
 
-__all__ = ["ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
+__all__ = ["BYTES", "ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 """Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
 :data:`plab.sim.storage.STATE_MASK`."""
 
-REAL_BYTES = {"float32": 4, "float64": 8}
-
 BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
+"""Bytes of a number by its type."""
 
 
 def kept_states(steps: int, slots_per_step: int, length: int, reach: int) -> int:

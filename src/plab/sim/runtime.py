@@ -23,11 +23,10 @@ import taichi as ti
 from taichi.lang import _ndarray, impl
 
 from plab.errors import ArgumentError, PlabError
+from plab.scene import DEVICES, PRECISIONS
 
-__all__ = ["DEVICES", "PRECISIONS", "DeviceError", "Runtime", "SimulationError", "start_runtime"]
+__all__ = ["DeviceError", "Runtime", "SimulationError", "start_runtime"]
 
-DEVICES = ("cpu", "cuda")
-PRECISIONS = ("float32", "float64")
 
 CACHE_BYTES = 1 << 30
 """Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
