@@ -65,15 +65,17 @@ def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Tell folders and archives from words that choose among their runs, as ``task=Rope`` does.
 
     Returns:
-        The folders, those that are there with an equals sign in their names included, and the words.
+        The sources, named as they are or as ``results=NAME``, and the words. A folder with an equals sign in
+        its name is a source if it exists.
 
     Raises:
         ArgumentError: If the name of a folder is empty.
     """
-    if not all(argument.strip() for argument in arguments):
+    named = [argument.removeprefix("results=") for argument in arguments]
+    if not all(argument.strip() for argument in named):
         raise ArgumentError("the name of a folder is empty: give one, or . for this one")
-    words = [argument for argument in arguments if "=" in argument and not os.path.exists(argument)]
-    return [argument for argument in arguments if argument not in words], words
+    words = [name for name in named if name in arguments and "=" in name and not os.path.exists(name)]
+    return [name for name in named if name not in words], words
 
 
 def task_list(text: str) -> list[str]:

@@ -76,7 +76,7 @@ def accuracy(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--particles", type=positive, help=what)
     parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
     parser.add_argument("--output", type=folder, default=Path("accuracy"), help="folder of what is written")
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     tasks = options.task or (bench.QUICK_TASKS if options.quick else bench.TASKS)
     if unknown := set(tasks) - set(bench.TASKS):
         parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(bench.TASKS)}")
@@ -108,7 +108,7 @@ def precision(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--deterministic", action="store_true", help="sums of integers in float32, on CUDA")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     configurations = bench.starts(options.task, options.variant, options.particles)
     rows = bench.compare(configurations, options.device, options.deterministic)
     table = measure_table(bench.COLUMNS, rows, options.csv)
@@ -226,7 +226,7 @@ def stability(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
     what = "file for the gradient's norm per step back in time"
     parser.add_argument("--gradients", type=to_write, help=what)
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     plan = bench.QUICK if options.quick else bench.FULL
     plan = replace(plan, particles=options.particles or plan.particles)
     plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
@@ -305,7 +305,7 @@ def unseen(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="so many scenes")
     parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
-    options = parser.parse_args(argv)
+    options = parser.parse_intermixed_args(argv)
     paths, words = sources_and_words(options.what)
     if not paths:
         parser.error("name the result file of a run that has trained a policy")

@@ -52,7 +52,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     add("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
     add("--output", type=folder, metavar="FOLDER", help="by default named like the result or the task")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     settle(arguments, f"-{arguments.format}")
     output = arguments.output
     require_writable(output / "target")

@@ -114,7 +114,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
     add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     for option, path, suffix, draw in (
         ("--contact-sheet", arguments.contact_sheet, ".png", _draw_contact_sheet),
         ("--film-strip", arguments.film_strip, ".jpg", _draw_film_strip),

@@ -47,7 +47,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--output", type=folder, metavar="FILE", help="by default a .html named like the result or the task"
     )
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_intermixed_args(argv)
     settle(arguments, ".html")
     if arguments.output.suffix.lower() != ".html":
         raise RenderError(f"cannot write {arguments.output}: its suffix must be .html")
