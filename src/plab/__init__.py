@@ -1,19 +1,65 @@
 """plab: PlasticineLab rebuilt as an experiment harness, from one command line to the result file."""
 
+from __future__ import annotations
+
 import inspect
 import os
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 # Before Taichi is imported, by whichever part of plab: it would print a banner on standard output, and send
 # version, platform and a number of its own to its makers.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
-from plab.envs import register_suite
+from plab.config.suite import suite_tasks
+from plab.envs import make, make_vec, register_suite
+
+if TYPE_CHECKING:
+    from plab.config import build_scene, load_config
+    from plab.results import load as load_results
+    from plab.scene import Scene
+    from plab.sim import Simulator
+
+__all__ = [
+    "TASKS",
+    "Scene",
+    "Simulator",
+    "__version__",
+    "build_scene",
+    "load_config",
+    "load_results",
+    "make",
+    "make_vec",
+]
 
 __version__ = "0.1.0"
+
+TASKS = tuple(suite_tasks())
+"""Names of the suite's tasks."""
+
+_PLACES = {
+    "Scene": ("plab.scene", "Scene"),
+    "Simulator": ("plab.sim", "Simulator"),
+    "build_scene": ("plab.config", "build_scene"),
+    "load_config": ("plab.config", "load_config"),
+    "load_results": ("plab.results", "load"),
+}
+"""Module and name of each part that is imported on first use: Taichi and pandas take seconds."""
 
 # Taichi's decorators ask for the source of the importer: inspect looks through all modules, each time, for a
 # file that it does not know.
 vars(inspect).setdefault("modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 
 register_suite()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'plab' has no attribute '{name}'")
+    module, attribute = _PLACES[name]
+    return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -13,10 +13,41 @@ import gymnasium
 
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 
-__all__ = ["ENTRY_POINT", "register_suite", "register_task"]
+__all__ = ["ENTRY_POINT", "make", "make_vec", "register_suite", "register_task"]
 
 ENTRY_POINT = "plab.envs.single:PlabEnv"
 """What Gymnasium makes an environment of plab's with."""
+
+
+def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """Make an environment of the suite.
+
+    Args:
+        task: Name of the task, such as ``Rope``.
+        variant: Number of the variant.
+        **kwargs: Arguments of :class:`plab.envs.single.PlabEnv`, or of ``gymnasium.make``.
+
+    Raises:
+        gymnasium.error.Error: If there is no such task or variant.
+    """
+    return gymnasium.make(f"plab/{task}-v{variant}", **kwargs)
+
+
+def make_vec(
+    task: str, variant: str | int = 1, num_envs: int = 1, **kwargs: Any
+) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+    """Make several environments of the suite that share one simulator.
+
+    Args:
+        task: Name of the task, such as ``Rope``.
+        variant: Number of the variant.
+        num_envs: Number of environments.
+        **kwargs: Arguments of :class:`plab.envs.vector.PlabVectorEnv`, or of ``gymnasium.make_vec``.
+
+    Raises:
+        gymnasium.error.Error: If there is no such task or variant.
+    """
+    return gymnasium.make_vec(f"plab/{task}-v{variant}", num_envs=num_envs, **kwargs)
 
 
 def register_suite() -> None:
