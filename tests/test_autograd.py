@@ -19,8 +19,10 @@ from plab.problem import Problem
 from plab.results import BUDGETS, RunResult, read, result_path
 from plab.runners import apg, run_config
 from plab.runners.common import episode_columns
-from same_runs import assert_same_numbers, stopped_at
+from plab.runners.environments import shared_batches
+from same_runs import KeepsAll, assert_same_numbers, stopped_at
 
+CACHE = KeepsAll()
 HORIZON = 3
 COARSE = [
     "task=Rope",
@@ -53,34 +55,46 @@ def draw(seed: int, **options) -> torch.Tensor:
     return (1.6 * unit - 0.8).to(**options).requires_grad_()
 
 
-def test_losses_and_gradients_are_the_simulators(problem: Problem) -> None:
+def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) -> None:
     actions = draw(0)
     losses = rollout(problem, actions)
     losses.sum().backward()
     expected = problem.rollout(actions.detach().numpy(), gradient=True)
     np.testing.assert_array_equal(losses.detach().numpy(), expected.loss.sum(axis=1))
     np.testing.assert_array_equal(actions.grad.numpy(), expected.gradient)
+    # Each environment's loss is weighed on its own, and there is no second derivative.
+    whole, weights = actions.grad.clone(), torch.tensor([0.0, 3.0], dtype=torch.float64)
+    (weighed,) = torch.autograd.grad(rollout(problem, actions) @ weights, actions)
+    assert torch.count_nonzero(weighed[0]) == 0
+    torch.testing.assert_close(weighed[1], 3.0 * whole[1])
+    (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+    # The type is kept, and no gradient is computed in vain.
+    actions = draw(0, dtype=torch.float32).detach().requires_grad_()
+    losses = rollout(problem, actions)
+    losses.sum().backward()
+    assert losses.dtype == actions.grad.dtype == torch.float32
+    wanted, intact = [], Problem.try_out
+
+    def try_out(self, tried, *, gradient):
+        wanted.append(gradient)
+        return intact(self, tried, gradient=gradient)
+
+    monkeypatch.setattr(Problem, "try_out", try_out)
+    assert not rollout(problem, actions.detach()).requires_grad and wanted == [False]
 
 
-def test_environments_of_tensors_do_what_those_of_arrays_do() -> None:
-    cfgs = [load_config([*COARSE, "sim=reference", f"task.yield_stress={s}"]) for s in (20, 50)]
-    env, arrays = TensorEnv(EpisodeBatch(cfgs)), EpisodeBatch(cfgs)
-    np.testing.assert_array_equal(env.reset().numpy(), arrays.reset()[0])
-    for t in range(HORIZON):
-        actions = draw(t)[:, t].detach().float()
-        got, want = env.step(actions), arrays.step(actions.numpy())
+def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBatch) -> None:
+    actions = [draw(t)[:, t].detach().float() for t in range(HORIZON)]
+    first, wanted = episodes.reset()[0], [episodes.step(action.numpy()) for action in actions]
+    env = TensorEnv(episodes)
+    np.testing.assert_array_equal(env.reset().numpy(), first)
+    for t, (action, want) in enumerate(zip(actions, wanted, strict=True)):
+        got = env.step(action)
         np.testing.assert_array_equal(got.observation.numpy(), want.observation)
         np.testing.assert_array_equal(got.reward.numpy(), want.reward.astype(np.float32))
         assert got.info.keys() == want.info.keys() and got.truncated == want.truncated == (t == HORIZON - 1)
-
-
-def test_each_environments_loss_is_weighed_on_its_own(problem: Problem) -> None:
-    actions = draw(1)
-    losses = rollout(problem, actions)
-    (whole,) = torch.autograd.grad(losses.sum(), actions, retain_graph=True)
-    (weighed,) = torch.autograd.grad(losses @ torch.tensor([0.0, 3.0], dtype=torch.float64), actions)
-    assert torch.count_nonzero(weighed[0]) == 0
-    torch.testing.assert_close(weighed[1], 3.0 * whole[1])
 
 
 def test_gradient_agrees_with_differences(problem: Problem) -> None:
@@ -95,42 +109,13 @@ def test_gradient_agrees_with_differences(problem: Problem) -> None:
 def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem) -> None:
     scale = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     actions = draw(4).detach()
+    # Beyond its bounds an action has no gradient.
+    actions[:, 1] = 3.0
     rollout(problem, scale * actions).sum().backward()
     fixed = (0.5 * actions).requires_grad_()
     rollout(problem, fixed).sum().backward()
     assert float(scale.grad) == pytest.approx(float((fixed.grad * actions).sum()), rel=1e-12)
-
-
-def test_beyond_its_bounds_an_action_has_no_gradient(problem: Problem) -> None:
-    actions = draw(5).detach()
-    actions[:, 1] = 1.5
-    actions.requires_grad_()
-    rollout(problem, actions).sum().backward()
-    assert torch.count_nonzero(actions.grad[:, 1]) == 0 and torch.count_nonzero(actions.grad[:, 0]) > 0
-
-
-def test_type_is_kept_and_no_gradient_is_computed_in_vain(problem: Problem, monkeypatch) -> None:
-    actions = draw(6, dtype=torch.float32).detach().requires_grad_()
-    losses = rollout(problem, actions)
-    losses.sum().backward()
-    assert losses.dtype == actions.grad.dtype == torch.float32
-    wanted, intact = [], Problem.try_out
-    monkeypatch.setattr(
-        Problem,
-        "try_out",
-        lambda self, a, **options: (wanted.append(options["gradient"]), intact(self, a, **options))[1],
-    )
-    assert not rollout(problem, actions.detach()).requires_grad
-    with torch.no_grad():
-        rollout(problem, actions)
-    assert wanted[0] is False
-
-
-def test_there_is_no_second_derivative(problem: Problem) -> None:
-    actions = draw(7)
-    (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+    assert torch.count_nonzero(fixed.grad[:, 1]) == 0 and torch.count_nonzero(fixed.grad[:, 0]) > 0
 
 
 # ---------------------------------------------------------------- a policy that reacts
@@ -263,7 +248,7 @@ def make_config(folder: Path, *overrides: str) -> Config:
 
 
 def run(cfg: Config) -> RunResult:
-    run_config(cfg)
+    run_config(cfg, CACHE)
     return read(result_path(cfg))
 
 
@@ -273,14 +258,28 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     return run(make_config(tmp_path_factory.mktemp("results"), "method.lr=0.01"))
 
 
-def test_apg_lowers_the_loss(finished: RunResult) -> None:
-    rows = finished.iterations
+def test_apg_descends_by_the_gradient_of_its_episodes(finished: RunResult, tmp_path: Path) -> None:
+    rows, cfg = finished.iterations, make_config(tmp_path, "method.lr=0.01")
     assert rows["steps"].tolist() == [HORIZON * i for i in range(ITERATIONS)]
-    spent = rows["steps_forward"].tolist(), rows["steps_gradient"].tolist()
-    assert spent == ([0] * ITERATIONS, [HORIZON * (i + 1) for i in range(ITERATIONS)])
+    assert not rows["steps_forward"].any()
+    assert rows["steps_gradient"].tolist() == [HORIZON * (i + 1) for i in range(ITERATIONS)]
     measured = set(episode_columns(["density", "sdf", "contact"])) | set(BUDGETS)
     assert measured | {"iteration", "episodes", "steps", "gradient_norm", "seconds"} == set(rows.columns)
-    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and (rows["gradient_norm"] > 0).all()
+    (batch,) = shared_batches(CACHE, ([cfg], 1, cfg.method.contact))
+    policy = apg.PolicyTraining(
+        cfg.method, *batch.observation_space.shape, 6, cfg.seed, torch.device("cpu")
+    ).policy
+    adam = torch.optim.Adam(policy.parameters(), 0.01)
+    for _, row in rows.iterrows():
+        first = batch.reset()[1]["loss"][0]
+        adam.zero_grad()
+        done = policy_gradient(batch, policy, HORIZON)
+        assert row["loss"] == done.loss.double().sum()
+        assert row["reward"] == pytest.approx(HORIZON * first - row["loss"], rel=1e-6)
+        assert row["loss_sdf"] == pytest.approx(float(done.terms[:, 0, 1].sum()), rel=1e-6)
+        assert row["gradient_norm"] == pytest.approx(float(gradient_of(policy).norm()), rel=1e-6)
+        adam.step()
+    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0]
     assert finished.best_loss == rows["loss"].min()
     judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
     assert finished.evaluation["score"] == judged.score
@@ -289,7 +288,7 @@ def test_apg_lowers_the_loss(finished: RunResult) -> None:
 def test_apg_resumes_to_the_same_numbers(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, "method.lr=0.01")
     with stopped_at(2, apg, "policy_gradient"):
-        run_config(cfg)
+        run_config(cfg, CACHE)
     assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
     again = run(cfg)
     assert_same_numbers(again, finished)

@@ -1,4 +1,4 @@
-"""What is written twice, for the CPU by tiles and for CUDA by particle or manipulator, computes the same.
+"""Phases written twice, for the CPU by tiles and for CUDA by particle or manipulator, compute the same.
 
 Functions for CUDA that use nothing of warps are compiled for the CPU here, with the CPU's layout of tiles.
 """
@@ -12,7 +12,6 @@ import pytest
 import taichi as ti
 
 import suite
-from plab.scene import Scene
 from plab.sim.cpu_bitcode import address_of
 from plab.sim.cpu_phases import CpuPhases
 from plab.sim.cuda_threads import ThreadPhases
@@ -21,11 +20,7 @@ from plab.sim.skips import Skips
 from plab.sim.storage import FRAME_ADJOINT, STATE
 from plab.sim.transfer import spline
 
-pytestmark = [
-    pytest.mark.skipif(
-        suite.DEVICE != "cpu", reason="what runs on CUDA is compared with the reference there"
-    ),
-]
+pytestmark = pytest.mark.skipif(suite.DEVICE != "cpu", reason="on CUDA the reference is compared with")
 
 SCENES = [
     suite.scene(suite.KINDS, particles=155, grid_size=16),
@@ -190,12 +185,9 @@ class Threads(ThreadPhases):
                     self.retreat_through(e, start, m, actions, actions_bar, 0)
 
 
-@pytest.fixture(scope="module")
-def pair() -> tuple[Tiles, Threads]:
-    return built(SCENES)
-
-
-def built(scenes: list[Scene]) -> tuple[Tiles, Threads]:
+@pytest.fixture(scope="module", params=[MIXED, pytest.param(SCENES, marks=pytest.mark.nightly)])
+def pair(request: pytest.FixtureRequest) -> tuple[Tiles, Threads]:
+    scenes = request.param
     runtime = start_runtime("cpu", "float64")
     both = Tiles(scenes, runtime, Skips(), True), Threads(scenes, runtime, Skips(), True)
     order = np.stack([np.random.default_rng(9).permutation(s.particle_count) for s in scenes])
@@ -267,10 +259,6 @@ def close(left: np.ndarray, right: np.ndarray, name: str) -> None:
 
 
 def test_particles(pair: tuple[Tiles, Threads]) -> None:
-    compare_particles(pair)
-
-
-def compare_particles(pair: tuple[Tiles, Threads]) -> None:
     results = []
     for phases in pair:
         given = drawn(pair[0])
@@ -339,8 +327,3 @@ def test_poses(pair: tuple[Tiles, Threads]) -> None:
         results.append(out | {"adjoint of poses": phases.pose_bar.to_numpy()})
     for name in results[0]:
         close(results[0][name], results[1][name], name)
-
-
-def test_particles_of_mixed_materials() -> None:
-    """Comes last: it starts Taichi anew, which ends the other pair."""
-    compare_particles(built(MIXED))

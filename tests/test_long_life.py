@@ -1,52 +1,44 @@
-"""One process that carries out many runs, or begins many episodes, holds no more at the end than early on."""
+"""Memory, threads and files of a process with many runs or episodes."""
 
 from __future__ import annotations
 
-import json
+import gc
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-pytestmark = [
-    pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
-]
-
-GROWTH = 1.05
-"""Of memory, from a tenth of the way to its end."""
-
-SHORT = 1.10
-"""The same of few runs, where what is loaded late counts for more."""
+from plab import runners
+from plab.cli.run import main
+from plab.envs.single import PlabEnv
+from toy_runner import COARSE
 
 
-def live(folder: Path, what: str, count: int, growth: float) -> None:
-    done = subprocess.run(
-        [sys.executable, Path(__file__).parent / "long_life.py", what, str(count)],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    print(done.stdout)
-    early, *_, late = (json.loads(line) for line in done.stdout.splitlines() if line.startswith("{"))
-    assert (early["done"], late["done"]) == (count // 10, count)
-    assert late["rss"] <= growth * early["rss"]
-    assert late.get("device", 0.0) <= growth * early.get("device", 0.0)
-    for name in ("threads", "files", "locks"):
-        assert late[name] <= early[name], name
-    assert late["locks"] <= 1
-
-
-@pytest.mark.parametrize(("what", "count"), [("runs", 60), ("resets", 500)])
-def test_memory_threads_files_and_locks_do_not_grow(tmp_path: Path, what: str, count: int) -> None:
-    live(tmp_path, what, count, SHORT)
+def held() -> tuple[float, int, int]:
+    """Return resident memory [MB], threads and open files of this process."""
+    gc.collect()
+    state = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(state["VmRSS"].split()[0]) / 1024.0, int(state["Threads"]), len(os.listdir("/proc/self/fd"))
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("what", "count"), [("runs", 2000), ("resets", 10_000)])
-def test_nothing_grows_in_a_long_life(tmp_path: Path, what: str, count: int) -> None:
-    live(tmp_path, what, count, GROWTH)
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_nothing_grows_with_many_runs_and_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    intact, runs, episodes = runners.run_batch, [], []
+    monkeypatch.setattr(runners, "run_batch", lambda *batch: runs.append(held()) or intact(*batch))
+    words = ["sim.horizon=2", "method.iterations=1", "progress=false", "hydra.launcher.batch_size=1"]
+    assert main(["-m", *COARSE, *words, "seed=range(400)"]) == 0
+    env = PlabEnv("Rope", overrides=[*COARSE, "sim.horizon=2"])
+    for number in range(3000):
+        env.reset(seed=number)
+        if number % 10 == 0:
+            env.step(env.action_space.sample())
+            episodes.append(held())
+    env.close()
+    # From a tenth of the way on.
+    for seen in (runs, episodes):
+        early, late = seen[len(seen) // 10], seen[-1]
+        assert late[0] <= 1.05 * early[0] and late[1:] <= early[1:], seen[:: len(seen) // 10]
+    assert not list(tmp_path.rglob("*.lock"))

@@ -67,17 +67,6 @@ NO_ACTION = torch.zeros(0, dtype=torch.float64)
 # ----------------------------------------------------------------------------------------------------- motion
 
 
-def test_free_fall() -> None:
-    scene = make_scene(gravity=(1.0, -30.0, 2.0))
-    start = ref.initial_state(scene)
-    end = ref.env_step(scene, start, NO_ACTION, 0.0)
-    k, g = scene.substeps, torch.tensor(scene.gravity, dtype=torch.float64)
-    torch.testing.assert_close(end.v, (k * scene.dt * g).expand_as(end.v), rtol=0, atol=1e-11)
-    fall = scene.dt**2 * k * (k + 1) / 2 * g
-    torch.testing.assert_close(end.x - start.x, fall.expand_as(end.x), rtol=0, atol=1e-14)
-    torch.testing.assert_close(end.F, start.F, rtol=0, atol=1e-11)
-
-
 def test_momentum_is_conserved_and_its_first_moment_changes_by_the_stress() -> None:
     """sum m (v x^T + dx^2/4 C) changes by -dt V sum tau: fixes the sign of tau and the order of C's indices.
 
@@ -100,27 +89,6 @@ def test_momentum_is_conserved_and_its_first_moment_changes_by_the_stress() -> N
     torch.testing.assert_close(impulse, impulse.T, rtol=0, atol=1e-12)
 
 
-def test_affine_velocity_survives_the_transfers() -> None:
-    scene = make_scene(gravity=(0.0, 0.0, 0.0), youngs_modulus=1e-9)
-    A = random_matrices((3, 3), 2.0)
-    start = ref.initial_state(scene)
-    start = replace(start, v=start.x @ A.T, C=A.expand(len(start.x), 3, 3))
-    end = ref.substep(scene, start, NO_ACTION, 0.0)
-    torch.testing.assert_close(end.v, start.v, rtol=0, atol=1e-9)
-    torch.testing.assert_close(end.C, start.C, rtol=0, atol=1e-9)
-
-
-def test_mass_tensor_conserves_mass_and_centre() -> None:
-    scene = make_scene()
-    x = ref.initial_state(scene).x
-    mass = ref.mass_tensor(scene, x)
-    at = torch.arange(scene.grid_size, dtype=torch.float64) * scene.dx
-    assert mass.shape == (16, 16, 16)
-    torch.testing.assert_close(mass.sum(), torch.tensor(40 * scene.particle_mass, dtype=torch.float64))
-    centre = torch.stack([(mass.sum(dim=(1, 2)) * at).sum(), (mass.sum(dim=(0, 2)) * at).sum()])
-    torch.testing.assert_close(centre, scene.particle_mass * x.sum(dim=0)[:2])
-
-
 def test_ghost_node_mass_goes_to_node_0_and_no_weight_is_negative() -> None:
     scene = make_scene()
     corner = torch.zeros(1, 3, dtype=torch.float64)
@@ -132,31 +100,6 @@ def test_ghost_node_mass_goes_to_node_0_and_no_weight_is_negative() -> None:
 
 
 # --------------------------------------------------------------------------------------------------- material
-
-
-def test_plastic_flow_keeps_volume_and_lands_on_the_yield_surface() -> None:
-    scene = make_scene()
-    F_trial = IDENTITY + random_matrices((50, 3, 3), 0.05)
-    F, R = ref.return_mapping(scene, F_trial)
-    strain = torch.linalg.svdvals(F).log()
-    deviator = (strain - strain.mean(dim=-1, keepdim=True)).norm(dim=-1)
-    radius = scene.yield_stress / (2.0 * scene.material.shear_modulus)
-    flows = (F != F_trial).any(dim=(1, 2))
-    assert flows.sum() > 40
-    torch.testing.assert_close(torch.linalg.det(F), torch.linalg.det(F_trial), rtol=1e-12, atol=0)
-    # sqrt(e_dev . e_dev + 1e-8) lands just inside the surface.
-    assert ((radius - deviator[flows]) >= -1e-12).all() and ((radius - deviator[flows]) < 1e-4).all()
-    torch.testing.assert_close(R @ R.mT, IDENTITY.expand(50, 3, 3), rtol=0, atol=1e-13)
-    P = R.mT @ F_trial
-    torch.testing.assert_close(P, P.mT, rtol=0, atol=1e-13)
-
-
-def test_without_yielding_the_trial_is_kept_bit_for_bit() -> None:
-    F_trial = IDENTITY + random_matrices((10, 3, 3), 0.3)
-    F, _ = ref.return_mapping(make_scene(yield_stress=math.inf), F_trial)
-    assert torch.equal(F, F_trial)
-    small = IDENTITY + random_matrices((10, 3, 3), 1e-4)
-    assert torch.equal(ref.return_mapping(make_scene(), small)[0], small)
 
 
 def test_inverted_element_has_a_proper_rotation_and_leaves_uninverted() -> None:
@@ -195,9 +138,8 @@ def test_normal_is_the_gradient_of_the_distance(shape: str) -> None:
     assert on_surface[d > 0].abs().max() < 1e-12
 
 
-@pytest.mark.parametrize(
-    ("shape", "point", "distance"),
-    [
+def test_distance_at_points_of_its_own_frame() -> None:
+    for shape, point, distance in (
         ("Sphere", (0.0, 0.2, 0.0), 0.12),
         ("Capsule", (0.0, 0.2, 0.0), 0.05),
         ("Capsule", (0.07, 0.1, 0.0), 0.02),
@@ -211,13 +153,11 @@ def test_normal_is_the_gradient_of_the_distance(shape: str) -> None:
         ("Box", (0.11, 0.09, 0.0), 0.05),
         ("Box", (0.01, 0.02, 0.09), -0.01),
         ("Box", (0.10, -0.06, 0.12), 0.03),
-    ],
-)
-def test_distance_at_points_of_its_own_frame(shape: str, point: tuple[float, ...], distance: float) -> None:
-    manipulator = replace(MANIPULATORS[shape], rotation=(1.0, 0.0, 0.0, 0.0), position=(0.3, 0.2, 0.1))
-    world = torch.tensor(point, dtype=torch.float64) + torch.tensor(manipulator.position, dtype=torch.float64)
-    d, _ = ref.signed_distance(manipulator, pose_of(manipulator), world)
-    assert math.isclose(d, distance, abs_tol=1e-12)
+    ):
+        manipulator = replace(MANIPULATORS[shape], rotation=(1.0, 0.0, 0.0, 0.0), position=(0.3, 0.2, 0.1))
+        world = pose_of(manipulator)[:3] + torch.tensor(point, dtype=torch.float64)
+        d, _ = ref.signed_distance(manipulator, pose_of(manipulator), world)
+        assert math.isclose(d, distance, abs_tol=1e-12), (shape, point)
 
 
 def test_rolling_pin_motion() -> None:
@@ -339,43 +279,11 @@ def test_floor_and_walls_by_hand() -> None:
             assert result[row].tolist() == pytest.approx(expected, abs=1e-14), (friction, row)
 
 
-def test_sticking_sphere_carries_the_block_at_its_own_velocity() -> None:
-    sphere = Manipulator("Sphere", (0.6,), (0.5, 0.5, 0.5), scale=(0.0, 0.006, 0.0), friction=10.0)
-    scene = make_scene(manipulators=(sphere,), bodies=(Body("box", (0.5, 0.7, 0.5), (0.01, 0.01, 0.01), 5),))
-    end = ref.substep(scene, ref.initial_state(scene), torch.ones(3, dtype=torch.float64), 0.0)
-    expected = torch.tensor([0.0, 0.006 / (scene.substeps * scene.dt), 0.0], dtype=torch.float64)
-    torch.testing.assert_close(end.v, expected.expand(5, 3), rtol=0, atol=1e-11)
-
-
-def test_static_obstacle_stops_a_falling_block() -> None:
-    cylinder = Manipulator("Cylinder", (0.3, 0.1), (0.5, 0.25, 0.5), friction=0.0)
-    lowest = []
-    for manipulators in ((cylinder,), ()):
-        body = Body("box", (0.5, 0.375, 0.5), (0.1, 0.05, 0.1), 40)
-        scene = make_scene(manipulators=manipulators, bodies=(body,))
-        start = ref.initial_state(scene)
-        state = replace(start, v=torch.tensor([0.0, -2.0, 0.0], dtype=torch.float64).expand(40, 3))
-        for _ in range(10):
-            state = ref.env_step(scene, state, NO_ACTION, 0.0)
-        assert torch.equal(state.poses, start.poses)
-        lowest.append(state.x[:, 1].min().item())
-    assert lowest[0] > 0.35 and lowest[1] < 0.33
-
-
 # --------------------------------------------------------------------------------------------------- gradient
 
 
 @pytest.mark.parametrize("varied", ["actions", "x", "v", "F"])
-@pytest.mark.parametrize(
-    ("shapes", "alpha"),
-    [
-        (("Sphere", "Cylinder"), 666.0),
-        (("Chopsticks",), 60.0),
-        (("RollingPin",), 60.0),
-        (("Box", "Torus"), 60.0),
-        (("Sphere",), 0.0),
-    ],
-)
+@pytest.mark.parametrize(("shapes", "alpha"), [(tuple(MANIPULATORS), 60.0), (("Sphere",), 0.0)])
 def test_autograd_matches_central_differences(shapes: tuple[str, ...], alpha: float, varied: str) -> None:
     scene = make_scene(*shapes)
     start = deformed_state(scene)
@@ -395,17 +303,3 @@ def test_autograd_matches_central_differences(shapes: tuple[str, ...], alpha: fl
         difference = (loss(1e-7) - loss(-1e-7)) / 2e-7
     assert abs(slope) > 1e-4
     assert math.isclose(slope, difference, rel_tol=1e-5), (slope, difference)
-
-
-def test_contact_loss_ignores_static_manipulators() -> None:
-    zeros = torch.zeros(16, 16, 16, dtype=torch.float64)
-    scene = make_scene("Cylinder", bodies=(Body("box", (0.5, 0.2, 0.5), (0.1, 0.1, 0.1), 10),))
-    state = ref.initial_state(scene)
-    assert ref.loss_terms(scene, state, zeros, zeros)[2] == 0
-    scene = replace(scene, manipulators=(*scene.manipulators, MANIPULATORS["Sphere"]))
-    state = ref.initial_state(scene)
-    terms = ref.loss_terms(scene, state, zeros, zeros + 2.0)
-    nearest = (state.x - state.poses[1, :3]).norm(dim=-1).min() - 0.08
-    torch.testing.assert_close(terms[2], nearest**2)
-    torch.testing.assert_close(terms[1], 2.0 * terms[0])
-    torch.testing.assert_close(terms[0], torch.tensor(10 * scene.particle_mass, dtype=torch.float64))
