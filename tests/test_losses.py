@@ -55,12 +55,6 @@ def with_tools(*kinds: str) -> list[Scene]:
     return [replace(made, manipulators=tools(made, kinds)) for made in SCENES]
 
 
-@pytest.fixture(scope="module")
-def bare(device: str) -> Simulator:
-    """A simulator without terms."""
-    return Simulator(with_tools("Sphere"), device=device)
-
-
 def distances(simulator: Simulator, e: int) -> tuple[np.ndarray, np.ndarray]:
     """Distances of all particles from the moving manipulators, and normals: [manipulator, particle(, 3)]."""
     state, tools = simulator.state(), simulator.scenes[e].manipulators
@@ -90,7 +84,8 @@ def test_a_wrong_gradient_is_noticed(device: str) -> None:
     assert errors["x"] > 0.5 and errors["v"] > 0.1 and errors["poses"] < 1e-6
 
 
-def test_a_term_of_weight_0_is_not_there(bare: Simulator, device: str) -> None:
+def test_a_term_of_weight_0_is_not_there(device: str) -> None:
+    bare = Simulator(with_tools("Sphere"), device=device)
     terms = make_terms({"density": 0.0, "contact": 2.0})
     simulator = Simulator(bare.scenes, terms=terms, device=device)
     assert [term.name for term in simulator.terms] == ["contact"]
@@ -100,29 +95,6 @@ def test_a_term_of_weight_0_is_not_there(bare: Simulator, device: str) -> None:
     assert bare.measure().terms.shape == (2, 0) and np.isnan(bare.measure().iou).all()
     with pytest.raises(ValueError, match="no loss"):
         bare.rollout(np.zeros((2, 1, bare.action_dim)))
-
-
-def test_the_way_back_is_refused_once_it_is_gone(bare: Simulator) -> None:
-    bare.reset()
-    u = torch.zeros((2, 2, bare.action_dim), requires_grad=True)
-    states = simulate(bare, u, every_step=False)
-    assert states.x.shape == (2, 1, bare.particle_count, 3) and states.mass.shape[:2] == (2, 1)
-    np.testing.assert_allclose(states.mass[:, 0].detach(), bare.mass_tensor(), atol=1e-9)
-    bare.reset()
-    with pytest.raises(RuntimeError, match="pull back"):
-        states.x.sum().backward()
-    with pytest.raises(TypeError, match="'y'"):
-        simulate(bare, u, y=u)
-    with pytest.raises(RuntimeError, match="full_gradient=True"):
-        simulate(bare, u, x=states.x[:, 0].detach().requires_grad_()).v.sum().backward()
-    recording = bare.record(np.zeros((2, 1, bare.action_dim)))
-    with pytest.raises(ValueError, match=r"by v .*\(2, 1\)"):
-        recording.pullback(v=np.zeros((2, 1)))
-    broken = bare.state()
-    broken.v[0, 0] = 1e9
-    bare.set_initial_state(broken)
-    with pytest.raises(SimulationError, match="environment 0"):
-        bare.record(np.zeros((2, 1, bare.action_dim)))
 
 
 def test_terms_that_do_not_exist_are_named() -> None:
@@ -268,3 +240,25 @@ def test_measures_are_the_formulas_and_the_gradient_of_all_is_summed(full: Simul
         moving = [m.shape != "Cylinder" for m in full.scenes[e].manipulators]
         back = -pulls.sum(axis=1)
         np.testing.assert_allclose(gradient.poses[e, moving, :3], back, atol=1e-9 * np.abs(pulls).sum())
+
+
+def test_the_way_back_is_refused_once_it_is_gone(full: Simulator) -> None:
+    full.reset()
+    u = torch.zeros((2, 2, full.action_dim), requires_grad=True)
+    states = simulate(full, u, every_step=False)
+    assert states.x.shape == (2, 1, full.particle_count, 3) and states.mass.shape[:2] == (2, 1)
+    np.testing.assert_allclose(states.mass[:, 0].detach(), full.mass_tensor(), atol=1e-9)
+    full.reset()
+    with pytest.raises(RuntimeError, match="pull back"):
+        states.x.sum().backward()
+    with pytest.raises(TypeError, match="'y'"):
+        simulate(full, u, y=u)
+    recording = full.record(np.zeros((2, 1, full.action_dim)))
+    with pytest.raises(ValueError, match=r"by v .*\(2, 1\)"):
+        recording.pullback(v=np.zeros((2, 1)))
+    full.reset()
+    broken = full.state()
+    broken.v[0, 0] = 1e9
+    full.set_initial_state(broken)
+    with pytest.raises(SimulationError, match="environment 0"):
+        full.record(np.zeros((2, 1, full.action_dim)))

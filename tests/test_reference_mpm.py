@@ -64,9 +64,6 @@ def pose_of(manipulator: Manipulator) -> Tensor:
 NO_ACTION = torch.zeros(0, dtype=torch.float64)
 
 
-# ----------------------------------------------------------------------------------------------------- motion
-
-
 def test_momentum_is_conserved_and_its_first_moment_changes_by_the_stress() -> None:
     """sum m (v x^T + dx^2/4 C) changes by -dt V sum tau: fixes the sign of tau and the order of C's indices.
 
@@ -89,29 +86,6 @@ def test_momentum_is_conserved_and_its_first_moment_changes_by_the_stress() -> N
     torch.testing.assert_close(impulse, impulse.T, rtol=0, atol=1e-12)
 
 
-def test_ghost_node_mass_goes_to_node_0_and_no_weight_is_negative() -> None:
-    scene = make_scene()
-    corner = torch.zeros(1, 3, dtype=torch.float64)
-    mass = ref.mass_tensor(scene, corner) / scene.particle_mass
-    assert mass.min() == 0
-    assert math.isclose(mass[0, 0, 0], 0.875**3, rel_tol=1e-14)
-    assert math.isclose(mass[1, 0, 0], 0.125 * 0.875**2, rel_tol=1e-14)
-    assert math.isclose(mass.sum(), 1.0, rel_tol=1e-14)
-
-
-# --------------------------------------------------------------------------------------------------- material
-
-
-def test_inverted_element_has_a_proper_rotation_and_leaves_uninverted() -> None:
-    F_trial = torch.diag(torch.tensor([1.0, 1.1, -0.9], dtype=torch.float64))[None]
-    U, S, Vt = ref.proper_svd(F_trial)
-    torch.testing.assert_close(U * S[..., None, :] @ Vt, F_trial)
-    assert S[0, 2] < 0 and torch.linalg.det(U) > 0 and torch.linalg.det(Vt) > 0
-    F, R = ref.return_mapping(make_scene(), F_trial)
-    assert torch.linalg.det(R) > 0
-    assert math.isclose(torch.linalg.det(F), 1.1 * 1.0 * 0.05, rel_tol=1e-12)
-
-
 def test_stress_is_the_derivative_of_the_fixed_corotated_energy() -> None:
     scene = make_scene()
     F = (IDENTITY + random_matrices((4, 3, 3), 0.1)).requires_grad_()
@@ -120,9 +94,6 @@ def test_stress_is_the_derivative_of_the_fixed_corotated_energy() -> None:
     (P,) = torch.autograd.grad(strain_energy + volume_energy, F)
     U, _, Vt = ref.proper_svd(F)
     torch.testing.assert_close(ref.kirchhoff_stress(scene, F, U @ Vt), P @ F.mT, rtol=1e-10, atol=1e-9)
-
-
-# ----------------------------------------------------------------------------------------------- manipulators
 
 
 @pytest.mark.parametrize("shape", MANIPULATORS)
@@ -138,86 +109,41 @@ def test_normal_is_the_gradient_of_the_distance(shape: str) -> None:
     assert on_surface[d > 0].abs().max() < 1e-12
 
 
-def test_distance_at_points_of_its_own_frame() -> None:
-    for shape, point, distance in (
-        ("Sphere", (0.0, 0.2, 0.0), 0.12),
-        ("Capsule", (0.0, 0.2, 0.0), 0.05),
-        ("Capsule", (0.07, 0.1, 0.0), 0.02),
-        ("Chopsticks", (0.08, 0.0, 0.03), -0.02),
-        ("Chopsticks", (-0.08, -0.25, 0.0), 0.0),
-        ("Chopsticks", (0.08, 0.2, 0.0), 0.15),
-        ("Torus", (0.0, 0.0, 0.0), 0.04),
-        ("Torus", (0.0, 0.05, -0.09), 0.0),
-        ("Cylinder", (0.11, 0.14, 0.0), 0.05),
-        ("Cylinder", (0.0, 0.06, 0.05), -0.03),
-        ("Box", (0.11, 0.09, 0.0), 0.05),
-        ("Box", (0.01, 0.02, 0.09), -0.01),
-        ("Box", (0.10, -0.06, 0.12), 0.03),
-    ):
-        manipulator = replace(MANIPULATORS[shape], rotation=(1.0, 0.0, 0.0, 0.0), position=(0.3, 0.2, 0.1))
-        world = pose_of(manipulator)[:3] + torch.tensor(point, dtype=torch.float64)
-        d, _ = ref.signed_distance(manipulator, pose_of(manipulator), world)
-        assert math.isclose(d, distance, abs_tol=1e-12), (shape, point)
+Y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+H = math.sqrt(0.5)
+# A pin along z, turned by 90 degrees about x.
+PIN = Manipulator("RollingPin", (0.3, 0.03), (0.5, 0.2, 0.5), (H, H, 0.0, 0.0), (0.6, 0.09, 0.003))
+STICKS = replace(MANIPULATORS["Chopsticks"], rotation=(1.0, 0.0, 0.0, 0.0), minimal_gap=0.15)
+BOX = replace(MANIPULATORS["Box"], rotation=(H, H, 0.0, 0.0), upper_bound=(0.51, 1.0, 1.0))
+C, S = math.cos(0.2 / 3), math.sin(0.2 / 3)
 
 
-def test_rolling_pin_motion() -> None:
-    """A pin along z (turned by 90 degrees about x) rolls along x, yaws about y and moves up as told."""
-    h = math.sqrt(0.5)
-    pin = Manipulator("RollingPin", (0.3, 0.03), (0.5, 0.2, 0.5), (h, h, 0.0, 0.0), (0.6, 0.09, 0.003))
-    scene = make_scene(manipulators=(pin,))
-    pose = ref.initial_state(scene).poses
-    moved = ref.move_manipulators(scene, pose, torch.tensor([0.5, 0.0, 2.0]))[0]
-    roll = 0.5 * 0.6 / 3
-    expected = torch.tensor([0.5 - 0.03 * roll, 0.2 + 0.001, 0.5], dtype=torch.float64)
-    torch.testing.assert_close(moved[:3], expected, rtol=0, atol=1e-15)
-    # It turns about own y, which is world z here, so that its lowest point stands still on the table.
-    frame = ref.to_frame(pose[0], torch.tensor([0.5, 0.17, 0.5], dtype=torch.float64))
-    lowest = ref.from_frame(torch.cat([moved[:1], pose[0, 1:3], moved[3:]]), frame)
-    assert abs(lowest[0] - 0.5) < 0.03 * roll**3
-    yawed = ref.move_manipulators(scene, pose, torch.tensor([0.0, 1.0, 0.0]))[0]
-    axis = ref.rotate(yawed[3:7], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
-    expected = torch.tensor([-math.sin(0.03), 0.0, math.cos(0.03)], dtype=torch.float64)
-    torch.testing.assert_close(axis, expected, rtol=0, atol=1e-15)
-
-
-def test_chopsticks_close_to_the_minimal_gap_and_rotate_in_their_own_frame() -> None:
-    scene = make_scene("Chopsticks")
-    sticks = replace(MANIPULATORS["Chopsticks"], minimal_gap=0.15)
-    scene = replace(scene, manipulators=(sticks,))
-    pose = ref.initial_state(scene).poses
-    close = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.3], dtype=torch.float64)
-    moved = ref.move_manipulators(scene, pose, close)[0]
-    assert math.isclose(moved[7], 0.16 - 0.3 * 0.05 / 3, rel_tol=1e-14)
-    assert ref.move_manipulators(scene, pose, torch.ones(7))[0, 7] == 0.15
-    y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    torch.testing.assert_close(ref.rotate(moved[3:7], y), ref.rotate(pose[0, 3:7], y))  # about own y
-    assert math.isclose(2 * torch.acos((moved[3:7] * pose[0, 3:7]).sum()), 0.6 * 0.2 / 3, rel_tol=1e-9)
-
-
-def test_box_rotates_in_the_world_frame_and_stays_within_its_bounds() -> None:
-    box = replace(MANIPULATORS["Box"], upper_bound=(0.51, 1.0, 1.0))
-    scene = make_scene(manipulators=(box,))
-    pose = ref.initial_state(scene).poses
-    action = torch.tensor([1.0, -0.6, 0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
-    moved = ref.move_manipulators(scene, pose, action)[0]
-    expected = torch.tensor([0.51, 0.61, 0.5], dtype=torch.float64)
-    torch.testing.assert_close(moved[:3], expected, rtol=0, atol=1e-14)
-    angle = 0.2 / 3
-    x, y, z = ref.rotate(pose[0, 3:7], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
-    c, s = math.cos(angle), math.sin(angle)
-    turned = ref.rotate(moved[3:7], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
-    torch.testing.assert_close(turned, torch.stack([c * x + s * z, y, c * z - s * x]), rtol=0, atol=1e-14)
-
-
-def test_rotation_quaternion_is_smooth_at_zero() -> None:
-    for angle in (0.0, 1e-9, 1e-3, 0.0199999, 0.0200001, 1.0, 3.0):
-        rotvec = angle * torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
-        q = ref.rotation_quaternion(rotvec)
-        values = [math.cos(angle / 2), *(math.sin(angle / 2) * c for c in (0.6, 0.0, -0.8))]
-        torch.testing.assert_close(q, torch.tensor(values, dtype=torch.float64), rtol=0, atol=1e-15)
-    zero = torch.zeros(3, dtype=torch.float64)
-    jacobian = torch.autograd.functional.jacobian(ref.rotation_quaternion, zero)
-    torch.testing.assert_close(jacobian, torch.cat([torch.zeros(1, 3, dtype=torch.float64), IDENTITY / 2.0]))
+@pytest.mark.parametrize(
+    ("manipulator", "action", "position", "y_axis", "gap"),
+    [
+        # Rolls along x about its own axis, and moves up.
+        (PIN, (0.5, 0.0, 2.0), (0.497, 0.201, 0.5), (0.0, 0.0, 1.0), 0.0),
+        # Yaws about the world's y.
+        (PIN, (0.0, 1.0, 0.0), (0.5, 0.2, 0.5), (-math.sin(0.03), 0.0, math.cos(0.03)), 0.0),
+        # Close, to the minimal gap, and rotate in their own frame.
+        (STICKS, (0.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.3), (0.52, 0.66, 0.5), (0.0, 1.0, 0.0), 0.155),
+        (STICKS, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.52, 0.66, 0.5), (0.0, 1.0, 0.0), 0.15),
+        # Rotates in the world's frame, and stays within its bounds.
+        (BOX, (1.0, -0.6, 0.0, 0.0, 1.0, 0.0), (0.51, 0.61, 0.5), (S, 0.0, C), 0.0),
+    ],
+)
+def test_motion_by_hand(manipulator: Manipulator, action, position, y_axis, gap: float) -> None:
+    scene = make_scene(manipulators=(manipulator,))
+    start = ref.initial_state(scene).poses
+    moved = ref.move_manipulators(scene, start, torch.tensor(action, dtype=torch.float64))[0]
+    expected = torch.tensor([*position, *y_axis], dtype=torch.float64)
+    got = torch.cat([moved[:3], ref.rotate(moved[3:7], Y)])
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-14)
+    if gap:
+        assert math.isclose(moved[7], gap, rel_tol=1e-14)
+    turned = 2 * torch.acos((moved[3:7] * start[0, 3:7]).sum().abs().clamp(max=1.0))
+    angle = {"RollingPin": 0.1 * action[0] or 0.03, "Chopsticks": 0.04 * action[4], "Box": 0.2 / 3}
+    assert math.isclose(turned, angle[manipulator.shape], rel_tol=1e-9, abs_tol=1e-7)
 
 
 def test_rigid_velocity_is_translation_plus_rotation() -> None:
@@ -233,9 +159,6 @@ def test_rigid_velocity_is_translation_plus_rotation() -> None:
     assert (
         ref.rigid_velocity(rough, rough, points, 1e-4).abs().max() < 1e-10
     )  # at rest, if not of unit length
-
-
-# ---------------------------------------------------------------------------------------------------- contact
 
 
 def test_hard_and_soft_contact_by_hand() -> None:
@@ -279,27 +202,25 @@ def test_floor_and_walls_by_hand() -> None:
             assert result[row].tolist() == pytest.approx(expected, abs=1e-14), (friction, row)
 
 
-# --------------------------------------------------------------------------------------------------- gradient
-
-
-@pytest.mark.parametrize("varied", ["actions", "x", "v", "F"])
 @pytest.mark.parametrize(("shapes", "alpha"), [(tuple(MANIPULATORS), 60.0), (("Sphere",), 0.0)])
-def test_autograd_matches_central_differences(shapes: tuple[str, ...], alpha: float, varied: str) -> None:
+def test_autograd_matches_central_differences(shapes: tuple[str, ...], alpha: float) -> None:
+    """By actions and each part of the state, with soft and with hard contact."""
     scene = make_scene(*shapes)
     start = deformed_state(scene)
     target_mass = ref.mass_tensor(scene, start.x + 0.03)
     target_sdf = random_matrices((16, 16, 16), 1.0).abs()
     inputs = {"actions": random_matrices((2, scene.action_dim), 0.4, seed=5), **vars(start)}
-    direction = random_matrices(inputs[varied].shape, 1.0, seed=6)
+    for varied in ("actions", "x", "v", "F"):
+        direction = random_matrices(inputs[varied].shape, 1.0, seed=6)
 
-    def loss(step: float | Tensor) -> Tensor:
-        values = {**inputs, varied: inputs[varied] + step * direction}
-        actions = values.pop("actions")
-        return ref.rollout_loss(scene, ref.State(**values), actions, alpha, target_mass, target_sdf)[0]
+        def loss(step: float | Tensor, varied: str = varied, direction: Tensor = direction) -> Tensor:
+            values = {**inputs, varied: inputs[varied] + step * direction}
+            actions = values.pop("actions")
+            return ref.rollout_loss(scene, ref.State(**values), actions, alpha, target_mass, target_sdf)[0]
 
-    step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(loss(step), step)
-    with torch.no_grad():
-        difference = (loss(1e-7) - loss(-1e-7)) / 2e-7
-    assert abs(slope) > 1e-4
-    assert math.isclose(slope, difference, rel_tol=1e-5), (slope, difference)
+        step = torch.zeros((), dtype=torch.float64, requires_grad=True)
+        (slope,) = torch.autograd.grad(loss(step), step)
+        with torch.no_grad():
+            difference = (loss(1e-7) - loss(-1e-7)) / 2e-7
+        assert abs(slope) > 1e-4
+        assert math.isclose(slope, difference, rel_tol=1e-5), (varied, slope, difference)

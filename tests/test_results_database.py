@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
-import subprocess
-import sys
-import time
 from contextlib import closing
 from pathlib import Path
 
@@ -20,39 +15,18 @@ import synthetic
 from plab.cli.render import _parse as parse_render
 from plab.cli.render import main as render
 from plab.cli.results import main
-from plab.cli.status import main as status
 from plab.config.selection import Selection
-from plab.examples import example_archive
 from plab.report.collect import collect
-from plab.results import (
-    ResultsError,
-    connect,
-    load,
-    loading,
-    pack,
-    read,
-    read_curves,
-    result_path,
-    rows,
-    write,
-)
+from plab.results import ResultsError, connect, load, loading, pack, read, read_curves, rows, write
 from plab.status import survey
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three finished runs that have not changed for a while."""
-    for seed in range(3):
-        age(synthetic.save(synthetic.run(tmp_path / "results", seed=seed)))
-    return tmp_path / "results"
-
-
-@pytest.fixture
-def scored(folder: Path) -> Path:
-    """Three finished runs that score 0.5, 0.75 and 0.25."""
+    """Three finished runs that score 0.5, 0.75 and 0.25 and have not changed for a while."""
     for seed, score in enumerate((0.5, 0.75, 0.25)):
-        age(synthetic.save(synthetic.run(folder, seed=seed, score=score)))
-    return folder
+        age(synthetic.save(synthetic.run(tmp_path / "results", seed=seed, score=score)))
+    return tmp_path / "results"
 
 
 def age(path: Path, seconds: float = 60.0) -> None:
@@ -83,7 +57,7 @@ def ask(source: Path | list[Path], sql: str) -> list[tuple]:
 # --------------------------------------------------------------------------------------------- same as files
 
 
-def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list[str], monkeypatch) -> None:
+def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list[str]) -> None:
     archive = folder.parent / "all.plab.zip.xz"
     pack(folder, archive)
     age(archive)
@@ -97,12 +71,6 @@ def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list
         digests.add(collect(source, Selection()).digest)
         assert not opened
     assert len(digests) == 1 and collect(folder, Selection({"seed": ["0"]}, {})).digest not in digests
-    # However the folder is given.
-    monkeypatch.chdir(folder.parent)
-    for place in ("results/", "./results"):
-        assert all(Path(path).is_file() for path in load(place)["path"])
-    monkeypatch.chdir(folder)
-    assert len(load(".")) == 3 and not opened
 
 
 def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
@@ -148,19 +116,6 @@ def test_changed_new_and_removed_files_are_noticed(folder: Path, opened: list[st
     pd.testing.assert_frame_equal(pd.DataFrame(unchanged), read(kept).iterations)
 
 
-def test_files_that_change_places_are_noticed(folder: Path) -> None:
-    one, other, _ = (Path(path) for path in load(folder)["path"])
-    size = max(one.stat().st_size, other.stat().st_size)
-    for path in (one, other):
-        path.write_bytes(path.read_bytes().ljust(size, b"\0"))
-        os.utime(path, (1e9, 1e9))
-    load(folder)
-    between = folder / "between"
-    one.rename(between), other.rename(one), between.rename(other)
-    pd.testing.assert_frame_equal(load(folder), load(folder, database=False))
-    assert ask(folder, "SELECT count(DISTINCT seed) FROM runs") == [(3,)]
-
-
 def test_unreadable_files_are_named_each_time(folder: Path) -> None:
     bad = folder / "bad.h5"
     bad.write_bytes(b"nothing")
@@ -170,8 +125,6 @@ def test_unreadable_files_are_named_each_time(folder: Path) -> None:
             assert len(load(folder)) == 3
         with pytest.warns(UserWarning, match=r"left out 1 unreadable file\(s\): .*bad\.h5"):
             assert ask(folder, "SELECT count(*) FROM runs") == [(3,)]
-    with pytest.raises(ResultsError, match=r"bad\.h5"):
-        connect([bad, bad])
     with pytest.raises(ResultsError, match="nowhere"):
         connect([folder, folder / "nowhere"])
 
@@ -182,38 +135,6 @@ def test_a_damaged_database_is_rebuilt_silently(folder: Path, recwarn) -> None:
         path.write_bytes(path.read_bytes()[:5000] + b"x" * 99)
     pd.testing.assert_frame_equal(load(folder), expected)
     assert ask(folder, "SELECT count(*) FROM runs") == [(3,)] and not recwarn.list
-
-
-_READER = """
-import sys
-from contextlib import closing
-from plab.results import connect, load
-for _ in range(6):
-    seeds = load(sys.argv[1])["seed"].tolist()
-    assert set(seeds) >= {0, 1, 2}, seeds
-    with closing(connect(sys.argv[1])) as connection:
-        (count,), = connection.execute("SELECT count(*) FROM runs WHERE seed < 3")
-    assert count == 3, count
-"""
-
-
-def test_processes_at_once(folder: Path, tmp_path: Path) -> None:
-    environment = os.environ | {"PLAB_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-W", "error", "-c", _READER, str(folder)]
-    readers = [subprocess.Popen(command, env=environment) for _ in range(2)]
-    try:
-        # Runs come, change and go all the while.
-        for seed in (seed for _ in range(1000) for seed in range(3, 9)):
-            path = synthetic.save(synthetic.run(folder, seed=seed))
-            os.utime(path, (1e9, 1e9))
-            result_path(synthetic.config(folder, seed=3 + (seed - 1) % 6)).unlink(missing_ok=True)
-            time.sleep(0.05)
-            if all(reader.poll() is not None for reader in readers):
-                break
-    finally:
-        codes = [reader.wait() for reader in readers]
-    assert codes == [0, 0]
-    pd.testing.assert_frame_equal(load(folder), load(folder, database=False))
 
 
 # ------------------------------------------------------------------------------------------------------- SQL
@@ -258,27 +179,18 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
     # Loose files that are as good as each other all stay; what an archive has beside them does not.
     assert ask(sources, listed) == [*of_one, *((str(two), seed, 0.5, None) for seed in (1, 2))]
     assert len(load(sources)) == 4
-    assert ask(one, listed) == of_one
-    assert ask([archive, archive], "SELECT count(*), count(DISTINCT folder) FROM runs") == [(2, 1)]
     for name in ("evaluations", "times", "config", "iterations"):
-        values = f"SELECT runs.seed, {name}.* FROM runs JOIN {name} USING (run) WHERE folder = '{two}'"
-        together, alone = ([row[:1] + row[2:] for row in ask(places, values)] for places in (sources, two))
-        assert together and sorted(together, key=repr) == sorted(alone, key=repr), name
+        values = f"SELECT {name}.* FROM runs JOIN {name} USING (run) WHERE folder = '{two}'"
+        together, alone = (sorted(row[1:] for row in ask(places, values)) for places in (sources, two))
+        assert together and together == alone, name
 
 
-def test_sql_refuses_in_a_line(folder: Path, told, monkeypatch) -> None:
-    monkeypatch.chdir(folder)
+def test_sql_refuses_in_a_line(folder: Path, told) -> None:
     load(folder)
     for sql, named in (
         ("delete from runs", "reading"),
-        ("drop table all_runs", "reading"),
-        ("attach 'other.sqlite' as other", "reading"),
-        ("vacuum into 'copy.sqlite'", "reading"),
-        ("select from", '"from"'),
         ("select lr from runs", "lr"),
-        ("select * from scores", "runs, config, evaluations, times and iterations"),
-        ("select 1; select 2", "one statement"),
-        ("-- nothing", "no query"),
+        ("select * from scores", "evaluations"),
     ):
         assert named in told(["sql", sql, str(folder)], main)
 
@@ -287,73 +199,36 @@ def test_sql_prints_a_table(folder: Path, told, capsys) -> None:
     sql = "select task, count(*) n, avg(seed) mean, null nil from runs group by task"
     assert main(["sql", sql, str(folder)]) == 0
     assert capsys.readouterr().out == "task  n  mean  nil\nRope  3     1\n"
-    assert main(["sql", sql, str(folder), "--csv"]) == 0
-    assert capsys.readouterr().out == "task,n,mean,nil\nRope,3,1.0,\n"
     assert main(["sql", sql, str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == [{"task": "Rope", "n": 3, "mean": 1.0, "nil": None}]
-    assert main(["sql", "select max(iteration) from iterations", str(folder)]) == 0
-    assert capsys.readouterr().out.split() == ["max(iteration)", "3"]
-    (folder / "bad.h5").write_bytes(b"x")
-    for place in ("no", "bad.h5"):
-        assert str(folder / place) in told(["sql", "select 1", str(folder / place)], main)
+    assert str(folder / "no") in told(["sql", "select 1", str(folder / "no")], main)
 
 
 # -------------------------------------------------------------------------------------- scores and pictures
 
 
-def test_scores(scored: Path, told, capsys) -> None:
-    synthetic.save(synthetic.synthetic_run(synthetic.config(scored, seed=7), rows=4, finished=False))
-    words = [str(scored), "seed=0,1", "--keys", "method.lr,iterations", "--sort", "score", "--descending"]
+def test_scores(folder: Path, told, capsys) -> None:
+    synthetic.save(synthetic.synthetic_run(synthetic.config(folder, seed=7), rows=4, finished=False))
+    words = [str(folder), "seed=0,1", "--keys", "method.lr,iterations", "--sort", "score", "--descending"]
     assert main(["scores", *words]) == 0
     assert capsys.readouterr().out == (
         "task  variant  method  seed  protocol  targets  status    score  method.lr  iterations\n"
         "Rope        1  adam       1  plab               finished   0.75        0.1           4\n"
         "Rope        1  adam       0  plab               finished    0.5        0.1           4\n"
     )
-    assert main(["scores", str(scored), "status=all", "--csv"]) == 0
-    read = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert [(row["seed"], row["status"]) for row in read] == [
-        *((seed, "finished") for seed in "012"),
-        ("7", "running"),
-    ]
-    assert read[-1]["score"] == ""
-    assert main(["scores", str(scored), "method.lr=0.1", "--json"]) == 0
+    assert main(["scores", str(folder), "status=all", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
-    assert [row["score"] for row in listed] == pytest.approx([0.5, 0.75, 0.25])
+    assert [row["status"] for row in listed] == ["finished"] * 3 + ["running"]
+    assert [row["score"] for row in listed[:3]] == pytest.approx([0.5, 0.75, 0.25])
     assert listed[0]["targets"] is None and listed[0]["seed"] == 0
-    for words in (["--keys", "method.lt"], ["--sort", "iou"], ["family=rl"]):
-        assert words[-1] in told(["scores", str(scored), *words], main)
+    for words in (["--keys", "method.lt"], ["--sort", "iou"]):
+        assert words[-1] in told(["scores", str(folder), *words], main)
 
 
-def test_folders_archives_and_example_are_taken_in_the_same_way(tmp_path: Path, capsys) -> None:
-    one, archive = tmp_path / "one", tmp_path / "two.plab.zip.xz"
-    age(synthetic.save(synthetic.run(one, seed=0, score=0.5)))
-    age(synthetic.save(synthetic.run(tmp_path / "two", seed=1, score=0.75)))
-    pack(tmp_path / "two", archive)
-    sources = [str(one), str(archive), "example"]
-    words = ["task=Rope", "variant=1", "method=adam", "sim.precision=float32"]
-    assert main(["scores", *sources, *words, "--csv"]) == 0
-    scored = {
-        row["seed"]: float(row["score"]) for row in csv.DictReader(io.StringIO(capsys.readouterr().out))
-    }
-    assert {"0", "1"} <= set(scored)
-    assert main(["sql", "select folder, count(*) from runs group by folder", *sources, "--csv"]) == 0
-    counted = dict(csv.reader(io.StringIO(capsys.readouterr().out)))
-    assert counted.pop(str(one)) == counted.pop(str(archive)) == "1" and len(counted) == 2
-    assert str(len(load(example_archive()))) in counted.values()
-    assert status([*sources, *words, "--json"]) == 0
-    known = json.loads(capsys.readouterr().out)["runs"]
-    assert {run["seed"] for run in known if run["state"] == "done"} == set(scored)
-    best = parse_render([str(one), str(archive), *words])
-    assert read(best.result).config["seed"] == 1 and best.output == Path("Rope-v1-adam-seed1.png")
-
-
-def test_pictures_are_of_the_run_with_the_highest_score(scored: Path, told) -> None:
-    pack(scored, scored.parent / "all.plab.zip.xz")
-    for source in (scored, scored.parent / "all.plab.zip.xz"):
+def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told) -> None:
+    pack(folder, folder.parent / "all.plab.zip.xz")
+    for source in (folder, folder.parent / "all.plab.zip.xz"):
         options = parse_render([str(source), "task=Rope"])
         assert read(options.result).config["seed"] == 1
         assert options.output == Path("Rope-v1-adam-seed1.png")
-    assert parse_render([str(scored), "seed=2"]).output == Path("Rope-v1-adam-seed2.png")
-    assert str(scored) in told([str(scored), "seed=3"], render)
-    assert "family=rl" in told(["example", "family=rl"], render)
+    assert str(folder) in told([str(folder), "seed=3"], render)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -26,10 +25,7 @@ from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin
 from same_runs import raising
-from toy_runner import COARSE, assert_complete, computed, configs
-
-WHY = "iteration 3: environment step 1: the loss is not finite"
-"""Message of the toy runner's failing run."""
+from toy_runner import COARSE, WHY, assert_complete, computed, configs
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +36,7 @@ def _toy_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def sweep(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[str, int], list[str]]]:
-    """Run a sweep; returns exit code, runs by status from the last line, lines on standard error."""
+    """Run a sweep; returns exit code, runs by status, lines on standard error."""
 
     def call(*argv: str) -> tuple[int, dict[str, int], list[str]]:
         capsys.readouterr()
@@ -53,28 +49,20 @@ def sweep(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[s
     return call
 
 
-# ---------------------------------------------------------------- choice of runs
-
-
 def test_each_run_is_computed_once_unless_forced(sweep) -> None:
-    assert sweep("seed=0,0,1", "progress=false") == (0, {"runs": 2, "finished": 2}, [])
+    assert sweep("seed=0,0", "progress=false") == (0, {"runs": 1, "finished": 1}, [])
     # Settings without influence on the result make no other run.
-    assert sweep("seed=0,1,2", "checkpoint_seconds=0", "sim.memory_mb=1000") == (
-        0,
-        {"runs": 3, "finished": 1, "finished before": 2},
-        [],
-    )
-    assert len(computed()) == 3
-    assert_complete(configs())
-    assert sweep("seed=0,1,2", "force=true")[:2] == (0, {"runs": 3, "finished": 3})
-    assert sweep("seed=0", "method.lr=0.05")[:2] == (0, {"runs": 1, "finished": 1})
-    assert len(computed()) == 7
-    assert_complete(configs() + configs("method.lr=0.05", seeds=(0,)))
+    counts = {"runs": 2, "finished": 1, "finished before": 1}
+    assert sweep("seed=0,1", "checkpoint_seconds=0", "sim.memory_mb=1000") == (0, counts, [])
+    assert len(computed()) == 2
+    assert sweep("seed=0,1", "force=true")[:2] == (0, {"runs": 2, "finished": 2})
+    assert len(computed()) == 4
+    assert_complete(configs(seeds=(0, 1)))
 
 
 def test_jobs_of_a_glob_and_of_an_experiment(seen) -> None:
-    assert main(["-m", "task=glob(R*)", "seed=0,1"]) == 0
-    assert len(seen) == len({(cfg.task.name, cfg.seed) for cfg in seen}) == 4
+    assert main(["-m", "task=glob(R*)"]) == 0
+    assert len(seen) == len({cfg.task.name for cfg in seen}) == 2
     seen.clear()
     assert main(["+experiment=smoke"]) == 0
     assert len(seen) == len({config_hash(cfg) for cfg in seen}) == 6
@@ -82,36 +70,28 @@ def test_jobs_of_a_glob_and_of_an_experiment(seen) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("experiment", "methods"),
-    [("paper_gradient", ("adam", "gd", "adam_h")), ("paper_rl", ("sac", "td3", "ppo"))],
-)
-def test_runs_of_the_paper(seen, experiment: str, methods: tuple[str, ...]) -> None:
-    assert main([f"+experiment={experiment}"]) == 0
-    runs = [(cfg.task.name, cfg.variant, cfg.method.name, cfg.seed) for cfg in seen]
-    assert sorted(runs) == sorted(product(suite_tasks(), SUITE_VARIANTS, methods, range(3)))
-    assert len({config_hash(cfg) for cfg in seen}) == 450
-
-
-# ---------------------------------------------------------------- runs without a result
+def test_runs_of_the_paper(seen) -> None:
+    assert main(["+experiment=paper_gradient"]) == 0
+    runs = {(cfg.task.name, cfg.variant, cfg.method.name, cfg.seed) for cfg in seen}
+    assert runs == set(product(suite_tasks(), SUITE_VARIANTS, ("adam", "gd", "adam_h"), range(3)))
 
 
 def test_failed_runs_do_not_stop_the_others(sweep) -> None:
-    code, counts, lines = sweep("seed=0,13,1", "method=adam,gd")
-    assert (code, counts) == (1, {"runs": 6, "finished": 4, "failed": 2})
-    assert lines == [f"plab: Rope-v1 {method} seed 13: {WHY}" for method in ("adam", "gd")]
+    code, counts, lines = sweep("seed=0,13,1")
+    assert (code, counts) == (1, {"runs": 3, "finished": 2, "failed": 1})
+    assert lines == [f"plab: Rope-v1 adam seed 13: {WHY}"]
     left = read(result_path(configs(seeds=(13,))[0]).with_suffix(".partial.h5"))
     assert (left.status, left.message, left.rows) == ("failed", WHY, 3)
     # The same command again: only those that failed.
-    code, counts, _ = sweep("seed=0,13,1", "method=adam,gd")
-    assert (code, counts) == (1, {"runs": 6, "finished before": 4, "failed": 2})
-    assert len(computed()) == 8
+    code, counts, _ = sweep("seed=0,13,1")
+    assert (code, counts) == (1, {"runs": 3, "finished before": 2, "failed": 1})
+    assert len(computed()) == 4
 
 
 def test_refused_runs_do_not_stop_the_others(sweep) -> None:
-    code, counts, lines = sweep("variant=1,9", "seed=0,1")
-    assert (code, counts) == (2, {"runs": 4, "finished": 2, "refused": 2})
-    assert len(lines) == 2 and all("variant=9" in line for line in lines)
+    code, counts, lines = sweep("variant=1,9")
+    assert (code, counts) == (2, {"runs": 2, "finished": 1, "refused": 1})
+    assert len(lines) == 1 and "variant=9" in lines[0]
 
 
 def test_a_bug_in_one_batch_does_not_stop_the_others(sweep) -> None:
@@ -132,7 +112,7 @@ def test_runs_that_cannot_share_a_simulator_are_halved(sweep, monkeypatch) -> No
         intact(jobs)
 
     monkeypatch.setattr(toy_runner, "run_toy", small_only)
-    assert sweep("seed=0,1,2,3,4")[0] == 0
+    assert sweep("seed=range(5)")[0] == 0
     assert sizes == [5, 2, 3, 1, 2]
     assert_complete(configs(seeds=range(5)))
 
@@ -147,25 +127,17 @@ def test_an_interrupted_batch_is_kept_and_resumed(sweep) -> None:
     assert_complete(configs())
 
 
-# ---------------------------------------------------------------- several processes
-
-
-def test_a_run_under_way_in_another_process_is_left_to_it(sweep, monkeypatch, capsys) -> None:
+def test_a_run_under_way_in_another_process_is_left_to_it(sweep, capsys) -> None:
     busy = configs(seeds=(1,))[0]
     other = RunFile(busy)
-    code, counts, lines = sweep("seed=0,1,2")
-    assert (code, counts) == (1, {"runs": 3, "finished": 2, "under way in another process": 1})
+    code, counts, lines = sweep("seed=0,1")
+    assert (code, counts) == (1, {"runs": 2, "finished": 1, "under way in another process": 1})
     assert len(lines) == 1 and "Rope-v1 adam seed 1: " in lines[0] and str(result_path(busy)) in lines[0]
     assert main([*COARSE, "seed=1"]) == 1
     assert str(result_path(busy)) in capsys.readouterr().err
-    # The state of the run is looked up once, even if the other process ends just after.
-    looks = iter([True, False])
-    with monkeypatch.context() as patch:
-        patch.setattr("plab.sweep.carry.held", lambda path: next(looks))
-        assert sweep("seed=0,1,2")[1]["under way in another process"] == 1
     other.release()
-    assert sweep("seed=0,1,2")[0] == 0
-    assert_complete(configs())
+    assert sweep("seed=0,1")[0] == 0
+    assert_complete(configs(seeds=(0, 1)))
 
 
 def test_a_run_that_another_process_gives_up_is_taken_up(sweep, monkeypatch) -> None:
@@ -180,32 +152,27 @@ def test_a_run_that_another_process_gives_up_is_taken_up(sweep, monkeypatch) -> 
     assert_complete(configs())
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-@pytest.mark.parametrize("count", [2, pytest.param(40, marks=pytest.mark.nightly)])
-def test_several_processes_on_one_sweep_compute_nothing_twice(monkeypatch, count: int) -> None:
+def test_several_processes_on_one_sweep_compute_nothing_twice(monkeypatch) -> None:
     monkeypatch.setattr(toy_runner, "PAUSE", 0.005)
     argv = ["-m", *COARSE, "seed=range(6)", "checkpoint_seconds=0", "hydra.launcher.batch_size=2"]
-    children = [_forked(argv, Path(f"err{number}")) for number in range(count)]
+    children = [_forked(argv) for _ in range(8)]
     codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
-    # A process that ends early says that others are at work, and nothing else.
+    # A process that ends early says that others are at work.
     assert set(codes) <= {0, 1} and 0 in codes
-    for number, code in enumerate(codes):
-        lines = Path(f"err{number}").read_text().splitlines()
-        assert bool(lines) == bool(code) and all("by another process" in line for line in lines)
     assert len(computed()) == len(set(computed())) == 6
     assert_complete(configs(seeds=range(6)))
 
 
-def _forked(argv: list[str], errors: Path) -> int:
+def _forked(argv: list[str]) -> int:
     child = os.fork()
-    if child:
-        return child
-    code = 99
-    try:
-        with open(os.devnull, "w") as sys.stdout, errors.open("w") as sys.stderr:
-            code = main(argv)
-    finally:
-        os._exit(code)
+    if child == 0:
+        try:
+            os._exit(main(argv))
+        finally:
+            os._exit(99)
+    return child
 
 
 def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
@@ -221,9 +188,6 @@ def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
     assert ends[1].message == WHY and "1 iterations" in ends[2].message
     assert str(result_path(busy)) in ends[4].message
     lock.release()
-
-
-# ---------------------------------------------------------------- batches
 
 
 def test_batches_hold_what_one_simulator_can_serve() -> None:
@@ -273,24 +237,20 @@ def test_full_size_batches_fit_the_memory(device: str) -> None:
     assert limits[1] * 2 > limits[2] - 2
 
 
-# ---------------------------------------------------------------- Hydra's other launchers
-
 HERE = "_target_:hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 """Hydra's own launcher, whose jobs are of this process, as another launcher."""
 
 
-@pytest.mark.parametrize(("size", "jobs"), [("null", 1), ("2", 2), ("1", 3)])
-def test_another_launcher_gets_a_job_per_batch(sweep, monkeypatch, size: str, jobs: int) -> None:
+def test_another_launcher_gets_a_job_per_batch(sweep, monkeypatch) -> None:
     sizes, intact = [], toy_runner.run_toy
     monkeypatch.setattr(toy_runner, "run_toy", lambda batch: sizes.append(len(batch)) or intact(batch))
-    ended = sweep("seed=0,1,2", f"hydra.launcher.inner={{{HERE}}}", f"hydra.launcher.batch_size={size}")
+    ended = sweep("seed=0,1,2", f"hydra.launcher.inner={{{HERE}}}", "hydra.launcher.batch_size=2")
     assert ended[:2] == (0, {"runs": 3, "finished": 3})
-    assert len(sizes) == jobs and sum(sizes) == 3
+    assert sorted(sizes) == [1, 2]
     assert_complete(configs())
 
 
-@pytest.mark.parametrize(("settings", "jobs"), [("", 1), (",n_jobs:2", 2), (",n_jobs:99", 6)])
-def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch, settings: str, jobs: int) -> None:
+def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> None:
     asked = []
 
     def launch(jobs: list, initial_job_idx: int) -> None:
@@ -300,12 +260,9 @@ def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch, sett
     queue = SimpleNamespace(launch=launch)
     launchers = SimpleNamespace(instantiate_launcher=lambda **settings: queue)
     monkeypatch.setattr(plugin(), "Plugins", SimpleNamespace(instance=lambda: launchers))
-    code, counts, lines = sweep("seed=range(6)", f"hydra.launcher.inner={{_target_:queue{settings}}}")
+    code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:2}")
     assert (code, counts) == (1, {"runs": 6, "not under way": 6})
-    assert asked == [jobs] and "RuntimeError: nobody is there" in lines[0]
-
-
-# ---------------------------------------------------------------- composition of jobs
+    assert asked == [2] and "RuntimeError: nobody is there" in lines[0]
 
 
 def compose(overrides: list[str]):
@@ -321,7 +278,6 @@ JOBS = [
     [["method=sac", "method.profile=paper"], ["method=sac", "method.profile=release"]],
     [["+experiment=yield_ablation", "task.yield_stress=10"], ["+experiment=yield_ablation"]],
     [["task.manipulators.left.size=[0.05]"], ["task.manipulators.left.size=[0.06]", "sim=reference"]],
-    [["+task.random.reach=0.3", "variant=random"], ["+task.random.reach=0.2", "variant=random"]],
 ]
 
 
@@ -332,11 +288,9 @@ def test_jobs_are_composed_as_hydra_does(jobs: list[list[str]]) -> None:
 
 def test_mistaken_jobs_are_refused_one_by_one() -> None:
     wrong = {
-        "seed=abc": "seed",
         "seed=-1": "seed",
         "method.lr=0": "method.lr",
         "method.lrr=0.1": "method.lrr",
-        "task.target.radius=0.6": "target",
         "task=Ropee": "Ropee",
     }
     good, *bad = compose_jobs([["variant=1"], *([override] for override in wrong)], compose)

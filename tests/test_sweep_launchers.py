@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import signal
@@ -10,10 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from itertools import product
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,10 +17,8 @@ from types import SimpleNamespace
 import pytest
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
-from rich.console import Console
 
 import toy_runner
-from plab import progress
 from plab.cli.run import main
 from plab.config import load_config
 from plab.locks import lock_path
@@ -34,28 +28,15 @@ from plab.sweep.gpus import _Worker, choose
 from same_runs import assert_same_numbers
 from toy_runner import COARSE, assert_complete, configs
 
-# ---------------------------------------------------------------- choice of batches
-
 
 def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
-    tasks = ["Move", "Move", "Rope", "Rope", "Writer"]
-    waiting = [[load_config([f"task={task}", f"seed={seed}"])] for seed, task in enumerate(tasks)]
-    had: list[tuple[str, str] | None] = [None, None]
-    taken = []
-    for process in (0, 1, 1, 0, 1):
-        number = choose(waiting, had[process], [had[1 - process]])
-        assert number is not None
-        [cfg] = waiting.pop(number)
-        had[process] = cfg.task.name, cfg.method.family
-        taken.append((process, cfg.seed))
-    # Its own kind first, then one that nobody has, in the order of the sweep.
-    assert taken == [(0, 0), (1, 2), (1, 3), (0, 1), (1, 4)]
     waiting = [[load_config(["task=Move", "method=sac"])], [load_config(["task=Move"])]]
-    assert choose(waiting, ("Move", "trajectory"), []) == 1
-    assert choose(waiting, None, [("Move", "rl")]) == 1
-    assert choose(waiting, None, [("Move", "rl"), ("Move", "trajectory")]) == 0
-    # Else the kind with most batches per process that has it; one less where a process will be free soon.
     move, rope, writer = ((task, "trajectory") for task in ("Move", "Rope", "Writer"))
+    assert choose(waiting, None, [None]) == 0
+    assert choose(waiting, move, []) == 1
+    assert choose(waiting, None, [("Move", "rl")]) == 1
+    assert choose(waiting, None, [("Move", "rl"), move]) == 0
+    # Else the kind with most batches per process that has it; one less where a process will be free soon.
     waiting = [[load_config([f"task={task}"])] for task in ("Move", "Rope", "Rope")]
     assert choose(waiting, None, [move, rope]) == 1
     assert choose(waiting, None, [move, rope, rope, rope]) == 0
@@ -132,15 +113,12 @@ def test_each_gpu_has_its_share_and_a_killed_process_is_replaced(threads, monkey
     # Three processes for three runs: the second of a GPU only after the first of each.
     for name in ("3, 1", "5, 1", "3, 2"):
         assert f"GPU {name} [0/3 runs] 1 runs 3/9, started, loss 2" in lines
-    assert lines[-1].startswith("3 runs: 3 finished")
     assert_complete(configs())
     threads.append("3")
     assert main([*argv, "seed=range(3,7)", "hydra.launcher.batch_size=1"]) == 1
     out, err = capsys.readouterr()
     assert out.splitlines()[-1].startswith("4 runs: 3 finished") and err.count("\n") == 1
-    assert threads == []
     assert main([*argv, "seed=range(7)"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("7 runs: 1 finished, 6 finished before")
     assert_complete(configs(seeds=range(7)))
 
 
@@ -153,41 +131,6 @@ def test_missing_gpus_and_packages_are_named(refused, monkeypatch) -> None:
     assert "plab[joblib]" in refused(["-m", "hydra/launcher=batch_joblib", "seed=0,1"])
 
 
-# ---------------------------------------------------------------- progress
-
-
-def test_bars_of_several_processes_on_a_terminal(monkeypatch) -> None:
-    screen = io.StringIO()
-    monkeypatch.setattr(progress, "Console", lambda: Console(file=screen, force_terminal=True, width=120))
-    with progress.show_several(["GPU 0", "GPU 1"]) as report:
-        report("GPU 1", "compiling", "substep")
-        assert "compiling substep, 0 s" in screen.getvalue().rsplit("GPU 1", 1)[1]
-        report("GPU 1", "compiling", "")
-        report("GPU 1", "progress", "Rope, 2 runs", 0, 8, 10, 3, "loss 2")
-    last = screen.getvalue().rsplit("GPU 0", 1)[1]
-    assert "GPU 1 Rope, 2 runs" in last and "3/8" in last and "loss 2" in last and "compiling" not in last
-
-
-def test_a_process_forwards_its_progress_and_the_kernel_under_compilation(monkeypatch) -> None:
-    told: list[tuple] = []
-    monkeypatch.setattr(progress, "_forward", None)
-    progress.forward_to(lambda *content: told.append(content))
-
-    @contextmanager
-    def compiler(note: Callable[[str], None]) -> Iterator[None]:
-        note("substep")
-        yield
-        note("")
-
-    with progress.show_progress("Rope", 0, 8, compiling=compiler) as report:
-        report(3, "loss 2")
-    said = ("progress", "Rope", 0, 8, progress.PLAIN_EVERY, 3, "loss 2")
-    assert told == [("compiling", "substep"), said, ("compiling", "")]
-
-
-# ---------------------------------------------------------------- processes of the launchers
-
-
 @pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/locks").exists(), reason="finds the processes of runs in /proc/locks")
 @pytest.mark.parametrize(
@@ -198,7 +141,7 @@ def test_a_process_forwards_its_progress_and_the_kernel_under_compilation(monkey
 def test_a_sweep_with_a_killed_job_is_completed_by_the_same_command(tmp_path, launcher, package) -> None:
     pytest.importorskip(package)
     words = [*COARSE, "progress=false", "method.iterations=60", "checkpoint_seconds=0"]
-    command = [sys.executable, "-m", "plab.run", "-m", *words, "method=adam,gd", "seed=0,1,2"]
+    command = [sys.executable, "-m", "plab.run", "-m", *words, "seed=range(6)"]
     command += [f"hydra/launcher=batch_{launcher}", "hydra.launcher.batch_size=2"]
     # Two GPUs that are none: the runs compute on the CPU.
     environment = os.environ | {"CUDA_VISIBLE_DEVICES": "0,1"}
@@ -210,10 +153,8 @@ def test_a_sweep_with_a_killed_job_is_completed_by_the_same_command(tmp_path, la
     locks = map(str.split, Path("/proc/locks").read_text().splitlines())
     os.kill(next(int(lock[4]) for lock in locks if lock[5].endswith(f":{inode}")), signal.SIGKILL)
     assert sweep.wait() == 1
-    last = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert last.returncode == 0, last.stderr
-    runs = product(("adam", "gd"), range(3))
-    cfgs = [load_config([*words, f"method={method}", f"seed={seed}"]) for method, seed in runs]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True)
+    cfgs = [load_config([*words, f"seed={seed}"]) for seed in range(6)]
     paths = [tmp_path / result_path(cfg) for cfg in cfgs]
     assert {path for path in tmp_path.glob("results/*-v*/*/*") if path.is_file()} == set(paths)
     undisturbed = [replace(cfg, results_dir=str(tmp_path / "undisturbed")) for cfg in cfgs]

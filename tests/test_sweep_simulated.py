@@ -10,7 +10,7 @@ import pytest
 
 from plab.config import Config, load_config
 from plab.problem import Problem
-from plab.results import ResultsError, RunFile, RunResult, read, result_path
+from plab.results import RunResult, read, result_path
 from plab.runners import run_batch, run_config
 from same_runs import KeepsAll, finished_as, stopped_at
 from toy_runner import COARSE
@@ -97,23 +97,3 @@ def test_runs_stopped_at_different_iterations_go_on_together(tmp_path: Path, alo
     assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
     for cfg, want in zip(cfgs, alone, strict=True):
         assert finished_as(cfg, want).provenance["resumed"] == 1
-
-
-def test_a_file_that_cannot_be_written_ends_its_run_only(tmp_path: Path, alone) -> None:
-    cfgs = configs(tmp_path)
-    bad, intact = result_path(cfgs[2]).with_suffix(".partial.h5"), RunFile._write
-
-    def write(self):
-        if self.partial_path == bad:
-            raise ResultsError(f"cannot write {bad}: No space left on device")
-        intact(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RunFile, "_write", write)
-        ended = run_batch(cfgs, cache=CACHE)
-    assert [one.status for one in ended] == ["finished", "finished", "refused", "finished"]
-    assert str(bad) in ended[2].message
-    for k in (0, 1, 3):
-        finished_as(cfgs[k], alone[k])
-    run_config(cfgs[2], CACHE)
-    finished_as(cfgs[2], alone[2])

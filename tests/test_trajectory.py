@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
-from plab.families import FAMILIES
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import RunResult, read, result_path
@@ -107,20 +104,6 @@ def test_rules_are_adam_and_momentum(method, optimizer: str) -> None:
     assert np.abs(expected).max() == 1.0
 
 
-@pytest.mark.parametrize("optimizer", sorted(FAMILIES["trajectory"].rules))
-def test_restored_actions_go_on_alike(method, optimizer: str) -> None:
-    method = replace(method, optimizer=optimizer)
-    rng = np.random.default_rng(0)
-    one, other = ActionSequence(method, 3, 2, seed=0), ActionSequence(method, 3, 2, seed=1)
-    one.step(rng.normal(size=(3, 2)))
-    other.restore(one.state())
-    for _ in range(3):
-        gradient = rng.normal(size=(3, 2))
-        one.step(gradient)
-        other.step(gradient)
-        assert np.array_equal(one.actions, other.actions)
-
-
 # ---------------------------------------------------------------- whole runs
 
 
@@ -141,10 +124,11 @@ def test_file_holds_the_whole_run(finished: RunResult) -> None:
     assert finished.resume is None
 
 
-# With steps of 1 they overshoot, so that the last actions are not the best.
-@pytest.mark.parametrize(
-    "words", [("method.lr=1.0", "method.iterations=8"), ("method=gd",), ("method=adam_h",)]
-)
+# With steps of 1 actions overshoot, so that the last are not the best.
+STEEP = ("method.lr=1.0", "method.iterations=8")
+
+
+@pytest.mark.parametrize("words", [STEEP, ("method=gd",), ("method=adam_h",)])
 def test_rows_are_those_of_the_rule_by_the_simulators_gradient(tmp_path: Path, words) -> None:
     cfg = make_config(tmp_path, *words)
     result, problem = run(cfg), shared_problem(CACHE, [cfg])
@@ -160,7 +144,7 @@ def test_rows_are_those_of_the_rule_by_the_simulators_gradient(tmp_path: Path, w
     best = int(rows["loss"].argmin())
     assert (result.best_iteration, result.best_loss) == (best, rows["loss"][best])
     assert np.array_equal(result.best_actions, tried[best])
-    assert best < len(rows) - 1 or "method.lr=1.0" not in words
+    assert best < len(rows) - 1 or words != STEEP
     simulator.set_contact("hard")
     hard = problem.rollout(result.best_actions[None], gradient=False)
     assert measures(hard) == result.evaluation
@@ -191,26 +175,22 @@ def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypa
     assert finished.path.stat().st_mtime_ns > before
 
 
-@pytest.mark.parametrize(
-    "word",
-    ["sim.substeps=6", "sim.particles_scale=0.04", "sim.precision=float32", "method.loss_weights.contact=0"],
-)
-def test_another_kind_of_scene_has_a_simulator_of_its_own(tmp_path: Path, word: str) -> None:
-    keys = [
-        simulator_key(cfg, build_scene(cfg)) for cfg in (make_config(tmp_path), make_config(tmp_path, word))
+def test_another_kind_of_scene_has_a_simulator_of_its_own(tmp_path: Path) -> None:
+    words = [
+        "sim.substeps=6",
+        "sim.particles_scale=0.04",
+        "sim.precision=float32",
+        "method.loss_weights.sdf=0",
     ]
-    assert keys[0] != keys[1]
+    cfgs = [make_config(tmp_path, word) for word in ("seed=1", *words)]
+    assert len({simulator_key(cfg, build_scene(cfg)) for cfg in cfgs}) == 5
 
 
 def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
     cache, made = SimulatorCache(), iter(range(9))
 
     def get(key: str, error: type[Exception] | None = None) -> int:
-        def check(kept: int) -> None:
-            if error is not None:
-                raise error
-
-        return cache.get(key, lambda: next(made), check=check)
+        return cache.get(key, lambda: next(made), check=Mock(side_effect=error))
 
     assert [get("a"), get("a"), get("b"), get("a"), get("a", RuntimeError), get("a")] == [0, 0, 1, 2, 3, 3]
     with pytest.raises(ValueError):
@@ -258,23 +238,6 @@ def test_resumed_run_equals_an_uninterrupted_one(
     assert not result_path(cfg).with_suffix(".partial.h5").exists()
 
 
-@pytest.mark.nightly
-def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
-    cfg = make_config(tmp_path)
-    partial = result_path(cfg).with_suffix(".partial.h5")
-    command = [sys.executable, "-m", "plab.run", *COARSE, f"results_dir={tmp_path}", "checkpoint_seconds=0"]
-    process = subprocess.Popen(command)
-    try:
-        while not partial.exists() and process.poll() is None:
-            time.sleep(0.001)
-        # Somewhere in the iterations that follow the first.
-        time.sleep(np.random.default_rng().uniform(0.0, finished.iterations["seconds"][1:].sum()))
-    finally:
-        process.kill()
-        process.wait()
-    assert_same_numbers(run(cfg), finished)
-
-
 @pytest.mark.parametrize(("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)])
 def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: type, raised: type) -> None:
     cfg = make_config(tmp_path)
@@ -285,11 +248,3 @@ def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: t
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", str(caught.value), 2)
     assert left.best_actions is not None
-
-
-def test_progress_is_plain_lines_without_a_terminal(tmp_path: Path, capsys) -> None:
-    run_config(replace(make_config(tmp_path), progress=True), CACHE)
-    # Taichi has lines of its own to say.
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Rope-v1")]
-    assert len(lines) == 2
-    assert lines[1].startswith(f"Rope-v1 adam seed 0 {ITERATIONS}/{ITERATIONS}, 0:00:00 left, loss ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import re
 import shlex
@@ -12,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from taichi.lang import kernel_impl
 
 from plab import progress
 from plab.cli.next_steps import next_steps
 from plab.cli.run import main
 from plab.config import load_config
-from plab.problem import Problem
 from plab.results import RunFile
 from plab.results import read as read_result
 from plab.runners.jobs import Job
@@ -74,40 +75,33 @@ def test_without_a_terminal_nothing_watches_the_compiler(capsys) -> None:
     assert capsys.readouterr().out == "Rope 8/8, started, loss 2\n"
 
 
-def test_kernels_are_reported_once_when_they_are_compiled() -> None:
-    from taichi.lang import kernel_impl
-
-    entry = kernel_impl._get_tree_and_ctx
-    told: list[str] = []
-    with watch_compiling(told.append):
-        problem = Problem([load_config(["task=Rope", *COARSE])])
-        actions = np.zeros((1, 2, problem.scenes[0].action_dim))
-        problem.rollout(actions, gradient=False)
-        assert {"step_kernel", "losses_kernel"} <= set(told)
-        # Each begins and ends before the next begins.
-        assert all(told[0::2]) and not any(told[1::2]) and len(told) % 2 == 0
-        told.clear()
-        problem.rollout(actions, gradient=False)
-        assert told == []
-    assert kernel_impl._get_tree_and_ctx is entry
-    kernels = [getattr(type(problem.simulator._engine), name) for name in ("step_kernel", "losses_kernel")]
-    assert all("launch_kernel" not in vars(kernel._primal) for kernel in kernels)
-
-
 def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, capsys) -> None:
-    kept: list[int] = []
-    record = RunFile.record
+    kept: list[tuple[int, int]] = []
+    compiled: list[str] = []
+    entry, record = kernel_impl._get_tree_and_ctx, RunFile.record
 
     def look(run: RunFile, *args, **kwargs) -> None:
         record(run, *args, **kwargs)
-        kept.append(len(read_result(run.partial_path).iterations))
+        kept.append((len(read_result(run.partial_path).iterations), len(compiled)))
 
+    @contextmanager
+    def watch(tell: Callable[[str], None]) -> Iterator[None]:
+        with watch_compiling(lambda name: (compiled.append(name), tell(name))):
+            yield
+
+    monkeypatch.setattr("plab.runners.runner.watch_compiling", watch)
     monkeypatch.setattr(RunFile, "record", look)
     monkeypatch.chdir(tmp_path)
     argv = ["task=Rope", *COARSE, "method.iterations=3", "checkpoint_seconds=1e6"]
     assert main(argv) == 0
-    # The first iteration is kept at once, later ones follow after checkpoint_seconds.
-    assert kept == [1, 1, 1]
+    # The first iteration is kept at once, later ones follow after checkpoint_seconds; these compile nothing.
+    assert kept == [(1, kept[0][1])] * 3
+    assert {"step_kernel", "losses_kernel", "step_adjoint_kernel"} <= set(compiled[: kept[0][1]])
+    # Each begins and ends before the next begins.
+    assert all(compiled[0::2]) and not any(compiled[1::2]) and len(compiled) % 2 == 0
+    assert kernel_impl._get_tree_and_ctx is entry
+    kernels = [one for one in gc.get_objects() if isinstance(one, kernel_impl.Kernel)]
+    assert kernels and all("launch_kernel" not in vars(kernel) for kernel in kernels)
     seen = screen.getvalue()
     assert "Rope-v1 adam seed 0 build" in seen and "Rope-v1 adam seed 0 final evaluation" in seen
     assert re.search(r"compiling \w+, \d+ s", seen)
