@@ -10,7 +10,6 @@ import pytest
 
 from plab.cli.export import main
 from plab.config import load_config
-from plab.render import graphics
 from plab.render.recording import RecordedRollout, record_with_motion
 
 pv = pytest.importorskip("pyvista")
@@ -35,7 +34,7 @@ def test_a_vtk_series_is_read_back(recording):
     for name in ("particles", "plasticine", "manipulators"):
         reader = pv.get_reader(f"{name}.pvd")
         assert reader.time_values == pytest.approx([0.0, 0.002, 0.004, 0.006])
-    for step in range(4):
+    for step in (0, 3):
         reader = pv.get_reader("particles.pvd")
         reader.set_active_time_value(reader.time_values[step])
         (particles,) = reader.read()
@@ -53,18 +52,13 @@ def test_a_vtk_series_is_read_back(recording):
 
 def test_surfaces_enclose_the_bodies_and_the_target(recording):
     files.write_vtk(recording, Path(), every=3)
-    names = sorted(path.stem for path in Path().glob("*.vtp"))
-    kinds = ("manipulators", "particles", "plasticine")
-    assert names == [*(f"{kind}_{step:04}" for kind in kinds for step in (0, 3)), "target"]
+    assert sorted(path.stem for path in Path().glob("part*.vtp")) == ["particles_0000", "particles_0003"]
     start, target = pv.read("plasticine_0000.vtp"), pv.read("target.vtp")
     volume = sum(body.volume for body in recording.scene.bodies)
     assert start.volume == pytest.approx(volume, rel=0.2)
     nodes = np.argwhere(recording.target_mass > recording.target_mass.max() / 4) * recording.scene.dx
     assert target.center_of_mass() == pytest.approx(nodes.mean(axis=0), abs=0.03)
     assert set(start["body"]) == set(range(len(recording.scene.bodies)))
-    Path("bare").mkdir()
-    files.write_vtk(dataclasses.replace(recording, target_mass=None, scores=None), Path("bare"), every=3)
-    assert not Path("bare/target.vtp").exists() and Path("bare/particles.pvd").exists()
 
 
 def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
@@ -78,31 +72,19 @@ def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
     strain = np.log(1.2) * np.sqrt((2 / 3) ** 2 + 2 * (1 / 3) ** 2)
     assert found["elastic_strain"] == pytest.approx(strain)
     assert np.all(found["yielding"] == 1.0)
-    elastic = dataclasses.replace(scene, yield_stress=float("inf"))
-    assert np.all(files.quantities(dataclasses.replace(recording, F=F, scene=elastic), 2)["yielding"] == 0.0)
-    limit = 4 * strain * 2 * scene.material.shear_modulus
-    stiff = dataclasses.replace(scene, yield_stress=limit)
+    stiff = dataclasses.replace(scene, yield_stress=4 * strain * 2 * scene.material.shear_modulus)
     found = files.quantities(dataclasses.replace(recording, F=F, scene=stiff), 2)
     assert found["yielding"] == pytest.approx(0.25)
-
-
-def test_ply_files_have_surfaces_with_colours(recording):
-    files.write_ply(recording, Path(), every=3)
-    clay, target = pv.read("plasticine_0000.ply"), pv.read("target.ply")
-    assert len(np.unique(clay["RGB"], axis=0)) == len(recording.scene.bodies)
-    assert np.unique(target["RGB"], axis=0).tolist() == [[43, 140, 155]]
-    assert clay.is_all_triangles and clay.n_cells > 100
 
 
 def test_the_command_line_writes_a_folder_named_like_the_task(told, capsys, monkeypatch, recording):
     monkeypatch.setattr("plab.render.recording.record_with_motion", lambda cfg, actions: recording)
     words = ["task=Assembly", *COARSE]
     assert main([*words, "--every", "3"]) == 0
-    out, err = capsys.readouterr()
-    assert out.splitlines()[-1] == "Assembly-v1-vtk" and err == ""
+    assert capsys.readouterr().out.splitlines()[-1] == "Assembly-v1-vtk"
     assert Path("Assembly-v1-vtk/particles.pvd").is_file()
     assert "Assembly-v1-vtk" in told(words, main)
     assert main([*words, "--format", "ply", "--output", "deep/er"]) == 0
     assert len(list(Path("deep/er").glob("plasticine_*.ply"))) == 4
-    monkeypatch.setattr(graphics, "find_spec", lambda wanted: None)
-    assert "PyVista" in told([*words, "--output", "new"], main)
+    target = pv.read("deep/er/target.ply")
+    assert np.unique(target["RGB"], axis=0).tolist() == [[43, 140, 155]] and target.is_all_triangles

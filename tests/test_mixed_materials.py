@@ -211,28 +211,3 @@ def test_simulators_of_one_material_refuse_two():
     single.set_material(yield_stress=7.0)
     assert single.scenes[0].materials[0].yield_stress == 7.0
     assert single.scenes[0].materials[0].youngs_modulus == 800.0
-
-
-@pytest.mark.nightly  # compiles four simulators
-def test_equal_materials_are_one_and_float32_is_float64_to_rounding(simulator):
-    """Gradients of the bodies add up; the same bits for any batch and threads."""
-
-    def results(it: Simulator, given: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        it.set_initial_state(State(*(part[: it.batch] for part in dataclasses.astuple(given))))
-        gradient = it.rollout(ACTIONS[: it.batch]).gradient
-        return it.state().x, gradient, it.material_gradient()
-
-    given = start(simulator, 0.02)
-    wide = results(simulator, given)
-    own = dict(zip(MATERIAL_KEYS, (3000.0, 0.25, 40.0), strict=True))
-    simulator.set_scenes([halves(own, own, (77, 73))] * len(SCENES))
-    equal = results(simulator, given)
-    one = results(built([halves({}, {}, (77, 73), **own)] * len(SCENES)), given)
-    for a, b in zip((*equal[:2], equal[2].sum(axis=1)), one, strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
-    narrow = results(built(SCENES, "float32", threads=1), given)
-    for a, b in zip(wide, narrow, strict=True):
-        assert (np.abs(a - b) <= 2e-3 * np.abs(a).max(axis=(0, 1))).all()
-    if suite.DEVICE == "cpu":
-        alone = results(built(SCENES[:1], "float32", threads=2), given)
-        assert all(np.array_equal(a[:1], b) for a, b in zip(narrow, alone, strict=True))

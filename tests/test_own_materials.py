@@ -9,13 +9,12 @@ import math
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from plab.config import Config, build_scene, load_config
-from plab.render.recording import stored
-from plab.results import config_dict, config_hash, load
+from plab.results import config_dict, config_hash
 from plab.run import main
 from plab.submissions.schema import Digests
 from plab.sweep.plan import plan
@@ -43,9 +42,6 @@ def example(*overrides: str) -> Config:
     return load_config(["task=Cushion", *overrides], CONF)
 
 
-# ------------------------------------------------------------------------------------------------- the page
-
-
 def test_the_page_shows_the_example_and_its_commands_are_runs_of_it(seen, tmp_path, monkeypatch):
     cushion = (CONF / "task" / "Cushion.yaml").read_text(encoding="utf-8")
     assert blocks("yaml") and all(excerpt in cushion for excerpt in blocks("yaml"))
@@ -55,33 +51,13 @@ def test_the_page_shows_the_example_and_its_commands_are_runs_of_it(seen, tmp_pa
     assert [build_scene(cfg).materials[1].youngs_modulus for cfg in seen] == [2000.0, 500.0, 3000.0]
 
 
-def test_mistakes_of_the_page_name_the_key(refused):
-    commands = re.findall(r"^\$ (.*)\nplab: .*$", "\n".join(blocks("console")), re.MULTILINE)
-    assert len(commands) == 5
-    for command in commands:
-        key = command.split("=")[-2].split(".")[-1]
-        # Young's modulus may be too large for the time step.
-        assert re.search(f"{key}|stability limit", refused(arguments(command)))
-
-
 def test_the_cushions_do_as_the_page_prints(monkeypatch):
     monkeypatch.chdir(ROOT)
     with contextlib.redirect_stdout(io.StringIO()) as printed:
-        exec(blocks("python")[0], {})
-    assert printed.getvalue() == blocks("text")[0]
-
-
-@pytest.mark.nightly
-def test_the_gradient_of_the_page_points_to_the_softer_cushion(monkeypatch):
-    monkeypatch.chdir(ROOT)
-    names: dict = {}
-    with contextlib.redirect_stdout(io.StringIO()):
+        names: dict = {}
         exec("\n".join(blocks("python")), names)
-    assert names["by_young"][1] > 0.0 and names["by_young"].shape == (2,)
-    assert names["by_yield"][0] != 0.0
-
-
-# --------------------------------------------------------------------------------- configurations, results
+    assert printed.getvalue().startswith(blocks("text")[0])
+    assert names["by_young"][1] > 0.0 and names["by_yield"][0] != 0.0
 
 
 def test_a_body_has_the_values_of_its_task_and_its_own():
@@ -95,12 +71,6 @@ def test_a_body_has_the_values_of_its_task_and_its_own():
     assert build_scene(example("task.bodies.cushion.yield_stress=null")).materials[1].yield_stress == 50.0
 
 
-class Recorder:
-    """Stand-in for a simulator in the cache's key."""
-
-    precision, device = "float32", "cpu"
-
-
 def test_materials_are_recorded_and_told_apart():
     bodies = config_dict(example())["task"]["bodies"]
     assert {key: bodies["cushion"][key] for key in RUBBER} == RUBBER
@@ -110,7 +80,12 @@ def test_materials_are_recorded_and_told_apart():
     text = json.dumps(build_scene(load_config(["task=Assembly"])).facts())
     assert all(text.count(f'"{key}"') == 1 for key in RUBBER)
     cfgs = [example(f"variant={variant}") for variant in "123"]
-    paths = {TargetStore(Recorder()).path(build_scene(cfg), np.zeros((1, 3))) for cfg in cfgs}
+    paths = {
+        TargetStore(SimpleNamespace(precision="float32", device="cpu")).path(
+            build_scene(cfg), np.zeros((1, 3))
+        )
+        for cfg in cfgs
+    }
     assert len(paths) == 3 and len({Digests.of(cfg).scene for cfg in cfgs}) == 3
 
 
@@ -118,14 +93,3 @@ def test_runs_of_one_material_and_of_several_are_not_of_one_batch():
     plain = [f"task.bodies.cushion.{key}=null" for key in RUBBER]
     cfgs = [example(), example("variant=2"), example(*plain), example(*plain, "seed=1")]
     assert plan(cfgs) == [cfgs[:2], cfgs[2:]]
-
-
-@pytest.mark.nightly
-def test_a_run_is_recorded_and_replayed_with_its_materials(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    run = ["--config-dir", str(CONF), "task=Cushion", *QUICK, "method.iterations=2", "progress=false"]
-    assert main(run) == 0
-    row = load("results", keys=["task.bodies.cushion.yield_stress"]).iloc[0]
-    assert row["status"] == "finished" and math.isinf(row["task.bodies.cushion.yield_stress"])
-    cfg, actions = stored(Path(row["path"]))[:2]
-    assert vars(build_scene(cfg).materials[1]) == RUBBER and actions.shape == (2, 3)

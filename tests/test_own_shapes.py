@@ -21,7 +21,7 @@ from plab.render.graphics import RenderError
 from plab.render.recording import stored
 from plab.results import config_dict, config_hash, load
 from plab.scene import Body, Scene, SceneError, make_body, sample_particles
-from plab.shape_files import ShapeError, pinned, read_points, read_tensor
+from plab.shape_files import ShapeError, pinned, read_points
 from plab.targets import TargetError, build_target
 
 trimesh = pytest.importorskip("trimesh")
@@ -161,17 +161,6 @@ def test_boxes_with_cavities_apart_and_turned_inwards():
     assert load_mesh(write(obj(BOX, INSIDE_OUT))).inside(np.zeros((1, 3))).all()
 
 
-def test_lines_through_vertices_and_edges_count_once():
-    """A fan of triangles around an axis that points lie on, and edges that they lie on."""
-    angle = 2 * np.pi * np.arange(8) / 8
-    rim = np.stack([np.cos(angle), np.zeros(8), np.sin(angle)], axis=1)
-    faces = [(0, 2 + k, 2 + (k + 1) % 8) for k in range(8)] + [(1, 2 + (k + 1) % 8, 2 + k) for k in range(8)]
-    mesh = load_mesh(write(obj(np.concatenate([[[0, -1, 0], [0, 1, 0]], rim]), faces)))
-    away = np.random.default_rng(0).normal(size=(1000, 3)) * 1e-9
-    assert mesh.inside(away).all()
-    assert not mesh.inside(away + np.array([0, 0.6, 0])).any()
-
-
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\n"
 PLY += b"property float z\nelement face 9\nproperty list uchar int vertex_indices\nend_header\n"
 DAMAGED = b" " * 80 + struct.pack("<I", 9) + b"facet normal 0 0\nvertex 1 2 x\n" * 9
@@ -195,23 +184,6 @@ def test_files_of_strangers_are_refused(capfd, monkeypatch):
     monkeypatch.setattr("plab.shape_files._MOST_BYTES", 100)
     with pytest.raises(ShapeError, match=r"it\.obj .*MB"):
         load_mesh(write(obj(BOX)))
-
-
-def test_places_of_files(tmp_path, monkeypatch):
-    inside = tmp_path / "conf"
-    inside.mkdir()
-    monkeypatch.syspath_prepend(str(inside))
-    here = write("elsewhere")
-    (inside / "it.obj").write_text("inside")
-    assert pinned("it.obj")[0] == here
-    Path(here).unlink()
-    path, digest = pinned("it.obj")
-    assert path == str(inside / "it.obj")
-    # Where it was recorded it is no longer; what it holds is known, so its name suffices.
-    assert pinned("/nowhere/it.obj", digest) == (path, digest)
-    for file, known in (("/nowhere/it.obj", None), ("a\0b", None), ("conf", None), ("it.obj", "0" * 64)):
-        with pytest.raises(ShapeError):
-            pinned(file, known)
 
 
 @pytest.mark.parametrize("start", ["plab", "release"])
@@ -281,16 +253,6 @@ def test_points_and_masses_that_do_not_do():
         np.save("it.npy", array)
         with pytest.raises(TargetError, match=named):
             build_target(scene_of(CUBE), {"recipe": recipe, "file": "it.npy"})
-
-
-def test_files_of_another_kind():
-    for read, content, name in (
-        (read_points, "v 0 0 0\n", "it.obj"),
-        (read_tensor, "ply\n", "it.ply"),
-        *((read_points, content, "it.xyz") for content in ("", "a b c\n", "1 2\n", "1 2 3\n4 5\n")),
-    ):
-        with pytest.raises(ShapeError, match=re.escape(name)):
-            read(write(content, name))
 
 
 def test_a_changed_file_is_another_configuration_and_a_moved_one_is_not(tmp_path):

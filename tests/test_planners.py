@@ -114,7 +114,7 @@ def test_mppi_weighs_draws_by_their_costs() -> None:
     torch.testing.assert_close(third, drawn(mean, 0.8 * 0.5, 2, best_of(through)))
 
 
-def test_cmaes_is_the_librarys() -> None:
+def test_cmaes_draws_as_the_library_does() -> None:
     search = make_planner(rule("cmaes", "spread=0.4"), START)
     best = best_of(iterate(search, 0)[0][0].actions)
     bounds = np.tile([-1.0, 1.0], (best.numel(), 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from pathlib import Path
@@ -12,15 +11,14 @@ import pytest
 
 import synthetic
 from plab.bench import accuracy, precision, speed
-from plab.cli.report import _parse, main
+from plab.cli.report import main
 from plab.config.selection import select
 from plab.examples import measurements
 from plab.report.collect import NAMES, collect
-from plab.report.costs import precision_summary, work_precision
-from plab.report.figures import style
+from plab.report.costs import precision_summary
 from plab.report.measurements import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
-from plab.report.table import MINUS, NOTHING
+from plab.report.table import MINUS
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
 
@@ -28,12 +26,9 @@ from plab.results import ResultsError
 @pytest.mark.parametrize(
     ("expected", "low", "high"),
     [
-        ("same", -0.02, 0.03),
-        ("same", 0.01, 0.09),
         ("same", -0.095, 0.095),
         ("undecided", -0.096, 0.02),
         ("higher", 0.02, 0.3),
-        ("undecided", 0.004, 0.3),
         ("lower", -0.3, -0.02),
         ("undecided", -0.3, -0.004),
         ("too few runs", math.nan, math.nan),
@@ -65,8 +60,6 @@ def test_incomplete_cells_are_judged_on_what_is_there_and_say_so(results: Path) 
     assert judged[("Move", "adam")] == "no runs"
     grid = verdict_grid(verdicts(runs)).set_index("task")
     assert re.fullmatch(rf"same [+{MINUS}]0\.0\d \(6/15\)", grid.loc["Rope", "Adam"])
-    single = verdict_grid(verdicts(runs, configurations=True)).set_index(["task", "variant"])
-    assert "(" not in single.loc[("Rope", "1"), "Adam"] and single.loc[("Rope", "3"), "Adam"] == "no runs"
 
 
 # ---------------------------------------------------------------------------------------------- measurements
@@ -97,21 +90,6 @@ WRITTEN = {ACCURACY: accuracy.COLUMNS, PRECISION: precision.COLUMNS, SPEED: spee
 def test_precision_is_summed_up_by_its_worst() -> None:
     (row,) = precision_summary(precision_rows()).to_dict("records")
     assert row["largest difference of scores"] == "2.0e-05" and row["failures"] == 1
-    (row,) = precision_summary(precision_rows().assign(angle_deg=math.nan)).to_dict("records")
-    assert row["largest angle of gradients [deg]"] == row["median angle [deg]"] == NOTHING
-
-
-def test_run_time_against_error() -> None:
-    table = accuracy_rows()
-    # Without run times errors are drawn against substeps.
-    for rows in (table, table.assign(ms_per_step=math.nan)):
-        with style():
-            drawing = work_precision(rows)
-        assert len(drawing.figure.axes) == 2 * 2 * 2
-        lines = [line for axes in drawing.figure.axes for line in axes.get_lines()]
-        assert {tuple(line.get_xdata()) for line in lines} == {(10.0, 19.0), (6.0,)}
-    assert {axes.get_xlabel() for axes in drawing.figure.axes} == {"substeps per step"}
-    assert any("no run times" in note for note in drawing.notes)
 
 
 @pytest.mark.parametrize("benchmark", WRITTEN, ids=lambda benchmark: benchmark.file)
@@ -122,21 +100,9 @@ def test_files_of_benchmarks_come_with_plab_and_are_checked(tmp_path: Path, benc
     assert len(table) == {ACCURACY: len(table)}.get(benchmark, 2 * 10)
     assert set(benchmark.columns) <= set(WRITTEN[benchmark])
     path = tmp_path / benchmark.file
-    table.to_csv(path, index=False)
-    assert origin(measured(path, benchmark))[0].startswith(f"Measured: {path}, SHA-256 ")
-    for damaged in (path.read_text().splitlines()[0] + "\n", "task\nMove\n", None):
-        path.unlink() if damaged is None else path.write_text(damaged)
-        with pytest.raises(ResultsError, match=rf"{path}.*python -m plab\.bench"):
-            measured(path, benchmark)
-
-
-def test_results_that_come_with_plab_are_shown_with_its_measurements() -> None:
-    for words, folder in (
-        (["--results", "example"], measurements("example")),
-        (["--results", "example", "--bench", "mine"], Path("mine")),
-        (["--results", "example", "runs"], Path("reports/bench")),
-    ):
-        assert _parse(["notebooks", *words]).bench == folder
+    path.write_text("task\nMove\n")
+    with pytest.raises(ResultsError, match=str(path)):
+        measured(path, benchmark)
 
 
 # ------------------------------------------------------------------------------------------------- notebooks
@@ -185,13 +151,10 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
         assert f"There is no {nothing / benchmark.file}: `python -m plab.bench" in text
 
 
-def test_missing_runs_and_packages_are_named(results: Path, tmp_path: Path, monkeypatch, told) -> None:
-    (tmp_path / "empty").mkdir()
-    words = ["notebooks", "--out", str(tmp_path / "out"), "--results"]
-    assert str(tmp_path / "empty") in told([*words, str(tmp_path / "empty")], main)
-    missing = lambda name: None if name == "nbclient" else object()  # noqa: E731
-    monkeypatch.setattr("plab.report.notebooks.find_spec", missing)
-    assert "nbclient" in told([*words, str(results)], main)
+def test_a_folder_without_runs_is_named(tmp_path: Path, told) -> None:
+    words = ["--results", str(tmp_path), "--out", str(tmp_path / "out")]
+    for form in ("notebooks", "html"):
+        assert str(tmp_path) in told([form, *words], main)
 
 
 @pytest.mark.nightly
@@ -203,9 +166,5 @@ def test_notebooks_become_pages(tmp_path: Path) -> None:
     for name in NOTEBOOKS:
         page = (out / f"{name}.html").read_text()
         assert "data:image/png;base64" in page and "python -m plab.report notebooks" in page
-        # It works without a network.
         assert not re.search(r"""(?:src|href)=["'](?:https?:)?//""", page)
-        notebook = json.loads((out / f"{name}.ipynb").read_text())
-        kinds = {output["output_type"] for cell in notebook["cells"] for output in cell.get("outputs", [])}
-        assert "error" not in kinds and "display_data" in kinds
         assert "There is no " not in page

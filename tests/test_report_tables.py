@@ -234,10 +234,8 @@ def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> N
     # Both are compared with what the paper has for the method; the key is no setting that needs a note.
     assert set(tables["paper"].cells.iloc[0][["Adam, lr 0.01", "Adam, lr 0.1"]]) == {"0.59 ± 0.13"}
     assert "method.lr" not in tables["ours"].notes[-1]
-    words = ["task=Rope", "--results", str(tmp_path), "--out", str(tmp_path / "out"), "--split"]
-    assert "sim.grid_size" in told(["tables", *words, "sim.grid_size"], main)
-    assert main(["tables", *words, "method.lr"]) == 0
-    assert "Adam, lr 0.01" in (tmp_path / "out" / "ours" / "iou_per_task.md").read_text()
+    words = ["tables", "--results", str(tmp_path), "--split", "sim.grid_size"]
+    assert "sim.grid_size" in told(words, main)
     runs = gather(tmp_path, "task=Rope", "variant=1", "method.lr=0.1", split="seed")
     assert [name for name in runs.methods if "seed" in name][:2] == ["adam seed=0", "adam seed=1"]
 

@@ -121,9 +121,6 @@ def test_damaged_member_is_left_out_and_named(folder: Path, tmp_path: Path) -> N
     archive.write_bytes(lzma.compress(image))
     with pytest.warns(UserWarning, match=r"1 unreadable .*all\.plab\.zip\.xz/"):
         assert len(load(archive)) == 1
-    archive.write_bytes(archive.read_bytes()[:300])
-    with pytest.warns(UserWarning, match=r"all\.plab\.zip\.xz .*damaged"):
-        assert load(archive).empty
 
 
 def test_command_line(folder: Path, tmp_path: Path, told, capsys) -> None:
@@ -188,7 +185,6 @@ BROKEN = {
     r"score leaves \[0, 1\]": lambda r: _table(r, "score", 2, 1.5),
     "best actions leave": lambda r: dataclasses.replace(r, best_actions=r.best_actions * 3.0),
     "but no best actions": lambda r: dataclasses.replace(r, best_actions=None),
-    "there is no iteration 99": lambda r: dataclasses.replace(r, best_iteration=99),
     "the best loss is 0": lambda r: dataclasses.replace(r, best_loss=0.0),
     "evaluation lacks loss": lambda r: dataclasses.replace(r, evaluation={"score": 0.5}),
     "evaluation is not finite: reward": lambda r: _evaluation(r, reward=np.inf),
@@ -197,7 +193,6 @@ BROKEN = {
     "wall_time has seconds": lambda r: dataclasses.replace(r, wall_time={"build": -1.0}),
     "mass final is negative": lambda r: dataclasses.replace(r, masses={"final": -np.ones((64, 64, 64))}),
     "finished after 3 of 4": lambda r: dataclasses.replace(synthetic.cut(r, 3), best_iteration=0),
-    "it has no iterations": lambda r: dataclasses.replace(synthetic.cut(r, 0), best_actions=None),
 }
 
 
@@ -218,8 +213,6 @@ def test_check_names_each_faulty_run_and_archive(tmp_path: Path, capsys) -> None
     assert len(lines) == 4 and all(f"seed{seed}-" in line for seed, line in enumerate(lines[:3]))
     archive = tmp_path / "a.plab.zip.xz"
     pack(tmp_path / "runs", archive)
-    assert main(["check", str(archive)]) == 1
-    assert "a.plab.zip.xz/Rope-v1/adam/seed0-" in capsys.readouterr().out
     image = bytearray(archive.read_bytes())
     image[len(image) // 2] ^= 0xFF
     archive.write_bytes(image)

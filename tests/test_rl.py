@@ -1,10 +1,9 @@
-"""Reinforcement learning on a coarse scene: single runs and populations, resumption, failures, benchmarks."""
+"""Reinforcement learning on a coarse scene: single runs and populations, resumption, failures."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
 import re
 from collections.abc import Collection
 from dataclasses import replace
@@ -16,10 +15,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from plab.bench.rl import PARTS
-from plab.cli import bench
-from plab.config import Config, ConfigError, load_config
+from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
@@ -35,7 +33,6 @@ from plab.runners.population.runner import PopulationRunner
 from plab.runners.rl import RlRunner
 from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
-from plab.sim import SimulationError
 from plab.tally import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
@@ -44,7 +41,7 @@ CACHE = KeepsAll()
 
 HORIZON = 4
 
-SCENE = (
+COARSE = (
     "task=Move",
     "sim.grid_size=32",
     "sim.particles_scale=0.03",
@@ -54,10 +51,6 @@ SCENE = (
     "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
     # Room for three replay buffers of METHODS, and for one that holds the whole training.
     "sim.memory_mb=0.9",
-)
-
-COARSE = (
-    *SCENE,
     "method.episodes=16",
     "method.num_envs=2",
     "method.evaluate_every=6",
@@ -187,33 +180,21 @@ def test_rows_evaluation_and_policy_of_a_whole_run(finished: dict[str, RunResult
     assert {name: done.measures[name] for name in COLUMNS} == rows.iloc[-1][[*COLUMNS]].to_dict()
 
 
-def logged_losses(result: RunResult, names: Collection[str]) -> list[float]:
-    """Last losses in a run's log, after a check that all are there and finite, at steps of its rows."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(result.path.with_suffix(".tensorboard"))).Reload()
-    losses = {tag: events.Scalars(tag) for tag in events.Tags()["scalars"] if tag.startswith("train/")}
-    assert set(losses) == {f"train/{name}" for name in names}
-    for points in losses.values():
-        assert points and {point.step for point in points} <= set(result.iterations["steps"][1:])
-        assert all(math.isfinite(point.value) for point in points)
-    return [points[-1].value for points in losses.values()]
-
-
 @pytest.mark.parametrize(
     "method", ["sac", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("td3", "ppo"))]
 )
 def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, method) -> None:
-    cfgs = configs(tmp_path, method, "logger=tensorboard")
-    results, losses = [], []
+    cfgs, results, losses = configs(tmp_path, method, "logger=tensorboard"), [], []
     for cfg, want, one in zip(cfgs, lone[method], carry(cfgs), strict=True):
         results.append(got := assert_same_run(cfg, want))
         assert (one.status, one.score) == ("finished", got.evaluation["score"])
         assert (got.provenance["batch"], want.provenance["batch"]) == (3, 1)
         assert set(got.wall_time) == {"build", "compile", "optimise", "evaluate"}
         assert np.isfinite(got.iterations[1:].to_numpy()).all()
-        losses.append(logged_losses(got, family("rl").agents(method).LOSSES))
-    assert losses[0] != losses[1] != losses[2]
+        events = EventAccumulator(str(got.path.with_suffix(".tensorboard"))).Reload()
+        names = family("rl").agents(method).LOSSES
+        losses.append([events.Scalars(f"train/{name}")[-1].value for name in names])
+    assert np.isfinite(losses).all() and losses[0] != losses[1] != losses[2]
     assert len({tuple(result.iterations["loss"]) for result in results}) == 3
     assert_nothing_else_is_left(*results)
 
@@ -234,14 +215,6 @@ def test_a_population_begins_and_counts_as_a_single_run_does(finished, lone, met
     done, last = evaluation(judge, load_policy(alone.path)), alone.iterations.iloc[-1]
     for name, value in done.measures.items():
         assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
-
-
-def test_another_seed_gives_other_numbers_and_progress_counts_episodes(tmp_path, finished, capsys) -> None:
-    cfg = replace(make_config(tmp_path, "sac", "seed=1"), progress=True)
-    assert not np.array_equal(run(cfg).iterations["loss"], finished["sac"].iterations["loss"])
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Move-v1")]
-    assert [line.split()[4].rstrip(",") for line in lines] == ["2/16", "6/16", "12/16", "16/16"]
-    assert "steps/s reward" in lines[-1] and " score " in lines[-1] and " left, " in lines[-1]
 
 
 # ---------------------------------------------------------------- models
@@ -393,18 +366,6 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
 # ---------------------------------------------------------------- failures
 
 
-def test_a_simulation_that_fails_ends_the_run(tmp_path: Path, monkeypatch) -> None:
-    def advance(self: Trainer, *_: Any) -> None:
-        raise SimulationError("environment 0, step 2: position is nan")
-
-    monkeypatch.setattr(Trainer, "advance", advance)
-    cfg = make_config(tmp_path, "sac")
-    with pytest.raises(RunError, match="position is nan"):
-        run_config(cfg, CACHE)
-    left = partial(cfg)
-    assert (left.status, len(left.iterations)) == ("failed", 1) and left.best_actions is not None
-
-
 @pytest.mark.parametrize("method", ["sac", "ppo"])
 def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, method, monkeypatch, caplog) -> None:
     intact, calls = PlabVecEnv.step_wait, itertools.count()
@@ -418,8 +379,7 @@ def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, method, monkeypa
     result = run(make_config(tmp_path, method))
     assert result.provenance["broken_episodes"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert re.search("1 of [68] .* environment step 1, substep 1", told)
+    assert len(caplog.records) == 1
 
 
 def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) -> None:
@@ -439,9 +399,7 @@ def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) 
     monkeypatch.setattr(module, "evaluation", evaluated)
 
 
-def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(
-    tmp_path, finished, monkeypatch, caplog
-) -> None:
+def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, finished, monkeypatch) -> None:
     with monkeypatch.context() as patch:
         break_evaluation(patch, rl, 0)
         with pytest.raises(RunError, match="iteration 0: environment step 1, substep 1"):
@@ -453,8 +411,6 @@ def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(
     rows, whole = result.iterations["loss"], finished["ppo"].iterations["loss"]
     assert rows.drop(2).equals(whole.drop(2)) and rows[2] != whole[2]
     assert result.best_iteration == whole.drop(2).idxmin()
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert re.search("evaluation of iteration 2 .* environment step 1, substep 1", told)
 
 
 def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None:
@@ -493,11 +449,8 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
     rows, whole = judged.iterations["loss"], alone[0].iterations["loss"]
     assert judged.best_iteration != 1
     assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
-    told = {str(one.path): "" for one in (judged, taught)}
-    for record, path in itertools.product(caplog.records, told):
-        told[path] += record.getMessage() if path in record.getMessage() else ""
-    assert "evaluation of iteration 1" in told[str(judged.path)]
-    assert re.search("2 of [68] .* environment step 1, substep 1", told[str(taught.path)])
+    for one in (judged, taught):
+        assert any(str(one.path) in record.getMessage() for record in caplog.records)
 
 
 def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
@@ -517,8 +470,7 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
         patch.setattr(Population, "train", train)
         ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "failed", "failed"]
-    assert ended[1].message.startswith("iteration 1: all 6 episodes of training broke off")
-    assert "the state is not finite" in ended[1].message
+    assert ended[1].message.startswith("iteration 1: all 6 episodes")
     assert ended[2].message.startswith("iteration 2:") and "not finite" in ended[2].message
     assert statuses(cfgs[:1]) == ["before"]
     for cfg, want in zip(cfgs, lone["sac"], strict=True):
@@ -531,24 +483,6 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
     cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
     assert statuses(cfgs) == ["finished"] * 2
     assert {read(result_path(cfg)).provenance["batch"] for cfg in cfgs} == {1}
-
-
-@pytest.mark.nightly
-def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> None:
-    def full(descriptor: int, start: int, size: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(ResultsError, match=r"GB for the replay buffer at .*\.replay: No space left"):
-        run_config(make_config(tmp_path, "td3"), CACHE)
-    assert not list(tmp_path.rglob("*.replay"))
-
-
-def test_a_device_that_torch_does_not_have_is_said_before_anything_is_built(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(rl, "shared_batches", None)
-    monkeypatch.setattr(rl.torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match=r"method\.torch_device=cuda"):
-        run_config(make_config(tmp_path, "ppo", "method.torch_device=cuda"))
 
 
 # ---------------------------------------------------------------- CUDA
@@ -565,23 +499,6 @@ def test_a_single_run_is_a_population_of_one_where_its_networks_are_on_cuda(tmp_
     # Whoever has begun goes on.
     assert carries_out("ppo", "cuda", False) is RlRunner
     assert carries_out("ppo", "cpu", True) is PopulationRunner
-
-
-@pytest.mark.gpu
-def test_networks_on_cuda_are_trained_resumed_and_kept(tmp_path) -> None:
-    """Those of an algorithm from outside; plab's own are populations there."""
-    pytest.importorskip("sb3_contrib")
-    cfg = make_config(tmp_path, "tqc", "method.torch_device=cuda")
-    with stopped_at(20, Trainer, "note_step"):
-        run_config(cfg, CACHE)
-    resumed = run(cfg)
-    assert resumed.provenance["resumed"] == 1
-    assert np.isfinite(resumed.iterations[1:].to_numpy()).all()
-    assert_nothing_else_is_left(resumed)
-    policy = load_policy(resumed.path, "cuda")
-    assert policy.network.device.type == "cuda"
-    done = evaluation(EpisodeBatch([cfg]), policy)
-    assert all(math.isfinite(done.measures[name]) for name in COLUMNS)
 
 
 @pytest.mark.gpu
@@ -605,7 +522,7 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
     assert read(result_path(single)).provenance["population"]
 
 
-# ---------------------------------------------------------------- learning, speed
+# ---------------------------------------------------------------- learning
 
 
 @pytest.mark.nightly
@@ -624,31 +541,3 @@ def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
         reward += episodes.step(rng.uniform(-1, 1, (32, 3))).reward
     # 0.12; after training 0.6 to 0.8 with three seeds.
     assert result.iterations[["reward", "train_reward"]].iloc[-1].min() > 2 * reward.max() > 0
-
-
-@pytest.mark.parametrize("agents", [None, 3])
-def test_benchmark_measures_every_part(tmp_path: Path, monkeypatch, capsys, agents: int | None) -> None:
-    batches = batches_of(*(make_config(tmp_path, "sac", f"seed={seed}") for seed in range(agents or 1)))
-
-    def kept(cfgs: list[Config], contact: str = "hard") -> EpisodeBatch:
-        """Environments of the runs: building others takes longer than the test."""
-        return next(batch for batch in batches if batch.size == len(cfgs))
-
-    monkeypatch.setattr("plab.bench.rl.EpisodeBatch", kept)
-    monkeypatch.setattr(EpisodeBatch, "close", lambda self: None)
-    words = [*SCENE, "method.hidden=[8]", "--methods", "sac", "--envs", "2", "--batches", "1"]
-    words += ["--agents", str(agents)] if agents else []
-    assert bench.rl([*words, "--csv", str(tmp_path / "rl.csv")]) in (None, 0)
-    assert "steps_per_s" in capsys.readouterr().out
-    (row,) = pd.read_csv(tmp_path / "rl.csv").to_dict("records")
-    assert (row["method"], row["num_envs"]) == ("sac", 2)
-    parts = [row[f"{part}_ms"] for part in PARTS]
-    assert min(row["steps_per_s"], *parts) > 0
-    if agents is None:
-        # Of 4 steps of 2 environments.
-        assert sum(parts) == pytest.approx(2 / row["steps_per_s"] * 1e3, rel=0.05)
-    else:
-        # A replay buffer of 10,000 episodes of four steps: five observations each, four actions and rewards.
-        observed = batches[0].observation_space.shape[0]
-        held = 10_000 * 4 * (5 * observed + 4 * 7) / 1e6
-        assert (row["agents"], row["agent_mb"]) == (3, pytest.approx(held, abs=0.1))

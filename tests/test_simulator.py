@@ -166,9 +166,6 @@ def test_states_in_several_arrays_give_the_same_gradient(
         monkeypatch.setattr(sim, "memory_mb", (sim.memory_bytes() - 2 * slot_bytes) / 1e6)
 
 
-# ------------------------------------------------------------------------------------------------ refusals
-
-
 def test_states_that_are_not_finite_are_named(sim: Simulator) -> None:
     idle = np.zeros((3, 6))
     make_not_finite(sim, 1)
@@ -245,9 +242,6 @@ def test_memory_is_checked(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> N
         Simulator([scene] * (most + 1), device=sim.device)
 
 
-# --------------------------------------------------------------------------------------- order and storage
-
-
 def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
     cells = np.indices((8, 8, 8)).reshape(3, -1).T
     index = hilbert_index(cells, 3)
@@ -261,17 +255,9 @@ def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
 
 
 @pytest.mark.skipif(DEVICE != "cpu", reason="the layout of the CPU's fields")
-def test_fields_are_aligned_and_written_entry_by_entry(
-    sim: Simulator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No vector straddles two cache lines; numbers differ, so that no entry can be taken for another."""
+def test_fields_are_written_entry_by_entry(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In several pieces; numbers differ, so that no entry can be taken for another."""
     engine = sim._engine
-    for name in ("stencils", "bases", "strains", "affine", "momentum", "velocity"):
-        field = getattr(engine, name)
-        node, offset = field.parent().ptr, 0
-        while node is not None:
-            offset, node = offset + node.offset_bytes_in_parent_cell, node.parent
-        assert offset % (4 * field.n) == 0, name
     monkeypatch.setattr(exchange, "PIECE", 7)
     for _, field, size in engine.shared:
         kept = field.to_numpy()

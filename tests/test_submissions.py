@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import math
 import re
 import shutil
 import struct
@@ -31,7 +30,6 @@ from plab.submissions.files import encode, read, read_members, write
 from plab.submissions.schema import (
     UNSEEN,
     Card,
-    CardError,
     Configuration,
     Digests,
     Entry,
@@ -250,20 +248,6 @@ def test_cards_that_are_read() -> None:
     assert example in (ROOT / "docs" / "submissions.md").read_text(encoding="utf-8")
 
 
-def test_every_mistake_of_a_card_has_its_line() -> None:
-    wrong = {"nam": "x", "link": "javascript:alert(1)", "budget": -1, "gradient": "no", "authors": []}
-    card = GOOD | wrong
-    del card["hardware"]
-    with pytest.raises(CardError) as caught:
-        parse_card(yaml.safe_dump(card).encode(), "card.yaml")
-    keys = ["'nam'; did you mean name?", "authors", "link", "budget", "hardware is missing", "gradient"]
-    assert len(caught.value.faults) == len(keys)
-    for line, key in zip(caught.value.faults, keys, strict=True):
-        assert line.startswith("card.yaml: ") and key in line and "\n" not in line
-    for text in (b"name: [", b"\xff\xfe", b"!!python/object/apply:os.system ['true']", b"x" * 70_000, b"42"):
-        assert why(parse_card, text, "card.yaml").startswith("card.yaml ")
-
-
 # ----------------------------------------------------------------------------------------- configurations
 
 
@@ -324,36 +308,6 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
     assert found.entries[0].score == pytest.approx(0.4)
     assert found.entries[0].steps % 50 == 0 and 50 <= found.entries[0].steps <= 200
     assert found.entries[0].digests == Digests.of(load_config(["task=Move"]))
-
-
-def test_mistakes_of_submit(
-    tmp_path: Path,
-    card: Path,
-    told: Callable[..., str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:
-    # However slow this computer is, the results have changed just now: no database is made of them.
-    monkeypatch.setattr("plab.results.store._SETTLED", math.inf)
-    folder, missing = tmp_path / "results", str(tmp_path / "no.pt")
-    first, second = result(folder), result(folder, seed=1)
-    output = ["--output", str(tmp_path / "out.plabsub.zip")]
-    for named, argv in (
-        (f"{second} and {first}", [str(folder)]),
-        ("nothing to submit", [str(folder), "seed=7"]),
-        ("--policy", []),
-        ("--policy", [str(folder), "--policy", "Move=a.pt", "--steps", "1"]),
-        ("--steps", ["--policy", "Move=a.pt"]),
-        ("--unseen", [str(folder), "--unseen"]),
-        ("Move=a.bin", ["--policy", "Move=a.bin", "--steps", "1"]),
-        (missing, ["--policy", f"Move={missing}", "--steps", "1"]),
-    ):
-        assert named in told([*argv, "--card", str(card), *output], submit.main)
-    assert missing in told([str(folder), "--card", missing, *output], submit.main)
-    card.write_text(yaml.safe_dump(GOOD | {"budget": -1, "gradient": 3}))
-    assert submit.main([str(folder), "--card", str(card), *output]) == 2
-    first, second = capsys.readouterr().err.splitlines()
-    assert first.startswith(f"plab: {card}: budget") and second.startswith(f"plab: {card}: gradient")
 
 
 def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Callable[..., str]) -> None:

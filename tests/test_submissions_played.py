@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import re
-import runpy
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +17,7 @@ from gymnasium.wrappers import RescaleAction
 from onnx import TensorProto, helper
 
 import plab  # noqa: F401
-from plab.cli import leaderboard, submit, verify
+from plab.cli import submit, verify
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.vector import PlabVectorEnv
@@ -280,27 +276,3 @@ def test_plans_and_policies_whose_actions_do_not_fit(tmp_path: Path, monkeypatch
 
 
 # --------------------------------------------------------------------------------------- from start to end
-
-
-@pytest.mark.nightly
-def test_an_agent_from_outside_gets_to_the_leaderboard(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    script = str(ROOT / "examples" / "outside_agent" / "ppo.py")
-    argv = f"{script} --env-id plab:plab/RollingPin-v1 --total-steps 48 --minibatches 2 --env-kwargs".split()
-    monkeypatch.setattr(sys, "argv", [*argv, json.dumps({"overrides": list(COARSE)})])
-    runpy.run_path(script, run_name="__main__")
-    assert re.findall(r"^steps (\d+),", capsys.readouterr().out, re.MULTILINE) == ["24", "48"]
-
-    usual = ["--card", str(CARD), "--output"]
-    assert submit.main(["recordings", *usual, "board/plan.plabsub.zip"]) == 0
-    policy = ["--policy", "RollingPin=policy.pt", "--steps", "48", *COARSE]
-    assert submit.main([*policy, *usual, "board/policy.plabsub.zip"]) == 0
-    assert verify.main(["board", "--run-policies", "--float32", *COARSE]) == 0
-    assert leaderboard.main(["board", *COARSE, "--out", "page"]) == 0
-    text = Path("page/index.html").read_text(encoding="utf-8")
-    assert text.count(">PPO in one file</a>") == 2
-    # The legend has the mark once, each of the two lines once.
-    assert text.count('<span class="mark verified">') == 3
-    assert "Left out" not in text

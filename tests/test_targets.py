@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plab.cli import targets as command
 from plab.config import ConfigError, build_scene, load_config
-from plab.config.suite import SUITE_VARIANTS
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
 from plab.scene import Scene, sample_particles
@@ -246,26 +244,6 @@ def test_release_files_that_are_refused(tmp_path, released):
             np.save(path, changed)
         with pytest.raises(TargetError, match=rf"targets\.source: .*Move3D-v1\.npy .*{named}"):
             load_release_target(tmp_path, scene, "1")
-
-
-def test_a_folder_of_release_files_is_described_as_the_suite_is(tmp_path, device):
-    """Shifted by a few nodes and of other mass than the scene: neither changes what has to move."""
-    overrides = ("task=Move", *COARSE, f"sim.device={device}")
-    for variant in SUITE_VARIANTS:
-        scene = load(*overrides, f"variant={variant}")[0]
-        start = spread_mass(sample_particles(scene), scene.grid_size, scene.particle_mass)
-        # As many particle masses as the files of the release hold, however few the scene has.
-        scale = 10000 * scene.particle_mass / start.sum()
-        np.save(tmp_path / f"Move3D-v{variant}.npy", scale * np.roll(start, 2, axis=0))
-    source = f"targets.source={tmp_path}"
-    problem = Problem([load_config([*overrides, source, "variant=3"])])
-    assert np.array_equal(problem.target_mass[0], np.load(tmp_path / "Move3D-v3.npy"))
-    shifted = command.moments("Move", [*overrides[1:], source])
-    np.testing.assert_allclose(shifted["mass"], 10000, rtol=1e-6)
-    assert shifted["moved"].between(0.2, 0.5).all()
-    assert shifted["distance"].between(0.003, 0.02).all()
-    own = command.moments("Move", overrides[1:])
-    assert (own["moved"] > 0.9).all() and (own["distance"] > 0.1).all()
 
 
 def test_targets_that_cannot_be_built(tmp_path, released, device):

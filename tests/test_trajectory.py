@@ -1,25 +1,32 @@
-"""Trajectory optimisation on a coarse scene: update rules, whole runs, resumption, failures."""
+"""Methods that descend by the gradient on a coarse scene: rules, whole runs, resumption, logs."""
 
 from __future__ import annotations
 
+import json
+import math
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
+from plab.autograd import policy_gradient
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
 from plab.objective import scores
 from plab.problem import Problem
-from plab.results import RunResult, read, result_path
+from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.reuse import SimulatorCache
-from plab.runners import RunError, run_config, trajectory
+from plab.runners import RunError, apg, run_config, trajectory
 from plab.runners.common import measures, shared_problem, simulator_key
+from plab.runners.environments import shared_batches
+from plab.runners.loggers import RunLog
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
-from same_runs import assert_same_numbers
+from same_runs import assert_same_numbers, finished_as, stopped_at
 
 CACHE = SimulatorCache()
 
@@ -217,18 +224,18 @@ def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: 
 @pytest.mark.parametrize(
     ("at", "error", "status", "message"),
     [
-        (1, OSError("gone"), "failed", "OSError: gone"),
-        (2, KeyboardInterrupt(), "stopped", "interrupted"),
+        (1, OSError, "failed", "OSError: gone"),
+        (2, KeyboardInterrupt, "stopped", "interrupted"),
         # In the final evaluation.
-        (ITERATIONS, OSError("gone"), "failed", "OSError: gone"),
+        (ITERATIONS, OSError, "failed", "OSError: gone"),
     ],
 )
 def test_resumed_run_equals_an_uninterrupted_one(
-    tmp_path: Path, finished, monkeypatch, at: int, error: BaseException, status: str, message: str
+    tmp_path: Path, finished, monkeypatch, at: int, error: type, status: str, message: str
 ) -> None:
     cfg = make_config(tmp_path)
-    with monkeypatch.context() as patch, pytest.raises(type(error)):
-        break_rollout(patch, Problem, at, error)
+    with monkeypatch.context() as patch, pytest.raises(error):
+        break_rollout(patch, Problem, at, error("gone"))
         run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == (status, message, at)
@@ -248,3 +255,147 @@ def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: t
     left = read(result_path(cfg).with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", str(caught.value), 2)
     assert left.best_actions is not None
+
+
+# ---------------------------------------------------------------- logs
+
+
+def assert_rows_are_shown(result: RunResult) -> None:
+    """Assert that TensorBoard shows each row and the final evaluation once."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(result.path.with_suffix(".tensorboard")), {"scalars": 0}).Reload()
+    got = {name: [(e.step, e.value) for e in events.Scalars(name)] for name in events.Tags()["scalars"]}
+    rows = result.iterations
+    for name in set(rows) - {"iteration", "steps"}:
+        finite = rows[rows[name].map(math.isfinite)]
+        assert [step for step, _ in got.get(name, [])] == list(finite["steps"])
+        np.testing.assert_allclose([value for _, value in got.get(name, [])], finite[name], rtol=1e-6)
+    last = int(rows["steps"].iloc[-1]) + 3
+    for name, value in result.evaluation.items():
+        ((step, shown),) = got[f"final/{name}"]
+        assert step == last and shown == pytest.approx(value, rel=1e-6)
+
+
+def test_tensorboard_shows_the_rows_as_one_curve(finished, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("tensorboard")
+    cfg = make_config(tmp_path, "logger=tensorboard", "checkpoint_seconds=1e6")
+    # Killed in the third iteration: the file has the first alone, the log has the second, too.
+    with monkeypatch.context() as patch, stopped_at(2):
+        patch.setattr(RunFile, "close", lambda run, *_: run.release())
+        run_config(cfg, CACHE)
+    result = run(cfg)
+    assert result.provenance["resumed"] == 1
+    assert_rows_are_shown(result)
+    finished_as(cfg, finished)
+
+
+def test_a_log_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    cfg = make_config(tmp_path, "logger=tensorboard")
+    folder = result_path(cfg).with_suffix(".tensorboard")
+    folder.parent.mkdir(parents=True)
+    folder.write_text("no folder")
+    with pytest.raises(ResultsError, match="logger=tensorboard fails: ") as caught:
+        run_config(cfg, CACHE)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatch) -> None:
+    began, logged = [], []
+    log = SimpleNamespace(log=logged.append, define_metric=lambda *_, **__: None, finish=lambda: None)
+
+    def init(**options):
+        began.append(options)
+        if options["project"] == "closed":
+            raise OSError("no\nanswer")
+        return log
+
+    fake = SimpleNamespace(init=init, Settings=dict, Error=OSError)
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    cfg = make_config(tmp_path, "logger=wandb")
+    run = SimpleNamespace(path=result_path(cfg), result=SimpleNamespace(config={"seed": 0}))
+    given = RunLog(cfg, run)
+    assert given.wanted and not began
+    given.write({"loss": 1.5, "score": math.nan}, 8)
+    given.write({"loss": 1.0}, 12)
+    assert logged == [{"loss": 1.5, "steps": 8}, {"loss": 1.0, "steps": 12}]
+    (options,) = began
+    name = f"Rope-v1-adam-{result_path(cfg).stem}"
+    assert (options["project"], options["name"], options["id"]) == ("plab", name, name)
+    assert (options["dir"], options["config"], options["resume"]) == (str(tmp_path), {"seed": 0}, "allow")
+    monkeypatch.setenv("WANDB_PROJECT", "closed")
+    with pytest.raises(ResultsError, match=r"^logger=wandb fails: no answer .*WANDB_MODE.*logger=none"):
+        RunLog(cfg, run).write({"loss": 1.0}, 0)
+    quiet = RunLog(replace(cfg, logger="none"), run)
+    quiet.write({"loss": 1.0}, 0)
+    assert not quiet.wanted and len(began) == 2
+
+
+@pytest.mark.nightly
+def test_wandb_gets_the_rows(tmp_path: Path, monkeypatch) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    wandb.teardown()
+    result = run(make_config(tmp_path, "logger=wandb"))
+    # Its own process writes the files.
+    wandb.teardown()
+    name = f"Rope-v1-adam-{result.path.stem}"
+    written = next((tmp_path / "wandb").glob(f"offline-run-*/run-{name}.wandb")).read_bytes()
+    for value in (*result.iterations["loss"], *result.evaluation.values()):
+        assert json.dumps(value).encode() in written
+
+
+def test_the_logger_is_no_part_of_the_hash(tmp_path: Path) -> None:
+    cfgs = [make_config(tmp_path, f"logger={name}") for name in ("none", "tensorboard", "wandb")]
+    assert len(set(map(result_path, cfgs))) == 1
+    with pytest.raises(ConfigError, match="logger 'mlflow'"):
+        make_config(tmp_path, "logger=mlflow")
+
+
+# ---------------------------------------------------------------- policies: apg
+
+
+APG = ("method=apg", "method.hidden=[16,16]", "method.lr=0.01")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """An uninterrupted run of apg."""
+    return run(make_config(tmp_path_factory.mktemp("apg"), *APG))
+
+
+def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_path: Path) -> None:
+    rows, cfg = trained.iterations, make_config(tmp_path, *APG)
+    assert rows["steps"].tolist() == [3 * i for i in range(ITERATIONS)]
+    assert not rows["steps_forward"].any()
+    assert rows["steps_gradient"].tolist() == [3 * (i + 1) for i in range(ITERATIONS)]
+    (batch,) = shared_batches(CACHE, ([cfg], 1, cfg.method.contact))
+    sizes = *batch.observation_space.shape, 6
+    policy = apg.PolicyTraining(cfg.method, *sizes, cfg.seed, torch.device("cpu")).policy
+    adam = torch.optim.Adam(policy.parameters(), 0.01)
+    for _, row in rows.iterrows():
+        first = batch.reset()[1]["loss"][0]
+        adam.zero_grad()
+        done = policy_gradient(batch, policy, 3)
+        norm = torch.cat([one.grad.flatten() for one in policy.parameters()]).norm()
+        assert row["loss"] == done.loss.double().sum()
+        assert row["reward"] == pytest.approx(3 * first - row["loss"], rel=1e-6)
+        assert row["loss_sdf"] == pytest.approx(float(done.terms[:, 0, 1].sum()), rel=1e-6)
+        assert row["gradient_norm"] == pytest.approx(float(norm), rel=1e-6)
+        adam.step()
+    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0]
+    assert trained.best_loss == rows["loss"].min()
+    judged = scores(trained.masses["initial"], trained.masses["final"], trained.masses["target"])
+    assert trained.evaluation["score"] == judged.score
+
+
+def test_apg_resumes_to_the_same_numbers(tmp_path: Path, trained: RunResult, monkeypatch) -> None:
+    cfg = make_config(tmp_path, *APG)
+    with stopped_at(2, apg, "policy_gradient"):
+        run_config(cfg, CACHE)
+    assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
+    again = run(cfg)
+    assert_same_numbers(again, trained)
+    assert again.provenance["resumed"] == 1

@@ -25,7 +25,7 @@ from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import spread_mass
 from plab.render import graphics
-from plab.render.recording import RecordedRollout, record_with_motion
+from plab.render.recording import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.scene import sample_particles
 from plab.sim import Simulator
@@ -127,20 +127,6 @@ def test_frames_and_particles_are_thinned_out(recording, monkeypatch):
     assert frames(rope["positions"])[3].reshape(-1, 3) == pytest.approx(recording.x[3, ::2], abs=0.51 / 2**16)
 
 
-def test_targets_in_files_that_are_missing_or_at_hand(capsys, recording):
-    cfg = load_config(["task=Rope", *COARSE])
-    cfg = dataclasses.replace(cfg, targets=dataclasses.replace(cfg.targets, source="files"))
-    found = record_with_motion(cfg, ACTIONS)
-    assert found.target_mass is None and found.scores is None and np.isnan(found.score)
-    assert found.x.shape == (4, found.scene.particle_count, 3) and found.F.shape == (*found.x.shape, 3)
-    assert capsys.readouterr().err.startswith("plab: without target")
-    Path("files").mkdir()
-    np.save("files/Rope3D-v1.npy", recording.target_mass)
-    again = record_with_motion(cfg, ACTIONS)
-    assert np.array_equal(again.target_mass, recording.target_mass) and again.scores.shape == (4,)
-    assert np.array_equal(again.x, found.x) and "files" in capsys.readouterr().err
-
-
 # ------------------------------------------------------------------------------- command line and notebook
 
 
@@ -174,14 +160,6 @@ def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, 
         assert shown.read_text(encoding="utf-8") == page
     for replay, given in simulated:
         assert np.array_equal(given, ACTIONS) and replay.variant == "2"
-
-
-@pytest.mark.parametrize(("package", "name"), [("k3d", "K3D-jupyter"), ("pyvista", "PyVista")])
-def test_missing_packages_and_other_suffixes_are_named(monkeypatch, told, package, name):
-    assert "rope.gif" in told(["task=Rope", "--output", "rope.gif"], main)
-    monkeypatch.setattr(graphics, "find_spec", lambda wanted: None if wanted == package else object())
-    line = told(["task=Rope"], main)
-    assert name in line and "plab[view]" in line
 
 
 def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulated, recording, page):

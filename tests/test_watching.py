@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import io
 import re
-import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,6 @@ from rich.console import Console
 from taichi.lang import kernel_impl
 
 from plab import progress
-from plab.cli.next_steps import next_steps
 from plab.cli.run import main
 from plab.config import load_config
 from plab.results import RunFile
@@ -62,17 +60,6 @@ def test_a_bar_shows_which_kernel_is_compiled_and_for_how_long(screen, monkeypat
         report(1, "loss 2")
     last = screen.getvalue().split("compiling losses_kernel, 0 s")[-1]
     assert "loss 2" in last and "compiling" not in last.rsplit("Rope", 1)[1]
-
-
-def test_without_a_terminal_nothing_watches_the_compiler(capsys) -> None:
-    def compiler(tell: Callable[[str], None]):
-        raise AssertionError
-
-    with progress.show_waiting("Rope build", compiler):
-        pass
-    with progress.show_progress("Rope", 0, 8, compiling=compiler) as report:
-        report(8, "loss 2")
-    assert capsys.readouterr().out == "Rope 8/8, started, loss 2\n"
 
 
 def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, capsys) -> None:
@@ -143,34 +130,3 @@ def test_the_summary_has_the_score_and_another_one_if_it_differs(
 ) -> None:
     columns = {"train_reward": 1.0} | more if more else {}
     assert re.findall(r"\d\.\d+", summary(tmp_path, shown, judged, *words, **columns)) == scores
-
-
-@pytest.mark.parametrize(
-    ("quick", "full"),
-    [
-        (["method.iterations=20", "seed=3"], "seed=3"),
-        (["sim.particles_scale=0.2", "task=Move", "force=true"], "task=Move"),
-        (["task=Move", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10"], "task=Move"),
-        (["method=sac", "method.episodes=100", "results_dir=my runs"], "method=sac 'results_dir=my runs'"),
-        (["method=solve", "method.stages.polish.iterations=1"], "method=solve"),
-        (["method.iterations=20"], ""),
-    ],
-)
-def test_a_quick_run_is_followed_by_the_full_one(quick, full) -> None:
-    first, second = next_steps(load_config(quick), quick)
-    folder = "'my runs'" if "my runs" in full else "results"
-    assert first.endswith(f"python -m plab.report html --results {folder}")
-    assert second.endswith(f"python -m plab.run {full}".rstrip())
-    whole = load_config(shlex.split(second.partition("plab.run")[2]))
-    assert whole.method.name == load_config(quick).method.name and whole.sim == load_config().sim
-
-
-def test_what_follows_full_runs_and_runs_of_ones_own_task() -> None:
-    words = ["task=Move", "method.lr=0.05", "sim.horizon=60"]
-    first, second = next_steps(load_config(words), words)
-    assert re.search(r"python -m plab.render results/Move-v1/adam/seed0-\w{8}\.h5$", first)
-    assert second.endswith("python -m plab.report html --results results")
-    own = str(Path(__file__).parents[1] / "examples" / "own_task" / "conf")
-    words = ["task=Dumbbell", "method.iterations=5"]
-    second = next_steps(load_config(words, own), words, own)[1]
-    assert second.endswith(f"plab.run task=Dumbbell --config-dir {own}")
