@@ -24,7 +24,6 @@ os.environ["PLAB_TRACEBACK"] = "1"
 
 OF_ANY_DEVICE = (
     "tests/test_simulator.py",
-    "tests/test_simulator_reference.py",
     "tests/test_mixed_materials.py",
     "tests/verification/",
 )

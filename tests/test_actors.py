@@ -114,6 +114,8 @@ def test_on_cuda_it_begins_as_on_the_cpu_and_learns(finished: RunResult, tmp_pat
     assert rows["steps_gradient"].equals(finished.iterations["steps_gradient"])
     trained = rows.filter(regex="^(train|plan)_").iloc[1:]
     assert np.isfinite(trained.to_numpy()).all() and rows["loss"].nunique() == 3
+    # Another device ends the simulators of the one before.
+    CACHE.clear()
 
 
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:

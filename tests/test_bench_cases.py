@@ -10,13 +10,10 @@ import pandas as pd
 import pytest
 
 from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
-from plab.bench.common_scene import PLACES, common_actions, common_scene, own_components
 from plab.bench.precision import angle
-from plab.bench.stability import QUICK as QUICK_CASES
 from plab.bench.stability import run_cases, run_refusals
-from plab.bench.stress_cases import StressPlan, bang_bang_actions, refusals, stress_cases
+from plab.bench.stress_cases import StressPlan, refusals, stress_cases
 from plab.cli import bench
-from plab.config import build_scene, load_config
 from plab.report.costs import diagrams
 from plab.report.figures import save, style
 from plab.scene import Body, SceneError
@@ -33,25 +30,7 @@ def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:
     assert "lower_bound" in said["manipulator's bounds are the wrong way round"]
 
 
-def test_common_scenes_hold_the_task_and_park_the_rest() -> None:
-    scene = build_scene(load_config(["task=Rope", "variant=2"]))
-    common = common_scene(scene, 100)
-    assert common.particle_count == 100
-    common.validate()
-    actions = np.arange(1.0, 7.0) * np.ones((4, 6))
-    spread = common_actions(scene, actions)
-    assert spread.shape == (4, common.action_dim)
-    np.testing.assert_array_equal(spread[:, own_components(scene)], actions)
-    assert (spread != 0).sum() == actions.size
-    used = [m for m in common.manipulators if m.position[1] < 1.0]
-    assert used == list(scene.manipulators)
-    assert tuple(m.shape for m in common.manipulators) == PLACES
-    with pytest.raises(ValueError, match="Cylinder"):
-        common_scene(scene, 100, ("Sphere", "Sphere"))
-
-
-
-
+@pytest.mark.nightly
 def test_few_particles_survive(tmp_path: Path) -> None:
     cases = [c for c in stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
     found = list(run_cases(cases, "float32"))

@@ -10,7 +10,10 @@ from cuda_scenes import ALL, actions_of, assert_same_bits, results_of, simulator
 pytestmark = [pytest.mark.gpu]
 
 
-@pytest.mark.parametrize(("contact", "batches"), [("nearest", ([7], [10, 2, 8])), ("soft", ([10, 2, 8],))])
+@pytest.mark.parametrize(
+    ("contact", "batches"),
+    [("nearest", ([7], [10, 2, 8])), pytest.param("soft", ([10, 2, 8],), marks=pytest.mark.nightly)],
+)
 def test_every_run_and_every_batch_has_the_same_bits(contact: str, batches: tuple[list[int], ...]) -> None:
     want, *again = results_of(ALL, "float32", contact, times=4)
     assert all(np.isfinite(values).all() for values in want.values())

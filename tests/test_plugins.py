@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from plab.config import ConfigError, MethodConfig, load_config
-from plab.families import FAMILIES, Family, family, known_family
+from plab.families import FAMILIES, Family
 from plab.plugins import load_object, passed_on, search_in
 from plab.results import check, read, result_path
 from plab.runners import Runner, run_batch
@@ -68,23 +68,6 @@ def test_what_is_wrong_is_one_line(folder: Path) -> None:
         with pytest.raises(ConfigError) as caught:
             load_object(text.format(k), int)
         assert named.format(k) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_families_that_are_not_there_or_do_not_fit(folder: Path) -> None:
-    for text, named in (
-        ("# A method.\nname: never\nfamily: zz_never:FAMILY\n", "'zz_never:FAMILY'"),
-        ("# Nothing.\nname: never\n", r"method\.family"),
-    ):
-        (folder / "method" / "never.yaml").write_text(text)
-        with pytest.raises(ConfigError, match=named):
-            load_config(["method=never"], folder)
-    with pytest.raises(ConfigError, match="'trajectoryy'"):
-        family("trajectoryy")
-    assert known_family("zz_never:FAMILY") is None and known_family("rl") is FAMILIES["rl"]
-    with pytest.raises(ConfigError, match=r"TrajectoryConfig.*ApgConfig"):
-        load_config(["method=adam", "method.family=apg"])
-    with pytest.raises(ConfigError, match=r"SacConfig.*PpoConfig"):
-        load_config(["method=sac", "method.algorithm=ppo"])
 
 
 OPTIMISER = """

@@ -92,14 +92,6 @@ def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
         assert np.all(distance(centers + 0.005 * normal) > distance(centers))
 
 
-def test_points_scattered_over_a_part_lie_on_it_evenly():
-    (part,) = manipulator_parts(Manipulator("Sphere", (0.1,), (0.0, 0.0, 0.0)))
-    points = part.scatter(1e-4)
-    assert len(points) == pytest.approx(4 * math.pi * 0.1**2 / 1e-4, rel=0.02)
-    assert np.linalg.norm(points, axis=1) == pytest.approx(0.1, rel=0.01)
-    assert np.abs(points.mean(axis=0)).max() < 0.01
-
-
 # ------------------------------------------------------------------------------------------------- plasticine
 
 
@@ -264,22 +256,6 @@ def test_every_kind_of_manipulator_is_drawn_at_its_pose(kind):
             inwards = nearest + 0.2 * (vertices.mean(axis=0) - nearest) * (kind != "Torus")
             column, row = np.floor(renderer.camera.project(inwards, SIZE)).astype(int)
             assert is_metal(picture[row, column].astype(float)), part.side
-
-
-def test_a_renderer_refuses_what_does_not_fit():
-    world = scene(SPHERE)
-    x, poses = sample_particles(world), start_poses(world)
-    renderer = Renderer(world, size=SIZE)
-    with pytest.raises(ValueError, match=r"x .*\(799, 3\)"):
-        renderer.frame(x[1:], poses)
-    with pytest.raises(ValueError, match=r"poses .*\(2, 8\)"):
-        renderer.frame(x, np.concatenate([poses, poses]))
-    with pytest.raises(ValueError, match="target"):
-        renderer.target(poses)
-    renderer.close()
-    renderer.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        renderer.frame(x, poses)
 
 
 # ------------------------------------------------------------------------------------------------------ files

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import urllib.parse
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,6 @@ from browsing import browsing, press, until
 from plab.bench.results import synthetic_run, template
 from plab.cli.report import main
 from plab.config.selection import select
-from plab.render import replays
 from plab.render.graphics import missing_graphics
 from plab.report.aggregate import interquartile_mean, shared_strata
 from plab.report.collect import NAMES, collect
@@ -169,6 +169,7 @@ def test_page_in_a_browser(browser, results: Path, tmp_path: Path) -> None:
 def test_pictures_are_drawn_once_and_replaced_by_better_ones(tmp_path: Path, monkeypatch) -> None:
     results, out = tmp_path / "results", tmp_path / "page"
     seen: list[bool] = []
+    replays = import_module("plab.render.replays")
     save = replays.save_set
 
     def looking(*arguments):

@@ -49,23 +49,6 @@ runtime.start_runtime("cpu", "float32")
     assert (done.returncode, done.stdout) == (0, "")
 
 
-def test_errors_in_functions_name_their_line() -> None:
-    """Also in functions that were read before."""
-    start_runtime("cpu", "float32")
-
-    @ti.func
-    def broken(x):
-        return 0.5 * x + unknown  # noqa: F821
-
-    @ti.kernel
-    def fails(x: ti.f32) -> ti.f32:
-        return broken(x)
-
-    for _ in range(2):
-        with pytest.raises(ti.TaichiNameError, match=r"in broken:\n *return 0.5 \* x \+ unknown"):
-            fails(1.0)
-
-
 def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
     """What Taichi keeps at their addresses by now may be another array, in use."""
     start_runtime("cpu", "float32")

@@ -276,7 +276,7 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
     # All 22 states were kept; with checkpoints fewer do.
     sim.memory_mb = (sim.memory_bytes() - 9 * sim._particles.slot_bytes) / 1e6
     results = [(sim.rollout(ACTIONS), sim.state())]
-    alone = built(SCENES[:1], "cpu", threads=sim._runtime.threads + 1)
+    alone = built(SCENES[:1], "cpu", threads=2 if sim._runtime.threads == 1 else 1)
     results.append((alone.rollout(ACTIONS[:1]), alone.state()))
     for got, state in results:
         count = len(state.x)
