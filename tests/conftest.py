@@ -18,13 +18,12 @@ from plab.tally import Outcome
 from refusals import ending, refusal, snapshot
 from suite import DEVICE
 
-# A bug is to be seen as what it is, also by the processes that tests start: the last net counts as a failure.
+# Let bugs through with their tracebacks, in the processes that tests start, too.
 os.environ["PLAB_TRACEBACK"] = "1"
 
 
 OF_ANY_DEVICE = (
     "tests/test_simulator.py",
-    "tests/test_simulator_reference.py",
     "tests/test_mixed_materials.py",
     "tests/verification/",
 )
@@ -39,7 +38,7 @@ def device() -> str:
 
 @pytest.fixture(scope="module", autouse=True)
 def _simulators_of_one_module(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Let go of what a module keeps in its ``CACHE``: beside it, others would be compiled anew."""
+    """Clear a module's ``CACHE`` of simulators after its last test."""
     yield
     if cache := getattr(request.module, "CACHE", None):
         cache.clear()
@@ -86,7 +85,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 
 @pytest.fixture
 def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
-    """Call a command line that has to refuse, see that it leaves the folder alone, return what it says."""
+    """Call a command line that has to refuse, assert that the folder is unchanged, and return the line."""
     from plab.cli.run import main
 
     def call(
@@ -107,7 +106,7 @@ def told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., st
 
 @pytest.fixture
 def refused(seen: list[Config], told: Callable[..., str]) -> Callable[..., str]:
-    """The same, and nothing is to have reached the runners."""
+    """The same as ``told``, and no configuration reaches the runners."""
 
     def call(*args: object, **kwargs: object) -> str:
         line = told(*args, **kwargs)

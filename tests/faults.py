@@ -1,9 +1,8 @@
-"""What this process does to the files of a folder, event by event: to count, to fail, to kill in between.
+"""Changes of files by this process, event by event: to count them, or to fail or die at one of them.
 
-Events are what changes files and can fail: ``create``, ``write`` (each in two halves, as a full disk or a
-kill may cut one off), ``fsync``, ``replace``, ``unlink``, ``mkdir``, ``rmdir``, ``reserve``, ``append`` (a
-step of a replay buffer, written by its mapping) and ``msync``. HDF5 files are made in memory, so that all of
-plab's files come by here.
+Events are ``create``, ``write`` (each in two halves, as a full disk or a kill may cut one off), ``fsync``,
+``replace``, ``unlink``, ``mkdir``, ``rmdir`` and ``reserve``. HDF5 files are made in memory, so that all of
+plab's files are covered.
 """
 
 from __future__ import annotations
@@ -11,24 +10,51 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
-import mmap
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-__all__ = ["Failing", "watched"]
+from plab.results import read
+from plab.results.files import encode
 
-Event = Callable[[str, str], None]
-"""Called with what is about to happen, and to which file; may raise OSError, or end the process."""
+DEATH = -1
+"""Instead of an error: the run dies, and from then on no file can be changed."""
+
+
+class Death(BaseException):
+    """End of a run whose process goes on."""
+
+
+class Failing:
+    """Failure at one of the events, whose kinds ``seen`` collects.
+
+    ``at`` is its number, -1 for none; ``error`` that of the disk, such as ``errno.ENOSPC``. If ``lasting``
+    later events fail, too, except that files can still be removed from a disk that is full.
+    """
+
+    def __init__(self, at: int, error: int, *, lasting: bool = False) -> None:
+        self._at, self._error, self._lasting = at, error, lasting or error == DEATH
+        self.seen: list[str] = []
+
+    def __call__(self, kind: str, path: str) -> None:
+        """Take part in an event."""
+        number = len(self.seen)
+        self.seen.append(kind)
+        removes = kind in ("unlink", "rmdir") and self._error == errno.ENOSPC
+        after = self._at >= 0 and self._lasting and number > self._at and not removes
+        if number == self._at or after:
+            raise Death if self._error == DEATH else OSError(self._error, os.strerror(self._error), path)
 
 
 class _Raw(io.FileIO):
-    """A file that is written in two halves, each an event."""
+    """File that is written in two halves, each an event."""
 
-    def __init__(self, path: str, mode: str, event: Event) -> None:
+    def __init__(self, path: str, mode: str, event: Callable[[str, str], None]) -> None:
         event("create", path)
         super().__init__(path, mode)
         self._path, self._event = path, event
@@ -37,66 +63,24 @@ class _Raw(io.FileIO):
         view = memoryview(content).cast("B")
         for part in (view[: len(view) // 2], view[len(view) // 2 :]):
             self._event("write", self._path)
-            done = 0
-            while done < len(part):
-                done += super().write(part[done:])
+            assert super().write(part) == len(part)
         return len(view)
 
 
-class Failing:
-    """An event at which the disk fails: at one of a number, or from that one on.
-
-    Attributes:
-        count: How many events there have been.
-        seen: What they were.
-    """
-
-    def __init__(self, at: int, error: int, *, lasting: bool = False) -> None:
-        """Choose the event.
-
-        Args:
-            at: Its number, from 0; -1 for none.
-            error: What the disk answers, such as ``errno.ENOSPC``.
-            lasting: Whether it goes on to fail. Files can then still be removed, unless it is read-only.
-        """
-        self._at, self._error, self._lasting = at, error, lasting
-        self.count, self.seen = 0, []
-
-    def __call__(self, kind: str, path: str) -> None:
-        number = self.count
-        self.count += 1
-        self.seen.append((kind, Path(path).name))
-        after = self._at >= 0 and self._lasting and number >= self._at
-        if number == self._at or (after and (self._error == errno.EROFS or kind not in ("unlink", "rmdir"))):
-            raise OSError(self._error, os.strerror(self._error), path)
-
-
 @contextlib.contextmanager
-def watched(folder: Path, event: Event) -> Iterator[None]:
-    """Have something called before each change of a file in a folder, inside the ``with`` block.
-
-    Args:
-        folder: The folder; what happens elsewhere is no event.
-        event: What is called.
-    """
+def watched(folder: Path, event: Callable[[str, str], None]) -> Iterator[None]:
+    """Call ``event`` with kind and path before each change of a file in a folder, inside the block."""
     root = os.path.realpath(folder)
 
     def inside(path: Any) -> str | None:
-        if not isinstance(path, str | bytes | os.PathLike):
-            return None
-        text = os.path.abspath(os.fsdecode(path))
-        return text if os.path.realpath(text).startswith(root + os.sep) or text == root else None
-
-    def of_descriptor(descriptor: int) -> str | None:
-        with contextlib.suppress(OSError):
-            return inside(os.readlink(f"/proc/self/fd/{descriptor}").removesuffix(" (deleted)"))
-        return None
+        if isinstance(path, int):
+            path = os.readlink(f"/proc/self/fd/{path}").removesuffix(" (deleted)")
+        text = os.path.realpath(os.fsdecode(path))
+        return text if text.startswith(root + os.sep) or text == root else None
 
     def before(kind: str, function: Callable[..., Any], place: int = 0) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
-            target = arguments[place]
-            path = of_descriptor(target) if isinstance(target, int) else inside(target)
-            if path is not None:
+            if path := inside(arguments[place]):
                 event(kind, path)
             return function(*arguments, **options)
 
@@ -105,43 +89,40 @@ def watched(folder: Path, event: Event) -> Iterator[None]:
     plain_open, plain_os_open = io.open, os.open
 
     def opened(file: Any, mode: str = "r", *arguments: Any, **options: Any) -> Any:
-        path = inside(file)
+        path = None if isinstance(file, int) else inside(file)
         # With an opener it is a file without a name, which os.open makes.
         if path is None or "b" not in mode or not set(mode) & set("wax+") or "opener" in options:
             return plain_open(file, mode, *arguments, **options)
-        raw = _Raw(path, mode.replace("b", ""), event)
-        return io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+        kind = io.BufferedRandom if "+" in mode else io.BufferedWriter
+        return kind(_Raw(path, mode.replace("b", ""), event))
 
     def os_opened(path: Any, flags: int, *arguments: Any, **options: Any) -> int:
         unnamed = getattr(os, "O_TMPFILE", os.O_CREAT)
-        if (flags & os.O_CREAT or flags & unnamed == unnamed) and inside(path):
-            event("create", os.fsdecode(path))
+        if (flags & os.O_CREAT or flags & unnamed == unnamed) and (found := inside(path)):
+            event("create", found)
         return plain_os_open(path, flags, *arguments, **options)
 
-    class Mapped(mmap.mmap):
-        """A mapping whose flush is an event."""
-
-        def flush(self, *arguments: int) -> None:
-            event("msync", str(folder))
-            super().flush(*arguments)
-
-    # Here, as it imports torch.
-    from plab.runners.replay import EpisodeReplay
-
-    add = EpisodeReplay.add
-
-    def appended(self: EpisodeReplay, *arguments: Any) -> None:
-        event("append", str(folder))
-        add(self, *arguments)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("io.open", opened)
-        patch.setattr("builtins.open", opened)
-        patch.setattr("os.open", os_opened)
+        for name, function in (("io.open", opened), ("builtins.open", opened), ("os.open", os_opened)):
+            patch.setattr(name, function)
         for name in ("unlink", "remove", "mkdir", "rmdir", "fsync"):
             patch.setattr(f"os.{name}", before("unlink" if name == "remove" else name, getattr(os, name)))
         patch.setattr("os.replace", before("replace", os.replace, 1))
         patch.setattr("os.posix_fallocate", before("reserve", os.posix_fallocate))
-        patch.setattr("mmap.mmap", Mapped)
-        patch.setattr(EpisodeReplay, "add", appended)
         yield
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the contents of all files but the toy runner's log, by name, without times and provenance."""
+
+    def content(path: Path) -> bytes:
+        if path.suffix == ".npz":
+            with np.load(path) as arrays:
+                return b"".join(key.encode() + arrays[key].tobytes() for key in sorted(arrays.files))
+        if path.suffix != ".h5":
+            return path.read_bytes()
+        result = read(path)
+        columns = result.columns | {"seconds": np.zeros(result.rows)}
+        return encode(replace(result, columns=columns, provenance={}, wall_time={}), compress=True)
+
+    return {str(one): content(one) for one in folder.rglob("*") if one.is_file() and one.name != "log"}

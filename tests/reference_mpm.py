@@ -60,12 +60,7 @@ class State:
 
 
 def initial_state(scene: Scene, x: Tensor | None = None) -> State:
-    """State at t = 0: at rest, undeformed.
-
-    Args:
-        scene: The scene.
-        x: Particle positions, shape [particle, 3]; drawn by :func:`plab.scene.sample_particles` unless given.
-    """
+    """State at t = 0: at rest, undeformed; particles x [particle, 3] are sampled unless given."""
     x = torch.as_tensor(sample_particles(scene) if x is None else x, dtype=torch.float64)
     rows = [(*m.position, *m.rotation, m.gap) for m in scene.manipulators]
     return State(
@@ -96,14 +91,7 @@ def _unit_rotations(poses: Tensor) -> Tensor:
 
 
 def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
-    """Advance by one substep.
-
-    Args:
-        scene: The scene.
-        state: State at the start of the substep.
-        action: Action of the environment step, shape [A], clipped to [-1, 1] here.
-        alpha: Stiffness of soft contact; 0 is the hard model.
-    """
+    """Advance by one substep of an environment step's action [A]; alpha is soft contact's stiffness, or 0."""
     F_trial = (_identity() + scene.dt * state.C) @ state.F
     F, R = return_mapping(scene, F_trial)
     momentum, mass = _particles_to_grid(scene, state, kirchhoff_stress(scene, F, R))
@@ -118,14 +106,7 @@ def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
 
 
 def proper_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """F = U diag(S) V^T with rotations U and V; the smallest singular value is negative where det F < 0.
-
-    Args:
-        F: Matrices, shape [..., 3, 3].
-
-    Returns:
-        U [..., 3, 3], S [..., 3] and V^T [..., 3, 3].
-    """
+    """Rotations U and V and values S with F = U diag(S) V^T; the smallest is negative where det F < 0."""
     U, S, Vt = torch.linalg.svd(F)
     keep = torch.ones_like(S[..., :2])
     flip_U = torch.cat([keep, torch.linalg.det(U.detach()).sign()[..., None]], dim=-1)
@@ -134,15 +115,7 @@ def proper_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def return_mapping(scene: Scene, F_trial: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mapping of von Mises plasticity in Hencky strain.
-
-    Args:
-        scene: The scene, for the yield stresses and the shear moduli.
-        F_trial: Trial deformation gradients, shape [particle, 3, 3].
-
-    Returns:
-        Deformation gradients F and their rotations R = U V^T, both [particle, 3, 3].
-    """
+    """Return mapping of von Mises plasticity in Hencky strain: F and R = U V^T, both [particle, 3, 3]."""
     U, S, Vt = proper_svd(F_trial)
     e = S.clamp(min=MIN_SINGULAR_VALUE).log()
     e_dev = e - e.mean(dim=-1, keepdim=True)
@@ -176,15 +149,8 @@ def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:
 
 
 def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The 27 nodes around each particle.
-
-    Args:
-        scene: The scene.
-        x: Particle positions, shape [particle, 3].
-
-    Returns:
-        Node indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3].
-    """
+    """Indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3] of the nodes
+    around each particle."""
     base = x.detach() / scene.dx - 0.5
     base = base.trunc() if scene.floor == "release" else base.floor()
     fx = x / scene.dx - base
@@ -229,12 +195,7 @@ def _grid_to_particles(scene: Scene, x: Tensor, velocity: Tensor) -> tuple[Tenso
 
 
 def mass_tensor(scene: Scene, x: Tensor) -> Tensor:
-    """Mass of the grid nodes, shape [n, n, n]; the ghost nodes' mass goes to their neighbour, node 0.
-
-    Args:
-        scene: The scene.
-        x: Particle positions, shape [particle, 3].
-    """
+    """Mass of the grid nodes, shape [n, n, n]; the ghost nodes' mass goes to their neighbour, node 0."""
     n = scene.grid_size
     node, weight, _ = _stencil(scene, x)
     i, j, k = node.clamp(min=0).unbind(dim=-1)
@@ -265,13 +226,8 @@ def _grid_update(
 def contact(v: Tensor, u: Tensor, d: Tensor, normal: Tensor, friction: float, alpha: float) -> Tensor:
     """Velocity of the nodes [node, 3] after contact with one manipulator.
 
-    Args:
-        v: Velocity of the nodes before, shape [node, 3].
-        u: Rigid velocity of the manipulator at the nodes, shape [node, 3].
-        d: Signed distances, shape [node].
-        normal: Outward normals, shape [node, 3].
-        friction: Coulomb friction coefficient.
-        alpha: Stiffness of soft contact; 0 is the hard model.
+    It has the rigid velocity u [node, 3], signed distances d [node] and outward normals [node, 3]; v is the
+    velocity before, alpha the stiffness of soft contact, or 0 for the hard model.
     """
     s = torch.exp(-alpha * d.clamp(min=0.0))[:, None]  # min(exp(-alpha d), 1) that cannot overflow
     touches = d <= 0
@@ -315,16 +271,7 @@ def floor_contact(v: Tensor, friction: float) -> Tensor:
 
 
 def move_manipulators(scene: Scene, poses: Tensor, action: Tensor) -> Tensor:
-    """Poses at the end of a substep.
-
-    Args:
-        scene: The scene.
-        poses: Poses at its start, shape [manipulator, 8].
-        action: Action of the environment step, shape [A].
-
-    Returns:
-        Poses, shape [manipulator, 8].
-    """
+    """Poses [manipulator, 8] at the end of a substep of an environment step's action [A]."""
     actions = action.to(torch.float64).clamp(-1.0, 1.0).split([m.action_dim for m in scene.manipulators])
     ends = []
     for manipulator, pose, part in zip(scene.manipulators, poses, actions, strict=True):
@@ -425,16 +372,10 @@ def _conjugate(q: Tensor) -> Tensor:
 
 
 def signed_distance(manipulator: Manipulator, pose: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to a manipulator and its gradient, the outward normal.
+    """Signed distance [...] of points [..., 3] to a manipulator, and its gradient, the outward normal.
 
-    Args:
-        manipulator: Shape and size.
-        pose: Pose, shape [8].
-        points: Points in the world, shape [..., 3].
-
-    Returns:
-        Distances [...], negative inside, and normals in the world frame [..., 3]. Where symmetry leaves a
-        direction of the normal undefined (on the axis of a capsule, say) that part of it is 0.
+    Where symmetry leaves a direction of the normal undefined (on the axis of a capsule, say) that part of it
+    is 0.
     """
     d, normal = _DISTANCES[manipulator.shape](manipulator.size, pose[7], to_frame(pose, points))
     return d, rotate(pose[3:7], normal)
@@ -491,14 +432,8 @@ def _box(size: tuple[float, ...], gap: Tensor, p: Tensor) -> tuple[Tensor, Tenso
 
 
 def _corner(q: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance to the corner {q <= 0} and its gradient.
-
-    Args:
-        q: Signed distances to the faces, shape [..., face].
-
-    Returns:
-        Distance [...] and gradient [..., face]; inside, of the nearest face (the first of equally near ones).
-    """
+    """Signed distance [...] to the corner {q <= 0} of faces and its gradient [..., face]; inside, to the
+    nearest face (the first of equally near ones)."""
     positive = q.clamp(min=0.0)
     outside = (q > 0).any(dim=-1)
     nearest = torch.nn.functional.one_hot(q.argmax(dim=-1), q.shape[-1]).to(q.dtype)
@@ -546,16 +481,8 @@ def loss_terms(
 ) -> Tensor:
     """The unweighted terms of one step's loss: density, sdf, contact.
 
-    Args:
-        scene: The scene.
-        state: State at the end of the environment step.
-        target_mass: Target mass tensor, shape [n, n, n].
-        target_sdf: Distance to the target, shape [n, n, n].
-        contact: Gradient of the contact term: its own (``nearest``), or that of an atomic minimum which is
-            differentiated as if it were a sum (``all``).
-
-    Returns:
-        Terms, shape [3].
+    ``contact`` is the gradient of the contact term: its own (``nearest``), or that of an atomic minimum which
+    is differentiated as if it were a sum (``all``).
     """
     mass = mass_tensor(scene, state.x)
     contact_term = torch.zeros((), dtype=torch.float64)
@@ -580,20 +507,9 @@ def rollout_loss(
     weights: tuple[float, float, float] = (10, 10, 1),
     contact: str = "nearest",
 ) -> tuple[Tensor, State]:
-    """Sum of the step losses over a rollout.
+    """Sum of the step losses over a rollout of actions [T, A], and the state at its end.
 
-    Args:
-        scene: The scene.
-        state: State at the start.
-        actions: Actions, shape [T, A].
-        alpha: Stiffness of soft contact; 0 is the hard model.
-        target_mass: Target mass tensor, shape [n, n, n].
-        target_sdf: Distance to the target, shape [n, n, n].
-        weights: Weights of density, sdf and contact.
-        contact: Gradient of the contact term, see :func:`loss_terms`.
-
-    Returns:
-        The loss, a scalar, and the state at the end.
+    ``weights`` are those of density, sdf and contact, ``contact`` as in :func:`loss_terms`.
     """
     loss = torch.zeros((), dtype=torch.float64)
     weight = torch.tensor(weights, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What a refusal has to be: one helpful line, exit code 2, nothing printed but the line, nothing written."""
+"""Form of a refusal: exit code 2, one line on standard error, nothing on standard output."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["ending", "plugin", "refusal", "snapshot"]
 
 
 def plugin() -> ModuleType:
-    """plab's plugin as Hydra has it, which executes its file anew when it looks for plugins."""
+    """The module of plab's launchers as Hydra has imported it."""
     Plugins.instance()
     return sys.modules["hydra_plugins.plab_launcher"]
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:
-    """Everything in a folder: folders, and files with what they hold, None where that may not be read."""
+    """Folders and files below a folder, with the content of files; None of what cannot be read."""
     return {
         str(path.relative_to(folder)): path.read_bytes()
         if path.is_file() and os.access(path, os.R_OK)
@@ -30,8 +30,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 
 def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
-    """Assert that a command line has refused what it was given; return the line that says why."""
-    # That of mistakes: 1 is left to what went wrong in a run or was found by a check.
+    """Assert that a command line has refused its arguments; return the line."""
     assert code == 2, f"exit code {code}: {argv}"
     assert out == ""
     assert "Traceback" not in err
@@ -44,9 +43,8 @@ def refusal(code: object, out: str, err: str, argv: Sequence[str]) -> str:
 
 
 def ending(entry: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> object:
-    """Call a command line in this process; return its exit code, however it ends."""
+    """Call a command line in this process; return its exit code."""
     try:
         return entry(argv)
     except SystemExit as stop:
-        # How argparse ends.
         return stop.code

@@ -1,4 +1,4 @@
-"""What tests of resuming and batching ask for: runs that end with the same numbers, runs cut short."""
+"""Comparison of runs, and interruptions, for tests of resuming and batching."""
 
 from __future__ import annotations
 
@@ -42,24 +42,30 @@ def finished_as(cfg: Config, want: RunResult) -> RunResult:
 
 
 @contextmanager
-def stopped_at(call: int, where: type | Any = RunFile, name: str = "record") -> Iterator[None]:
-    """Raise KeyboardInterrupt in the block at a call of a function, counted from 0, and catch it outside."""
+def raising(error: BaseException, call: int, where: Any, name: str) -> Iterator[None]:
+    """Raise an error in the block at a call of a function, counted from 0."""
     intact: Callable = getattr(where, name)
     calls = count()
 
     def interrupted(*arguments: Any, **options: Any) -> Any:
         if next(calls) == call:
-            raise KeyboardInterrupt
+            raise error
         return intact(*arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(where, name, interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            yield
+        yield
+
+
+@contextmanager
+def stopped_at(call: int, where: Any = RunFile, name: str = "record") -> Iterator[None]:
+    """Interrupt the block at a call of a function, counted from 0, and catch that outside."""
+    with pytest.raises(KeyboardInterrupt), raising(KeyboardInterrupt(), call, where, name):
+        yield
 
 
 class KeepsAll(SimulatorCache):
-    """All simulators of a module's runs, so that none is built twice: that takes longer than a run."""
+    """Cache of all simulators of a module, as building one takes longer than a run."""
 
     def get(self, key: Any, build: Callable[[], Any], *, check: Callable[[Any], object]) -> Any:
         if key in self._kept:

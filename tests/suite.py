@@ -122,6 +122,16 @@ class Kinetic(ParticleTerm):
         return ti.Vector([0.0, 0.5, 0.0]) * v.dot(v), v * x[1]
 
 
+def reference_state(state: State, e: int) -> reference.State:
+    """State of one environment, for the plain reference."""
+    import torch
+
+    import reference_mpm
+
+    parts = (state.x, state.v, state.C, state.F, state.poses)
+    return reference_mpm.State(*(torch.tensor(np.asarray(part[e])) for part in parts))
+
+
 def assert_same_state(got: State, e: int, want: reference.State) -> None:
     """Compare an environment's state with the plain reference's, to 1e-9 of the largest number, or of 1."""
     for name in ("x", "v", "C", "F", "poses"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +10,10 @@ import torch
 from gymnasium.error import ResetNeeded
 
 from plab.autograd import policy_gradient, rollout
-from plab.config import Config, load_config
+from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
-from plab.objective import scores
 from plab.problem import Problem
-from plab.results import BUDGETS, RunResult, read, result_path
-from plab.runners import apg, run_config
-from plab.runners.common import episode_columns
-from same_runs import assert_same_numbers, stopped_at
 
 HORIZON = 3
 COARSE = [
@@ -53,100 +47,61 @@ def draw(seed: int, **options) -> torch.Tensor:
     return (1.6 * unit - 0.8).to(**options).requires_grad_()
 
 
-def test_losses_and_gradients_are_the_simulators(problem: Problem) -> None:
+def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) -> None:
     actions = draw(0)
     losses = rollout(problem, actions)
     losses.sum().backward()
     expected = problem.rollout(actions.detach().numpy(), gradient=True)
     np.testing.assert_array_equal(losses.detach().numpy(), expected.loss.sum(axis=1))
     np.testing.assert_array_equal(actions.grad.numpy(), expected.gradient)
+    # Each environment's loss is weighed on its own, and there is no second derivative.
+    whole, weights = actions.grad.clone(), torch.tensor([0.0, 3.0], dtype=torch.float64)
+    (weighed,) = torch.autograd.grad(rollout(problem, actions) @ weights, actions)
+    assert torch.count_nonzero(weighed[0]) == 0
+    torch.testing.assert_close(weighed[1], 3.0 * whole[1])
+    (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+    # The type is kept, and no gradient is computed in vain.
+    actions = draw(0, dtype=torch.float32).detach().requires_grad_()
+    losses = rollout(problem, actions)
+    losses.sum().backward()
+    assert losses.dtype == actions.grad.dtype == torch.float32
+    wanted, intact = [], Problem.try_out
+
+    def try_out(self, tried, *, gradient):
+        wanted.append(gradient)
+        return intact(self, tried, gradient=gradient)
+
+    monkeypatch.setattr(Problem, "try_out", try_out)
+    assert not rollout(problem, actions.detach()).requires_grad and wanted == [False]
 
 
-def test_environments_of_tensors_do_what_those_of_arrays_do() -> None:
-    cfgs = [load_config([*COARSE, "sim=reference", f"task.yield_stress={s}"]) for s in (20, 50)]
-    env, arrays = TensorEnv(EpisodeBatch(cfgs)), EpisodeBatch(cfgs)
-    np.testing.assert_array_equal(env.reset().numpy(), arrays.reset()[0])
-    for t in range(HORIZON):
-        actions = draw(t)[:, t].detach().float()
-        got, want = env.step(actions), arrays.step(actions.numpy())
+def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBatch) -> None:
+    actions = [draw(t)[:, t].detach().float() for t in range(HORIZON)]
+    first, wanted = episodes.reset()[0], [episodes.step(action.numpy()) for action in actions]
+    env = TensorEnv(episodes)
+    np.testing.assert_array_equal(env.reset().numpy(), first)
+    for t, (action, want) in enumerate(zip(actions, wanted, strict=True)):
+        got = env.step(action)
         np.testing.assert_array_equal(got.observation.numpy(), want.observation)
         np.testing.assert_array_equal(got.reward.numpy(), want.reward.astype(np.float32))
         assert got.info.keys() == want.info.keys() and got.truncated == want.truncated == (t == HORIZON - 1)
 
 
-def test_each_environments_loss_is_weighed_on_its_own(problem: Problem) -> None:
-    actions = draw(1)
-    losses = rollout(problem, actions)
-    (whole,) = torch.autograd.grad(losses.sum(), actions, retain_graph=True)
-    (weighed,) = torch.autograd.grad(losses @ torch.tensor([0.0, 3.0], dtype=torch.float64), actions)
-    assert torch.count_nonzero(weighed[0]) == 0
-    torch.testing.assert_close(weighed[1], 3.0 * whole[1])
-
-
-def test_gradient_agrees_with_differences(problem: Problem) -> None:
-    actions, direction = draw(2), draw(3).detach()
-    (gradient,) = torch.autograd.grad(rollout(problem, actions).sum(), actions)
-    step = 1e-5
-    with torch.no_grad():
-        ahead, behind = (rollout(problem, actions + sign * step * direction).sum() for sign in (1, -1))
-    assert float((gradient * direction).sum()) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-4)
-
-
 def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem) -> None:
     scale = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
     actions = draw(4).detach()
+    # Beyond its bounds an action has no gradient.
+    actions[:, 1] = 3.0
     rollout(problem, scale * actions).sum().backward()
     fixed = (0.5 * actions).requires_grad_()
     rollout(problem, fixed).sum().backward()
     assert float(scale.grad) == pytest.approx(float((fixed.grad * actions).sum()), rel=1e-12)
-
-
-def test_beyond_its_bounds_an_action_has_no_gradient(problem: Problem) -> None:
-    actions = draw(5).detach()
-    actions[:, 1] = 1.5
-    actions.requires_grad_()
-    rollout(problem, actions).sum().backward()
-    assert torch.count_nonzero(actions.grad[:, 1]) == 0 and torch.count_nonzero(actions.grad[:, 0]) > 0
-
-
-def test_type_is_kept_and_no_gradient_is_computed_in_vain(problem: Problem, monkeypatch) -> None:
-    actions = draw(6, dtype=torch.float32).detach().requires_grad_()
-    losses = rollout(problem, actions)
-    losses.sum().backward()
-    assert losses.dtype == actions.grad.dtype == torch.float32
-    wanted, intact = [], Problem.try_out
-    monkeypatch.setattr(
-        Problem,
-        "try_out",
-        lambda self, a, **options: (wanted.append(options["gradient"]), intact(self, a, **options))[1],
-    )
-    assert not rollout(problem, actions.detach()).requires_grad
-    with torch.no_grad():
-        rollout(problem, actions)
-    assert wanted[0] is False
-
-
-def test_there_is_no_second_derivative(problem: Problem) -> None:
-    actions = draw(7)
-    (gradient,) = torch.autograd.grad(rollout(problem, actions).square().sum(), actions, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+    assert torch.count_nonzero(fixed.grad[:, 1]) == 0 and torch.count_nonzero(fixed.grad[:, 0]) > 0
 
 
 # ---------------------------------------------------------------- a policy that reacts
-
-
-class Blind(torch.nn.Module):
-    """Actions that do not depend on what is observed, one row for each call."""
-
-    def __init__(self, actions: torch.Tensor) -> None:
-        super().__init__()
-        self.actions = torch.nn.Parameter(actions)
-        self.calls = 0
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        self.calls += 1
-        return self.actions[:, self.calls - 1]
 
 
 def network(episodes: EpisodeBatch, outputs: int, seed: int = 0) -> torch.nn.Sequential:
@@ -165,19 +120,16 @@ def gradient_of(module: torch.nn.Module) -> torch.Tensor:
     return torch.cat([parameter.grad.flatten() for parameter in module.parameters()])
 
 
-@pytest.mark.parametrize("valued", [False, True])
-def test_the_whole_gradient_of_a_policy_agrees_with_differences(episodes: EpisodeBatch, valued: bool) -> None:
+def test_the_whole_gradient_of_a_policy_agrees_with_differences(episodes: EpisodeBatch) -> None:
     policy, critic = network(episodes, 6), network(episodes, 1, seed=1)
     weights = torch.nn.utils.parameters_to_vector(policy.parameters()).detach()
-    value = (lambda seen: critic(seen)[:, 0]) if valued else None
 
     def loss() -> float:
         episodes.reset()
         policy.zero_grad()
-        done = policy_gradient(episodes, policy, HORIZON, discount=0.8, value=value)
+        done = policy_gradient(episodes, policy, HORIZON, discount=0.8, value=lambda seen: critic(seen)[:, 0])
         total = sum(0.8**t * done.loss[t].mean() for t in range(HORIZON))
-        worth = value(done.observations[-1]).mean().item() if valued else 0.0
-        return float(total) - 0.8**HORIZON * worth
+        return float(total - 0.8**HORIZON * critic(done.observations[-1]).detach().mean())
 
     loss()
     assert all(parameter.grad is None for parameter in critic.parameters())
@@ -188,27 +140,6 @@ def test_the_whole_gradient_of_a_policy_agrees_with_differences(episodes: Episod
         torch.nn.utils.vector_to_parameters(weights + sign * step * direction, policy.parameters())
         beside.append(loss())
     assert along == pytest.approx((beside[0] - beside[1]) / (2 * step), rel=1e-6)
-
-
-def test_without_a_reaction_it_is_the_gradient_of_a_rollout(episodes: EpisodeBatch) -> None:
-    actions = draw(8).detach()
-    policy, wanted = Blind(actions.clone()), actions.clone().requires_grad_()
-    episodes.reset()
-    done = policy_gradient(episodes, policy, HORIZON)
-    losses = rollout(episodes.problem, wanted)
-    losses.mean().backward()
-    np.testing.assert_array_equal(done.loss.sum(0).numpy(), losses.detach().numpy())
-    torch.testing.assert_close(policy.actions.grad, wanted.grad, rtol=1e-12, atol=1e-14)
-
-
-def test_a_reaction_changes_the_gradient(episodes: EpisodeBatch) -> None:
-    policy = network(episodes, 6)
-    episodes.reset()
-    done = policy_gradient(episodes, policy, HORIZON)
-    whole = gradient_of(policy)
-    policy.zero_grad()
-    rollout(episodes.problem, policy(done.observations[:-1].transpose(0, 1))).mean().backward()
-    assert float((whole - gradient_of(policy)).norm()) > 1e-3 * float(whole.norm())
 
 
 def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None:
@@ -231,66 +162,21 @@ def test_stretches_follow_each_other_as_steps_do(episodes: EpisodeBatch) -> None
 
 
 def test_the_weights_of_the_loss_are_put_back(episodes: EpisodeBatch) -> None:
-    actions = draw(9).detach()
-    before = episodes.problem.try_out(actions.numpy(), gradient=True)
-    episodes.reset()
-    with pytest.raises(ValueError, match=r"actions have shape \(2, 5\)"):
-        policy_gradient(episodes, network(episodes, 5), HORIZON)
-    episodes.reset()
+    actions = draw(9).detach().numpy()
+    before = episodes.problem.try_out(actions, gradient=True)
     calls = count()
 
     def react(t: int, bar: np.ndarray | None) -> None:
         if next(calls) == 1:
             raise ArithmeticError("on the way back")
 
+    episodes.reset()
     with pytest.raises(ArithmeticError):
-        episodes.closed_loop(HORIZON, lambda t, seen: actions[:, 0].numpy(), react, discount=0.5)
+        episodes.closed_loop(HORIZON, lambda t, seen: actions[:, 0], react, discount=0.5)
+    np.testing.assert_array_equal(episodes.problem.try_out(actions, gradient=True).gradient, before.gradient)
     episodes.reset()
     policy_gradient(episodes, network(episodes, 6), HORIZON, discount=0.5)
-    after = episodes.problem.try_out(actions.numpy(), gradient=True)
-    np.testing.assert_array_equal(after.gradient, before.gradient)
-
-
-# ---------------------------------------------------------------- method=apg
-
-
-ITERATIONS = 4
-APG = [*COARSE, "method=apg", f"method.iterations={ITERATIONS}", "method.hidden=[16,16]", "progress=false"]
-
-
-def make_config(folder: Path, *overrides: str) -> Config:
-    return load_config([*APG, f"results_dir={folder}", *overrides])
-
-
-def run(cfg: Config) -> RunResult:
-    run_config(cfg)
-    return read(result_path(cfg))
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """An uninterrupted run."""
-    return run(make_config(tmp_path_factory.mktemp("results"), "method.lr=0.01"))
-
-
-def test_apg_lowers_the_loss(finished: RunResult) -> None:
-    rows = finished.iterations
-    assert rows["steps"].tolist() == [HORIZON * i for i in range(ITERATIONS)]
-    spent = rows["steps_forward"].tolist(), rows["steps_gradient"].tolist()
-    assert spent == ([0] * ITERATIONS, [HORIZON * (i + 1) for i in range(ITERATIONS)])
-    measured = set(episode_columns(["density", "sdf", "contact"])) | set(BUDGETS)
-    assert measured | {"iteration", "episodes", "steps", "gradient_norm", "seconds"} == set(rows.columns)
-    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0] and (rows["gradient_norm"] > 0).all()
-    assert finished.best_loss == rows["loss"].min()
-    judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
-    assert finished.evaluation["score"] == judged.score
-
-
-def test_apg_resumes_to_the_same_numbers(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
-    cfg = make_config(tmp_path, "method.lr=0.01")
-    with stopped_at(2, apg, "policy_gradient"):
-        run_config(cfg)
-    assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
-    again = run(cfg)
-    assert_same_numbers(again, finished)
-    assert again.provenance["resumed"] == 1
+    np.testing.assert_array_equal(episodes.problem.try_out(actions, gradient=True).gradient, before.gradient)
+    episodes.reset()
+    with pytest.raises(ValueError, match=r"\(2, 5\)"):
+        policy_gradient(episodes, network(episodes, 5), HORIZON)

@@ -1,11 +1,13 @@
-"""Commands that README and docs show: their options exist, their overrides compose, make has the rules."""
+"""Commands and code of README, docs and notebooks: options exist, overrides compose, imports resolve."""
 
 from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import importlib
 import itertools
+import json
 import re
 import shlex
 from collections.abc import Iterator
@@ -16,22 +18,15 @@ import pytest
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override
-from PIL import Image, ImageColor
 
 from plab.cli.run import _parse as parse_run
 from plab.config import choices, load_config
 from plab.config.selection import select
-from plab.report import methods
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted(
-    [
-        ROOT / "README.md",
-        ROOT / "CONTRIBUTING.md",
-        *(ROOT / "docs").glob("*.md"),
-        *ROOT.glob("src/**/README.md"),
-    ]
-)
+FILES = ("README.md", "CONTRIBUTING.md", "docs/*.md", "src/**/README.md")
+PAGES = sorted(path for pattern in FILES for path in ROOT.glob(pattern))
+NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
 WORDS = {
     "plab.report": ("task", "variant", "method", "seed"),
     "plab.status": ("task", "variant", "method", "seed"),
@@ -63,9 +58,14 @@ PLAB = [
 ]
 
 
-def test_commands_are_found():
-    assert len(PLAB) > 60
+def test_commands_and_code_are_found():
+    assert len(PLAB) > 60 and len(PYTHON) > 20
     assert {command.split()[2] for command in PLAB} > {"plab.run", "plab.report", "plab.bench.speed"}
+
+
+@functools.cache
+def compose(words: tuple[str, ...], config_dir: str | None = None) -> None:
+    load_config(words, config_dir)
 
 
 class Parsed(Exception):
@@ -92,17 +92,15 @@ def test_a_command_that_is_shown_makes_sense(command, monkeypatch, star_files):
         check_run(argv)
         return
     options = parsed(module, argv, monkeypatch)
-    # "what" are those of plab.render only.
-    words = next(
-        (own for name in ("words", "arguments", "overrides", "what") if (own := getattr(options, name, []))),
-        [],
-    )
+    names = ("words", "arguments", "overrides", "what")
+    words = next((own for name in names if (own := getattr(options, name, []))), [])
     words = [word for word in words if "=" in word] if isinstance(words, list) else []
     if module in WORDS:
         select(words, WORDS[module])
         return
     for method in getattr(options, "methods", [None]):
-        load_config([*words, *([f"method={method}"] if method else [])], getattr(options, "config_dir", None))
+        chosen = [f"method={method}"] if method else []
+        compose((*words, *chosen), getattr(options, "config_dir", None))
 
 
 def parsed(module: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
@@ -143,7 +141,7 @@ def check_run(argv: list[str]) -> None:
         overrides = [override for override in overrides if not override.is_hydra_override()]
     values = [swept(override) for override in overrides]
     for words in {tuple(own[end] for own in values) for end in (0, -1)}:
-        load_config(words, arguments.config_dir)
+        compose(words, arguments.config_dir)
 
 
 def swept(override: Override) -> list[str]:
@@ -165,17 +163,20 @@ def test_what_is_made_has_a_rule(command):
             check_run(shlex.split(word.removeprefix("ARGS=")))
 
 
+def cells(path: Path) -> list[str]:
+    """Code of a page's blocks, or of a notebook's cells."""
+    text = path.read_text(encoding="utf-8")
+    if path in PAGES:
+        return re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    found = json.loads(text)["cells"]
+    return ["".join(cell["source"]) for cell in found if cell["cell_type"] == "code"]
+
+
 PYTHON = [
     pytest.param(code, id=f"{page.stem}-{number}")
-    for page in PAGES
-    for number, code in enumerate(
-        re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    )
+    for page in (*PAGES, *NOTEBOOKS)
+    for number, code in enumerate(cells(page))
 ]
-
-
-def test_python_is_found():
-    assert len(PYTHON) > 15
 
 
 @pytest.mark.parametrize("code", PYTHON)
@@ -190,51 +191,3 @@ def test_python_that_is_shown_parses_and_imports_what_there_is(code):
             # As the statement does: what the module has, or else a module of the package.
             if not hasattr(module, name):
                 importlib.import_module(f"{node.module}.{name}")
-
-
-USERS = sorted((ROOT / "docs").glob("*.md"))
-"""Pages for users; what was measured on which day, and what was tried, is in docs/developers."""
-
-
-def words(page: Path) -> int:
-    return len(page.read_text(encoding="utf-8").split())
-
-
-def test_pages_for_users_are_short():
-    assert words(ROOT / "README.md") <= 1400
-    assert words(ROOT / "docs" / "performance.md") <= 1000
-    assert sum(map(words, USERS)) <= 16_000, {page.name: words(page) for page in USERS}
-
-
-DIARY = re.compile(
-    r"\b(earlier|formerly|previously|now|nowadays|no longer|at first|(another|that) day|that time|before this"
-    r"|since (then|that|the (last|previous))|(?<!is )(?<!are )(?<!be )used to|aims? (was|were)|we tried)\b",
-    re.IGNORECASE,
-)
-
-
-@pytest.mark.parametrize("notebook", sorted((ROOT / "reports").glob("*.py")), ids=lambda path: path.stem)
-def test_notebooks_say_what_holds(notebook):
-    text = re.findall(r"^# (?!%%).*", notebook.read_text(encoding="utf-8"), re.MULTILINE)
-    assert [match[0] for match in DIARY.finditer("\n".join(text))] == []
-
-
-@pytest.mark.parametrize(
-    "page",
-    [ROOT / "README.md", ROOT / "src" / "plab" / "examples" / "README.md", *USERS],
-    ids=lambda page: "-".join((*page.relative_to(ROOT).parts[:-1], page.stem)),
-)
-def test_pages_for_users_say_what_holds(page):
-    text = page.read_text(encoding="utf-8")
-    assert [match[0] for match in DIARY.finditer(" ".join(text.split()))] == []
-    # A page opens with what its reader can do with it: words, before any table, picture or command.
-    title, _, rest = text.partition("\n")
-    assert title.startswith("# ")
-    assert page.stem == "README" or re.match(r"\n[A-Z]", rest)
-
-
-def test_the_curves_that_are_shown_have_the_colours_of_the_methods():
-    with Image.open(ROOT / "docs" / "images" / "reward_per_task.png") as picture:
-        seen = {color for _, color in picture.convert("RGB").getcolors(picture.width * picture.height)}
-    wanted = [methods.method(name).colour for name in ("adam", "gd", "adam_h", "ppo")]
-    assert seen >= set(map(ImageColor.getrgb, wanted))

@@ -1,17 +1,17 @@
-"""The batched environments on CUDA: the same episode as on the CPU, but for rounding."""
+"""Batched environments on CUDA: tensors on the device, the CPU's gradients; recorded updates."""
 
 from __future__ import annotations
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 
 from plab.autograd import policy_gradient, rollout
-from plab.config import load_config
+from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
+from plab.runners.population.graphs import CapturedUpdate
 from suite import make_not_finite
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]
@@ -19,37 +19,25 @@ COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.
 pytestmark = [pytest.mark.gpu]
 
 
-def episode(device: str) -> list[tuple]:
-    """Steps of two environments of Rope under random actions."""
-    overrides = [*COARSE, f"sim.device={device}"]
-    env = gymnasium.make_vec("plab/Rope-v1", num_envs=2, overrides=overrides)
-    env.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-1, 1, (4, *env.action_space.shape))
-    steps = [env.step(action) for action in actions]
-    env.close()
-    return steps
+def config(device: str = "cuda") -> Config:
+    return load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}"])
 
 
-def test_cuda_gives_what_the_cpu_gives() -> None:
-    for on_cpu, on_cuda in zip(episode("cpu"), episode("cuda"), strict=True):
-        np.testing.assert_allclose(on_cuda[0], on_cpu[0], rtol=1e-3, atol=1e-3)
-        np.testing.assert_allclose(on_cuda[1], on_cpu[1], atol=1e-4)
-        np.testing.assert_array_equal(on_cuda[3], on_cpu[3])
-    np.testing.assert_allclose(on_cuda[4]["final_info"]["iou"], on_cpu[4]["final_info"]["iou"], atol=1e-5)
+@pytest.fixture(scope="module")
+def env() -> TensorEnv:
+    """Two environments in float64."""
+    return TensorEnv(EpisodeBatch([config()] * 2))
 
 
 @pytest.mark.parametrize("own_stream", [False, True])
-def test_tensors_stay_on_the_device(own_stream: bool) -> None:
+def test_tensors_stay_on_the_device(env: TensorEnv, own_stream: bool) -> None:
     """Also where PyTorch works in another stream than Taichi."""
-    cfgs = [load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2
-    env, arrays = TensorEnv(EpisodeBatch(cfgs)), EpisodeBatch(cfgs)
-    generator = torch.Generator("cuda").manual_seed(0)
+    actions = 2.0 * np.random.default_rng(0).random((4, 2, 6)) - 1.0
+    wants = [env.batch.reset()[0], *(env.batch.step(action) for action in actions)]
     with torch.cuda.stream(torch.cuda.Stream() if own_stream else torch.cuda.default_stream()):
-        first = env.reset()
-        np.testing.assert_array_equal(first.cpu().numpy(), arrays.reset()[0])
-        for _ in range(4):
-            actions = 2.0 * torch.rand((2, 6), generator=generator, device="cuda", dtype=torch.float64) - 1.0
-            got, want = env.step(actions), arrays.step(actions.cpu().numpy())
+        np.testing.assert_array_equal(env.reset().cpu().numpy(), wants[0])
+        for action, want in zip(actions, wants[1:], strict=True):
+            got = env.step(torch.tensor(action, device="cuda"))
             assert all(tensor.is_cuda for tensor in (got.observation, got.reward, *got.info.values()))
             np.testing.assert_allclose(got.observation.cpu().numpy(), want.observation, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(got.reward.cpu().numpy(), want.reward, atol=1e-9)
@@ -57,10 +45,8 @@ def test_tensors_stay_on_the_device(own_stream: bool) -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1])
-def test_what_breaks_off_rests_on_the_device(at: int) -> None:
+def test_what_breaks_off_rests_on_the_device(env: TensorEnv, at: int) -> None:
     """The first environment is not finite before a step; the other one goes on."""
-    cfg = load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])
-    env = TensorEnv(EpisodeBatch([cfg] * 2))
     actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(4, 2, 6)
     env.reset()
     whole = [env.step(action, strict=False) for action in actions]
@@ -84,7 +70,7 @@ def test_what_breaks_off_rests_on_the_device(at: int) -> None:
 
 
 def test_gradients_of_tensors_stay_on_the_device() -> None:
-    problem = Problem([load_config(["task=Rope", *COARSE, "sim=reference", "sim.device=cuda"])] * 2)
+    problem = Problem([config()] * 2)
     actions = torch.linspace(-0.9, 0.9, 48, device="cuda", dtype=torch.float64).reshape(2, 4, 6)
     actions.requires_grad_()
     losses = rollout(problem, actions)
@@ -101,8 +87,7 @@ def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
     """Also where there are so many particles that they are put into the order of their cells."""
     gradients = []
     for device, size in (("cpu", 2), ("cuda", envs)):
-        cfg = load_config(["task=Rope", *COARSE, "sim=reference", f"sim.device={device}"])
-        episodes = EpisodeBatch([cfg] * size, contact="soft")
+        episodes = EpisodeBatch([config(device)] * size, contact="soft")
         if size == 512:
             assert episodes.problem.simulator._engine.sorts
         torch.manual_seed(0)
@@ -119,3 +104,15 @@ def test_the_gradient_of_a_policy_is_that_of_the_cpu(envs: int) -> None:
         episodes.close()
     scale = np.abs(gradients[0]).max()
     np.testing.assert_allclose(gradients[1], gradients[0], atol=1e-8 * scale)
+
+
+def test_a_recorded_update_reads_its_arguments_and_what_it_changes() -> None:
+    state = torch.zeros(3, device="cuda")
+
+    def update(x: torch.Tensor) -> torch.Tensor:
+        state.add_(x)
+        return state.sum()
+
+    captured = CapturedUpdate(update)
+    sums = [float(captured(torch.full((3,), float(k), device="cuda"))) for k in range(10)]
+    assert sums == [3.0 * k * (k + 1) / 2 for k in range(10)]

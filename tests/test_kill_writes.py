@@ -1,40 +1,58 @@
-"""Simulated runs that are killed at any of their writes end with the files of undisturbed ones."""
+"""Simulated runs that die at any change of a file end, resumed, with the files of undisturbed ones."""
 
 from __future__ import annotations
 
-import os
-import subprocess
+import gc
+import random
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
-pytestmark = [
-    pytest.mark.skipif(sys.platform != "linux", reason="forks, and follows descriptors in /proc"),
-]
+from faults import DEATH, Death, Failing, contents, watched
+from plab.config import Config, load_config
+from plab.results import read
+from plab.runners import run_batch
+from same_runs import KeepsAll
 
-SCRIPT = Path(__file__).parent / "kill_writes.py"
-
-
-def rounds(deaths: int, kills: int, *cases: str) -> None:
-    done = subprocess.run(
-        [sys.executable, SCRIPT, str(deaths), str(kills), *cases],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    print(done.stdout)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    lines = [line.split(maxsplit=1) for line in done.stdout.splitlines()]
-    ended = [int(line[0]) for line in lines if line[1:] == ["ended early"]]
-    assert all(have >= want for have, want in zip(ended, filter(None, (deaths, kills)), strict=True))
+CACHE = KeepsAll()
+TD3 = """
+method=td3 method.episodes=12 method.num_envs=2 method.evaluate_every=4 method.hidden=[8] method.batch_size=8
+method.learning_starts=8 method.buffer_size=16 task=Move sim.grid_size=32 sim.horizon=4 sim.substeps=5
+task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75] sim.particles_scale=0.03 checkpoint_seconds=0
+progress=false
+"""
 
 
-def test_a_few_kills_of_a_run_with_a_replay_buffer() -> None:
-    rounds(12, 2, "sac")
+def died(cfgs: list[Config], folder: Path, event: Failing) -> bool:
+    """Carry out runs; returns whether they died."""
+    try:
+        with watched(folder, event):
+            assert all(one.finished for one in run_batch(cfgs, cache=CACHE))
+    except Death:
+        return True
+    finally:
+        # Locks that nothing refers to are free, as are those of a process that is gone.
+        gc.collect()
+    return False
 
 
 @pytest.mark.nightly
-def test_kills_at_any_write_of_every_kind_of_run() -> None:
-    rounds(210, 30)
+@pytest.mark.skipif(sys.platform != "linux", reason="follows descriptors in /proc")
+@pytest.mark.parametrize("runs", [1, 2])
+def test_runs_that_die_at_any_event_end_with_the_same_files(tmp_path: Path, runs: int) -> None:
+    folder, rng, deaths = tmp_path / "results", random.Random(0), 0
+    cfgs = [load_config([*TD3.split(), f"results_dir={folder}", f"seed={seed}"]) for seed in range(runs)]
+    count = Failing(-1, DEATH)
+    assert not died(cfgs, folder, count)
+    want = contents(folder)
+    while deaths < 30:
+        shutil.rmtree(folder)
+        # Up to two thirds of an undisturbed run's events: most runs die several times.
+        last = len(count.seen) * 2 // 3
+        while died(cfgs, folder, Failing(rng.randrange(last) if deaths < 30 else -1, DEATH)):
+            deaths += 1
+            for path in folder.rglob("*.h5"):
+                assert read(path).status == ("running" if ".partial." in path.name else "finished"), path
+        assert contents(folder) == want

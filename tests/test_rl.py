@@ -1,42 +1,40 @@
-"""Reinforcement learning on a coarse scene: whole runs, seeds, resumption, the replay buffer, refusals."""
+"""Reinforcement learning on a coarse scene: single runs and populations, resumption, failures."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
 import re
-import subprocess
-import sys
-import time
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from gymnasium.spaces import Box
-from stable_baselines3.common.buffers import ReplayBuffer
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from plab.bench.rl import PARTS
-from plab.cli import bench
-from plab.config import Config, ConfigError, load_config
+from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
-from plab.families import FAMILIES
+from plab.envs.tensors import TensorEnv
+from plab.families import FAMILIES, family
 from plab.objective import scores
-from plab.results import ResultsError, RunResult, read, result_path
-from plab.runners import RunError, rl, run_config
+from plab.results import ResultsError, RunFile, RunResult, read, result_path
+from plab.runners import Job, RunError, _runner, rl, run_batch, run_config
 from plab.runners.common import episode_columns
 from plab.runners.environments import evaluation, shared_batches
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.replay import EpisodeReplay
+from plab.runners.population.population import Population
+from plab.runners.population.runner import PopulationRunner
+from plab.runners.rl import RlRunner
 from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
-from plab.sim import SimulationError
-from same_runs import KeepsAll, assert_same_numbers
+from plab.tally import Outcome
+from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
 
 CACHE = KeepsAll()
@@ -51,33 +49,46 @@ COARSE = (
     "sim.substeps=5",
     # A target that the ball reaches into, so that IoU and score are not 0.
     "task.variants.1.target.bodies.ball.center=[0.68,0.49,0.75]",
+    # Room for three replay buffers of METHODS, and for one that holds the whole training.
+    "sim.memory_mb=0.9",
     "method.episodes=16",
     "method.num_envs=2",
     "method.evaluate_every=6",
     "method.hidden=[8]",
     "progress=false",
+    "checkpoint_seconds=0",
 )
 
 OFF_POLICY = ("method.batch_size=8", "method.learning_starts=12", "method.buffer_size=16")
 """Updates begin in the second batch of episodes, and the buffer remembers the last four episodes."""
 
-COLUMNS = episode_columns(["density", "sdf", "contact"])
-
-OWN = Path(__file__).resolve().parents[1] / "examples" / "own_rl" / "conf"
-
 METHODS = {
     "sac": OFF_POLICY,
     "td3": OFF_POLICY,
-    # From outside plab.
-    "tqc": OFF_POLICY,
     # Updates of 10 transitions end within episodes of 4 steps.
     "ppo": ("method.steps_per_update=10", "method.minibatches=2", "method.epochs=2"),
+    # From outside plab.
+    "tqc": OFF_POLICY,
 }
+
+OWN = [name for name in METHODS if name != "tqc"]
+"""Methods that have populations."""
+
+RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3"))
+"""A population: different in seed, material and scene."""
+
+COLUMNS = episode_columns(["density", "sdf", "contact"])
+
+TQC = Path(__file__).resolve().parents[1] / "examples" / "own_rl" / "conf"
 
 
 def make_config(folder: Path, method: str, *overrides: str) -> Config:
     words = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={folder}", *overrides]
-    return load_config(words, OWN if method == "tqc" else None)
+    return load_config(words, TQC if method == "tqc" else None)
+
+
+def configs(folder: Path, method: str, *overrides: str) -> list[Config]:
+    return [make_config(folder, method, *overrides, *own) for own in RUNS]
 
 
 def run(cfg: Config) -> RunResult:
@@ -87,30 +98,69 @@ def run(cfg: Config) -> RunResult:
     return result
 
 
-def assert_nothing_else_is_left(result: RunResult) -> None:
-    """Assert that only the result and the policy are in the run's folder."""
-    names = {path.name for path in result.path.parent.iterdir()}
-    assert names == {result.path.name, policy_path(result.path).name}
+def carry(cfgs: list[Config]) -> list[Outcome]:
+    return run_batch(cfgs, cache=CACHE)
+
+
+def statuses(cfgs: list[Config]) -> list[str]:
+    return [one.status for one in carry(cfgs)]
+
+
+def partial(cfg: Config) -> RunResult:
+    """An unfinished run's file."""
+    return read(result_path(cfg).with_suffix(".partial.h5"))
+
+
+def assert_same_run(cfg: Config, want: RunResult) -> RunResult:
+    """Assert that a run's file and policy agree with another one's in all but times; return it."""
+    got = finished_as(cfg, want)
+    # The same arrays in the same bytes.
+    assert policy_path(got.path).read_bytes() == policy_path(want.path).read_bytes()
+    return got
+
+
+def assert_nothing_else_is_left(*results: RunResult) -> None:
+    """Assert that only results, policies and logs are in the runs' folders."""
+    names = {path.name for one in results for path in one.path.parent.iterdir() if path.is_file()}
+    assert names == {path.name for one in results for path in (one.path, policy_path(one.path))}
+
+
+def batches_of(*cfgs: Config) -> list[EpisodeBatch]:
+    """Environments of a training, two for each run, and of the evaluation."""
+    own = [cfg for cfg in cfgs for _ in range(2)]
+    return shared_batches(CACHE, (own, len(own), cfgs[0].method.contact), (cfgs, len(cfgs), "hard"))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
-    """An uninterrupted run of each method."""
-    folder = tmp_path_factory.mktemp("results")
+    """An uninterrupted single run of each method, by Stable-Baselines3."""
+    folder = tmp_path_factory.mktemp("single")
     return {method: run(make_config(folder, method)) for method in METHODS}
+
+
+@pytest.fixture(scope="module")
+def lone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[RunResult]]:
+    """Uninterrupted runs, each as a population of one."""
+    known = {method: configs(tmp_path_factory.mktemp("alone"), method) for method in OWN}
+    assert {status for cfgs in known.values() for cfg in cfgs for status in statuses([cfg])} == {"finished"}
+    return {method: [read(result_path(cfg)) for cfg in cfgs] for method, cfgs in known.items()}
 
 
 # ---------------------------------------------------------------- whole runs
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_file_holds_the_whole_run(finished: dict[str, RunResult], method: str) -> None:
+def test_rows_evaluation_and_policy_of_a_whole_run(finished: dict[str, RunResult], method: str) -> None:
     result = finished[method]
     rows = result.iterations
     assert set(COLUMNS) | {"iteration", "episodes", "steps", "train_reward", "seconds"} <= set(rows.columns)
     assert rows["iteration"].tolist() == list(range(len(rows)))
-    assert np.isfinite(rows[1:].to_numpy()).all()
-    assert math.isnan(rows["train_reward"][0])
+    # Seven updates of 10 transitions are the fewest that make 16 episodes.
+    on_policy = [0, 7, 15, 17], [0, 30, 60, 70]
+    episodes, steps = on_policy if method == "ppo" else ([0, 6, 12, 16], [0, 24, 48, 64])
+    assert (rows["episodes"].tolist(), rows["steps"].tolist()) == (episodes, steps)
+    assert np.isfinite(rows[1:].to_numpy()).all() and math.isnan(rows["train_reward"][0])
+    assert rows["loss"].nunique() > 1
     terms = rows[["loss_density", "loss_sdf", "loss_contact"]].to_numpy()
     np.testing.assert_allclose(rows["loss"], terms @ [10.0, 10.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-6)
@@ -118,70 +168,60 @@ def test_file_holds_the_whole_run(finished: dict[str, RunResult], method: str) -
     assert result.evaluation["score"] == judged.score and judged.iou_final > 0.1
     assert set(result.wall_time) == {"build", "compile", "optimise", "evaluate"}
     assert result.resume is None
-    assert_nothing_else_is_left(result)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_trained_policy_is_beside_the_result(finished: dict[str, RunResult], method: str) -> None:
-    """Its episode is that of the last row, bit for bit."""
-    result = finished[method]
-    policy = load_policy(result.path)
-    last = result.iterations.iloc[-1]
-    (batch,) = shared_batches(CACHE, ([make_config(result.path.parents[2], method)], 1, "hard"))
-    done = evaluation(batch, policy)
-    assert {name: done.measures[name] for name in COLUMNS} == {name: last[name] for name in COLUMNS}
-
-
-def test_a_policy_that_is_not_there_or_broken_is_told(finished: dict[str, RunResult], tmp_path: Path) -> None:
-    with pytest.raises(
-        ResultsError, match=r"none\.policy\.npz is not there: sac, td3, ppo, shac and pods write it"
-    ):
-        load_policy(tmp_path / "none.h5")
-    whole = policy_path(finished["sac"].path).read_bytes()
-    with np.load(policy_path(finished["sac"].path)) as file:
-        arrays = dict(file)
-    for broken in (b"", b"no archive", whole[:40], whole[: len(whole) // 2]):
-        policy_path(tmp_path / "some.h5").write_bytes(broken)
-        with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
-            load_policy(tmp_path / "some.h5")
-    weight = next(name for name in arrays if name.endswith("mu.weight"))
-    for broken in ({weight: arrays[weight][:1]}, {weight: np.array("text")}, {"header": np.array("{}")}):
-        np.savez(policy_path(tmp_path / "some.h5"), **arrays | broken)
-        with pytest.raises(ResultsError, match=r"some\.policy\.npz is no policy of plab's"):
-            load_policy(tmp_path / "some.h5")
-
-
-def test_rows_are_on_the_axis_of_episodes_and_steps(finished: dict[str, RunResult]) -> None:
-    for method in ("sac", "td3", "tqc"):
-        rows = finished[method].iterations
-        assert rows["episodes"].tolist() == [0, 6, 12, 16]
-        assert rows["steps"].tolist() == [0, 24, 48, 64]
-    # Seven updates of 10 transitions, the fewest that make 16 episodes.
-    assert finished["ppo"].iterations["steps"].tolist() == [0, 30, 60, 70]
-    assert finished["ppo"].iterations["episodes"].tolist() == [0, 7, 15, 17]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_best_actions_are_those_of_the_best_evaluation(finished: dict[str, RunResult], method: str) -> None:
-    result = finished[method]
-    best = int(result.iterations["loss"].argmin())
-    assert result.best_iteration == best and result.best_loss == result.iterations["loss"][best]
+    # The best actions are those of the best evaluation.
+    best = int(rows["loss"].argmin())
+    assert result.best_iteration == best and result.best_loss == rows["loss"][best]
     assert result.best_actions.shape == (HORIZON, 6) and np.abs(result.best_actions).max() <= 1
     for name in COLUMNS:
-        assert result.evaluation[name] == pytest.approx(result.iterations[name][best], rel=1e-5, abs=1e-6), (
-            name
-        )
+        assert result.evaluation[name] == pytest.approx(rows[name][best], rel=1e-5, abs=1e-6), name
+    # An episode of the kept policy is that of the last row, bit for bit.
+    _, judge = batches_of(make_config(result.path.parents[2], method))
+    done = evaluation(judge, load_policy(result.path))
+    assert {name: done.measures[name] for name in COLUMNS} == rows.iloc[-1][[*COLUMNS]].to_dict()
 
 
-def test_policies_change(finished: dict[str, RunResult]) -> None:
-    for result in finished.values():
-        assert result.iterations["loss"].nunique() > 1
+@pytest.mark.parametrize(
+    "method", ["sac", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("td3", "ppo"))]
+)
+def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, method) -> None:
+    cfgs, results, losses = configs(tmp_path, method, "logger=tensorboard"), [], []
+    for cfg, want, one in zip(cfgs, lone[method], carry(cfgs), strict=True):
+        results.append(got := assert_same_run(cfg, want))
+        assert (one.status, one.score) == ("finished", got.evaluation["score"])
+        assert (got.provenance["batch"], want.provenance["batch"]) == (3, 1)
+        assert set(got.wall_time) == {"build", "compile", "optimise", "evaluate"}
+        assert np.isfinite(got.iterations[1:].to_numpy()).all()
+        events = EventAccumulator(str(got.path.with_suffix(".tensorboard"))).Reload()
+        names = family("rl").agents(method).LOSSES
+        losses.append([events.Scalars(f"train/{name}")[-1].value for name in names])
+    assert np.isfinite(losses).all() and losses[0] != losses[1] != losses[2]
+    assert len({tuple(result.iterations["loss"]) for result in results}) == 3
+    assert_nothing_else_is_left(*results)
 
 
-def test_the_same_seed_gives_the_same_bits_another_seed_others(tmp_path: Path, finished) -> None:
-    assert_same_numbers(run(make_config(tmp_path, "ppo")), finished["ppo"])
-    other = run(make_config(tmp_path, "ppo", "seed=1"))
-    assert not np.array_equal(other.iterations["loss"], finished["ppo"].iterations["loss"])
+@pytest.mark.parametrize("method", OWN)
+def test_a_population_begins_and_counts_as_a_single_run_does(finished, lone, method) -> None:
+    """The same first policy, the same rows, other random numbers."""
+    single, alone = finished[method], lone[method][0]
+    assert "population" not in single.provenance and alone.provenance["population"]
+    assert set(single.iterations) == set(alone.iterations)
+    counts = ["iteration", "episodes", "steps"]
+    pd.testing.assert_frame_equal(single.iterations[counts], alone.iterations[counts])
+    first = [result.iterations.iloc[0].drop("seconds") for result in (single, alone)]
+    pd.testing.assert_series_equal(*first, rtol=1e-4)
+    assert not np.allclose(single.iterations["loss"][1:], alone.iterations["loss"][1:], rtol=1e-9)
+    # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
+    _, judge = batches_of(make_config(alone.path.parents[2], method))
+    done, last = evaluation(judge, load_policy(alone.path)), alone.iterations.iloc[-1]
+    for name, value in done.measures.items():
+        assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
+
+
+# ---------------------------------------------------------------- models
+
+
+def trainer_of(cfg: Config, folder: Path) -> Trainer:
+    return Trainer(cfg, batches_of(cfg)[0], folder / "replay", None)
 
 
 def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
@@ -194,12 +234,14 @@ def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
         ("ppo", "release"): {"n_steps": 1250, "batch_size": 79, "ent_coef": 0.01 / 6, "vf_coef": 0.25},
     }
     for (method, profile), expected in values.items():
-        cfg = load_config([*COARSE, f"method={method}", f"method.profile={profile}"])
-        model = trainer_of(cfg, tmp_path).model
+        words = [f"method={method}", f"method.profile={profile}"]
+        model = trainer_of(load_config([*COARSE, *words]), tmp_path).model
         assert {name: getattr(model, name) for name in expected} == expected, (method, profile)
     cfg = load_config([*COARSE, "method=sac", "method.profile=paper", "method.tau=0.25"])
     model = trainer_of(cfg, tmp_path).model
     assert (model.tau, model.learning_starts) == (0.25, 1000)
+    algorithms = {make_config(tmp_path, method).method.algorithm for method in METHODS}
+    assert algorithms == {*FAMILIES["rl"].rules, "tqc"}
 
 
 def test_sac_begins_with_the_weights_of_the_authors_code(tmp_path: Path) -> None:
@@ -214,140 +256,121 @@ def test_sac_begins_with_the_weights_of_the_authors_code(tmp_path: Path) -> None
 
 
 def test_ppo_begins_and_ends_episodes_as_the_profile_says(tmp_path: Path) -> None:
-    gains, ends = {"paper": (0.01, 1.0), "release": (1.0, math.sqrt(2.0))}, {"paper": True, "release": False}
-    for profile, (policy_gain, value_gain) in gains.items():
-        cfg = load_config([*COARSE, "method=ppo", f"method.profile={profile}", "method.num_envs=2"])
-        model = trainer_of(cfg, tmp_path).model
+    profiles = {"paper": (0.01, 1.0, True), "release": (1.0, math.sqrt(2.0), False)}
+    for profile, (policy_gain, value_gain, truncates) in profiles.items():
+        model = trainer_of(load_config([*COARSE, "method=ppo", f"method.profile={profile}"]), tmp_path).model
         # The rows are orthogonal, and as long as the gain.
         for layer, gain in ((model.policy.action_net, policy_gain), (model.policy.value_net, value_gain)):
             weight = layer.weight.detach()
-            torch.testing.assert_close(
-                weight @ weight.T, gain**2 * torch.eye(len(weight)), rtol=1e-4, atol=1e-6
-            )
+            expected = gain**2 * torch.eye(len(weight))
+            torch.testing.assert_close(weight @ weight.T, expected, rtol=1e-4, atol=1e-6)
         model.env.reset()
         for _ in range(HORIZON):
             *_, infos = model.env.step(np.zeros((2, 6)))
-        assert [info["TimeLimit.truncated"] for info in infos] == [ends[profile]] * 2
+        assert [info["TimeLimit.truncated"] for info in infos] == [truncates] * 2
 
 
-def trainer_of(cfg: Config, folder: Path) -> Trainer:
-    batch, _ = shared_batches(CACHE, ([cfg], cfg.method.num_envs, "hard"), ([cfg], 1, "hard"))
-    return Trainer(cfg, batch, folder / "replay", None)
-
-
-def test_learning_rate_falls_to_zero_over_the_run() -> None:
+def test_learning_rate_and_length_of_a_cycle(tmp_path: Path) -> None:
+    """The rate falls to 0 over the run; a cycle is an update of ppo, or a batch of episodes of the others."""
     decay = LinearDecay(0.5)
     assert decay(0.0) == 0.5
     decay.remaining = 0.25
     assert decay(1.0) == 0.125
-
-
-def test_an_update_is_the_unit_of_ppo_a_batch_of_episodes_that_of_the_others(tmp_path: Path) -> None:
     assert cycle_steps(make_config(tmp_path, "sac").method, HORIZON) == 8
     assert cycle_steps(make_config(tmp_path, "ppo", "method.steps_per_update=11").method, HORIZON) == 12
 
 
-# ---------------------------------------------------------------- interruptions, failures
-
-
-def break_after(monkeypatch: pytest.MonkeyPatch, evaluations: int, error: BaseException) -> None:
-    """Let the run break off in the training that follows some evaluations."""
-    looked, intact = rl.evaluation, Trainer.note_step
-    counts = {"evaluations": 0, "steps": 0}
-
-    def evaluated(batch, policy):
-        counts["evaluations"] += 1
-        return looked(batch, policy)
-
-    def note_step(self, actions, infos):
-        counts["steps"] += counts["evaluations"] >= evaluations
-        if counts["steps"] > 7:
-            raise error
-        return intact(self, actions, infos)
-
-    monkeypatch.setattr(rl, "evaluation", evaluated)
-    monkeypatch.setattr(Trainer, "note_step", note_step)
+# ---------------------------------------------------------------- interruptions
 
 
 @pytest.mark.parametrize(
-    ("method", "evaluations"),
-    # After its third evaluation ppo is left with an update that is too short to break off in.
-    [(method, evaluations) for method in METHODS for evaluations in (1, 2, 3)][:-1],
+    ("method", "step", "rows"),
+    # Steps of two environments; evaluations come after 12 and 24, of ppo after 15 and 30.
+    [*((method, 20, 2) for method in METHODS), ("sac", 7, 1), ("td3", 27, 3)],
 )
-def test_resumed_run_equals_an_uninterrupted_one(
-    tmp_path, finished, monkeypatch, method, evaluations
-) -> None:
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, finished, method, step, rows) -> None:
     cfg = make_config(tmp_path, method)
-    with monkeypatch.context() as patch:
-        break_after(patch, evaluations, OSError("gone"))
-        with pytest.raises(OSError, match="gone"):
-            run_config(cfg, CACHE)
-    left = read(result_path(cfg).with_suffix(".partial.h5"))
-    assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", evaluations)
-    resumed = run(cfg)
-    assert_same_numbers(resumed, finished[method])
+    with stopped_at(step, Trainer, "note_step"):
+        run_config(cfg, CACHE)
+    assert len(partial(cfg).iterations) == rows
+    run(cfg)
+    resumed = assert_same_run(cfg, finished[method])
     assert resumed.provenance["resumed"] == 1
     assert_nothing_else_is_left(resumed)
 
 
-@pytest.mark.gpu
-def test_networks_on_cuda_are_trained_resumed_and_kept(tmp_path, monkeypatch) -> None:
-    """Those of an algorithm from outside; plab's own are populations there."""
-    cfg = make_config(tmp_path, "tqc", "method.torch_device=cuda")
-    with monkeypatch.context() as patch:
-        break_after(patch, 2, OSError("gone"))
-        with pytest.raises(OSError, match="gone"):
-            run_config(cfg, CACHE)
-    resumed = run(cfg)
-    assert resumed.provenance["resumed"] == 1
-    assert np.isfinite(resumed.iterations[1:].to_numpy()).all()
-    assert_nothing_else_is_left(resumed)
-    policy = load_policy(resumed.path, "cuda")
-    assert policy.network.device.type == "cuda"
-    done = evaluation(EpisodeBatch([cfg]), policy)
-    assert all(math.isfinite(done.measures[name]) for name in COLUMNS)
+@pytest.mark.parametrize("method", OWN)
+def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method) -> None:
+    cfgs = configs(tmp_path, method)
+    with stopped_at(18, Population, "_step"):
+        carry(cfgs)
+    assert [len(partial(cfg).iterations) for cfg in cfgs] == [2] * 3
+    carry(cfgs)
+    for cfg, want in zip(cfgs, lone[method], strict=True):
+        assert assert_same_run(cfg, want).provenance["resumed"] == 1
 
 
-def test_a_run_broken_off_before_the_final_evaluation_needs_no_replay_buffer(
-    tmp_path, finished, monkeypatch
-) -> None:
+def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone) -> None:
+    cfgs = configs(tmp_path, "sac")
+    with stopped_at(4):
+        carry(cfgs)
+    assert [len(partial(cfg).iterations) for cfg in cfgs] == [2, 1, 1]
+    carry(cfgs)
+    for cfg, want in zip(cfgs, lone["sac"], strict=True):
+        assert_same_run(cfg, want)
+
+
+def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -> None:
+    """What is lost is done again, to the same numbers; a replay buffer may hold more than the state knows."""
+    cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, "td3")]
+    with monkeypatch.context() as patch, stopped_at(27, Population, "_step"):
+        # As if the process were killed.
+        patch.setattr(RunFile, "close", lambda self, status, message: None)
+        carry(cfgs)
+    assert [len(partial(cfg).iterations) for cfg in cfgs] == [1] * 3
+    carry(cfgs)
+    for cfg, want in zip(cfgs, lone["td3"], strict=True):
+        pd.testing.assert_series_equal(read(result_path(cfg)).iterations["loss"], want.iterations["loss"])
+
+
+def test_the_replay_buffer_of_a_single_run(tmp_path, finished) -> None:
+    """Needed to go on with the training, not before the final evaluation."""
     cfg = make_config(tmp_path, "sac")
-    with monkeypatch.context() as patch:
-        patch.setattr(rl.RlRunner, "judge", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-        with pytest.raises(KeyboardInterrupt):
-            run_config(cfg, CACHE)
-    assert not result_path(cfg).with_suffix(".replay").exists()
-    assert_same_numbers(run(cfg), finished["sac"])
+    lost = result_path(cfg).with_suffix(".replay")
+    with stopped_at(20, Trainer, "note_step"):
+        run_config(cfg, CACHE)
+    lost.unlink()
+    with pytest.raises(ResultsError, match=rf"{re.escape(str(lost))}.*force=true"):
+        run_config(cfg, CACHE)
+    assert len(partial(cfg).iterations) == 2
+    with stopped_at(0, RlRunner, "judge"):
+        run_config(replace(cfg, force=True), CACHE)
+    assert not lost.exists()
+    run(cfg)
+    assert_same_run(cfg, finished["sac"])
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("method", METHODS)
-def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path, finished, method) -> None:
-    cfg = make_config(tmp_path, method)
-    partial = result_path(cfg).with_suffix(".partial.h5")
-    arguments = [*COARSE, f"method={method}", *METHODS[method], f"results_dir={tmp_path}"]
-    arguments += ["--config-dir", str(OWN)] if method == "tqc" else []
-    command = [sys.executable, "-m", "plab.run", *arguments]
-    process = subprocess.Popen(command)
-    try:
-        while not partial.exists() and process.poll() is None:
-            time.sleep(0.001)
-        # The first step of training compiles, which takes some seconds.
-        time.sleep(np.random.default_rng().uniform(0.0, 15.0))
-    finally:
-        process.kill()
-        process.wait()
-    subprocess.run(command, check=True)
-    assert_same_numbers(read(result_path(cfg)), finished[method])
+def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
+    cfgs = configs(tmp_path, "sac")
+    with stopped_at(18, Population, "_step"):
+        carry(cfgs)
+    lost = result_path(cfgs[1]).with_suffix(".replay")
+    lost.unlink()
+    ended = carry(cfgs)
+    assert [one.status for one in ended] == ["finished", "refused", "finished"]
+    assert str(lost) in ended[1].message and "force=true" in ended[1].message
+    carry([replace(cfgs[1], force=True)])
+    assert_same_run(cfgs[1], lone["sac"][1])
+
+
+# ---------------------------------------------------------------- failures
 
 
 @pytest.mark.parametrize("method", ["sac", "ppo"])
-def test_an_episode_that_breaks_off_is_counted_and_ends_nothing(
-    tmp_path, method, monkeypatch, caplog
-) -> None:
+def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, method, monkeypatch, caplog) -> None:
     intact, calls = PlabVecEnv.step_wait, itertools.count()
 
-    def step_wait(self: PlabVecEnv):
+    def step_wait(self: PlabVecEnv) -> Any:
         if next(calls) == 9:
             make_not_finite(self.batch.problem.simulator, 1)
         return intact(self)
@@ -356,10 +379,7 @@ def test_an_episode_that_breaks_off_is_counted_and_ends_nothing(
     result = run(make_config(tmp_path, method))
     assert result.provenance["broken_episodes"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert re.search(
-        "1 of [68] episodes of training broke off .* environment step 1, substep 1: the state", told
-    )
+    assert len(caplog.records) == 1
 
 
 def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) -> None:
@@ -379,141 +399,130 @@ def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) 
     monkeypatch.setattr(module, "evaluation", evaluated)
 
 
-@pytest.mark.parametrize("number", [0, 2])
-def test_an_evaluation_that_breaks_off_ends_only_a_run_of_no_other(
-    tmp_path, finished, monkeypatch, caplog, number: int
-) -> None:
-    cfg = make_config(tmp_path, "ppo")
+def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, finished, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        break_evaluation(patch, rl, number)
-        if number == 0:
-            with pytest.raises(
-                RunError, match="iteration 0: environment step 1, substep 1: the state is not finite"
-            ):
-                run_config(cfg, CACHE)
-            assert_same_numbers(run(cfg), finished["ppo"])
-            return
-        result = run(cfg)
+        break_evaluation(patch, rl, 0)
+        with pytest.raises(RunError, match="iteration 0: environment step 1, substep 1"):
+            run_config(make_config(tmp_path / "first", "ppo"), CACHE)
+    break_evaluation(monkeypatch, rl, 2)
+    result = run(make_config(tmp_path, "ppo"))
     assert result.provenance["broken_evaluations"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
-    rows, whole = result.iterations, finished["ppo"].iterations
-    others = [k for k in range(len(rows)) if k != number]
-    assert rows["loss"][others].equals(whole["loss"][others]) and rows["loss"][2] != whole["loss"][2]
-    assert result.best_iteration == whole["loss"][others].idxmin()
-    (told,) = (record.getMessage() for record in caplog.records)
-    assert re.search(
-        "the evaluation of iteration 2 broke off .*: environment step 1, substep 1: the state", told
-    )
+    rows, whole = result.iterations["loss"], finished["ppo"].iterations["loss"]
+    assert rows.drop(2).equals(whole.drop(2)) and rows[2] != whole[2]
+    assert result.best_iteration == whole.drop(2).idxmin()
 
 
-def test_a_state_that_is_not_finite_ends_the_run(tmp_path: Path, monkeypatch) -> None:
-    cfg = make_config(tmp_path, "sac")
-    break_after(monkeypatch, 2, SimulationError("environment 0, step 2: position is nan"))
-    with pytest.raises(RunError, match="position is nan"):
-        run_config(cfg, CACHE)
-    left = read(result_path(cfg).with_suffix(".partial.h5"))
-    assert (left.status, len(left.iterations)) == ("failed", 2)
-    assert left.best_actions is not None
+def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None:
+    """Have both environments of a population's second run break off in some steps of the training."""
+    intact, calls = Population._step, itertools.count()
+
+    def step(self: Population) -> None:
+        if next(calls) in steps:
+            for env in (2, 3):
+                make_not_finite(self._training.batch.problem.simulator, env)
+        intact(self)
+
+    monkeypatch.setattr(Population, "_step", step)
 
 
-def test_a_lost_replay_buffer_is_said(tmp_path: Path, monkeypatch) -> None:
-    cfg = make_config(tmp_path, "sac")
+@pytest.mark.parametrize("method", ["sac", "ppo"])
+def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method, monkeypatch, caplog) -> None:
+    """They are counted and end nothing: episodes of the second run, and an evaluation of the first run."""
+    cfgs, alone = configs(tmp_path, method), lone[method]
+    intact, calls = Population._advance, itertools.count()
+
+    def advance(self: Population, env: TensorEnv, actions: torch.Tensor) -> Any:
+        # In the third step of the second evaluation.
+        if env is self._evaluation and next(calls) == HORIZON + 2:
+            make_not_finite(env.batch.problem.simulator, 0)
+        return intact(self, env, actions)
+
+    break_steps(monkeypatch, {9})
+    monkeypatch.setattr(Population, "_advance", advance)
+    assert statuses(cfgs) == ["finished"] * 3
+    assert_same_run(cfgs[2], alone[2])
+    judged, taught, other = (read(result_path(cfg)) for cfg in cfgs)
+    assert [one.provenance.get("broken_episodes") for one in (judged, taught, other)] == [None, 2, None]
+    assert [one.provenance.get("broken_evaluations") for one in (judged, taught, other)] == [1, None, None]
+    assert np.isfinite(taught.iterations[1:].to_numpy()).all()
+    rows, whole = judged.iterations["loss"], alone[0].iterations["loss"]
+    assert judged.best_iteration != 1
+    assert rows[1] != whole[1] and rows.drop(1).equals(whole.drop(1))
+    for one in (judged, taught):
+        assert any(str(one.path) in record.getMessage() for record in caplog.records)
+
+
+def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeypatch) -> None:
+    """All episodes of the second run break off, and the networks of the third run are not finite."""
+    cfgs = configs(tmp_path, "sac")
+    intact = Population.train
+
+    def train(self: Population, episodes: int) -> None:
+        intact(self, episodes)
+        if self.episodes == 12:
+            with torch.no_grad():
+                for parameter in self.stacks[-1].networks.parameters():
+                    parameter.fill_(np.nan)
+
     with monkeypatch.context() as patch:
-        break_after(patch, 2, OSError("gone"))
-        with pytest.raises(OSError, match="gone"):
-            run_config(cfg, CACHE)
-    result_path(cfg).with_suffix(".replay").unlink()
-    with pytest.raises(ResultsError, match=r"replay, the replay buffer of the run, is gone: .*force=true"):
-        run_config(cfg, CACHE)
-    assert result_path(cfg).with_suffix(".partial.h5").exists()
-    run(replace(cfg, force=True))
+        break_steps(patch, range(12))
+        patch.setattr(Population, "train", train)
+        ended = carry(cfgs)
+    assert [one.status for one in ended] == ["finished", "failed", "failed"]
+    assert ended[1].message.startswith("iteration 1: all 6 episodes")
+    assert ended[2].message.startswith("iteration 2:") and "not finite" in ended[2].message
+    assert statuses(cfgs[:1]) == ["before"]
+    for cfg, want in zip(cfgs, lone["sac"], strict=True):
+        carry([cfg])
+        assert_same_run(cfg, want)
 
 
-def test_a_full_disk_is_said_before_training(tmp_path: Path, monkeypatch) -> None:
-    def full(descriptor: int, start: int, size: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    cfg = make_config(tmp_path, "td3")
-    with pytest.raises(
-        ResultsError, match=r"cannot reserve .* GB for the replay buffer at .*: No space left"
-    ):
-        run_config(cfg, CACHE)
-    assert not list(tmp_path.rglob("*.replay"))
+def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path) -> None:
+    """Until they fit ``sim.memory_mb``; one is always tried."""
+    cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
+    assert statuses(cfgs) == ["finished"] * 2
+    assert {read(result_path(cfg)).provenance["batch"] for cfg in cfgs} == {1}
 
 
-def test_what_is_not_installed_is_said_before_anything_is_built(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(rl, "shared_batches", None)
-    monkeypatch.setattr("plab.config.checks.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"TensorBoard: pip install 'plab\[tensorboard\]'"):
-        run_config(make_config(tmp_path, "ppo", "logger=tensorboard"))
-    monkeypatch.setattr(rl.torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigError, match=r"choose method\.torch_device=cpu"):
-        run_config(make_config(tmp_path, "ppo", "method.torch_device=cuda"))
+# ---------------------------------------------------------------- CUDA
 
 
-def test_progress_counts_episodes(tmp_path: Path, capsys) -> None:
-    run_config(replace(make_config(tmp_path, "sac"), progress=True), CACHE)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Move-v1")]
-    assert [line.split()[4].rstrip(",") for line in lines] == ["2/16", "6/16", "12/16", "16/16"]
-    assert "steps/s reward" in lines[-1] and " score " in lines[-1] and " left, " in lines[-1]
+def test_a_single_run_is_a_population_of_one_where_its_networks_are_on_cuda(tmp_path: Path) -> None:
+    def carries_out(method: str, device: str, population: bool | None = None) -> type:
+        cfg = make_config(tmp_path, method, f"method.torch_device={device}")
+        begun = None if population is None else {"steps": 0}
+        result = SimpleNamespace(resume=begun, provenance={"population": population})
+        return _runner(Job(cfg, SimpleNamespace(result=result)), in_sweep=False)
+
+    assert carries_out("sac", "cpu") is RlRunner and carries_out("sac", "cuda") is PopulationRunner
+    # Whoever has begun goes on.
+    assert carries_out("ppo", "cuda", False) is RlRunner
+    assert carries_out("ppo", "cpu", True) is PopulationRunner
 
 
-# ---------------------------------------------------------------- replay buffer
+@pytest.mark.gpu
+@pytest.mark.parametrize("method", OWN)
+def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch, method) -> None:
+    cfgs = configs(tmp_path, method, "sim.device=cuda", "method.torch_device=cuda")
+    with stopped_at(18, Population, "_step"):
+        run_batch(cfgs)
+    with monkeypatch.context() as patch:
+        break_steps(patch, {9})
+        assert [one.status for one in run_batch(cfgs)] == ["finished"] * 3
+    for k, cfg in enumerate(cfgs):
+        result = read(result_path(cfg))
+        assert result.provenance.get("broken_episodes", 0) == (2 if k == 1 else 0)
+        assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
+        assert np.isfinite(result.iterations[1:].to_numpy()).all()
+        assert load_policy(result.path, "cuda").network.device.type == "cuda"
+    # The simulator stays on the CPU.
+    single = make_config(tmp_path / "single", method, "method.torch_device=cuda")
+    run_config(single)
+    assert read(result_path(single)).provenance["population"]
 
 
-@pytest.mark.parametrize("buffer_size", [10_000, 24])
-def test_replay_buffer_samples_what_a_plain_one_does(tmp_path: Path, buffer_size: int) -> None:
-    """The same transitions as Stable-Baselines3's buffer, which keeps next observations of their own."""
-    observations, actions = Box(-1, 1, (3,), np.float32), Box(-1, 1, (2,), np.float32)
-    steps, envs, horizon = 40, 2, 4
-    own = EpisodeReplay(
-        buffer_size,
-        observations,
-        actions,
-        n_envs=envs,
-        path=str(tmp_path / "replay"),
-        horizon=horizon,
-        total_steps=steps,
-        spare_steps=horizon,
-        added=0,
-    )
-    plain = ReplayBuffer(min(buffer_size, steps * envs), observations, actions, "cpu", n_envs=envs)
-    rng = np.random.default_rng(0)
-    state = rng.normal(size=(envs, 3)).astype(np.float32)
-    for step in range(steps):
-        after, action = rng.normal(size=(envs, 3)).astype(np.float32), rng.normal(size=(envs, 2))
-        reward, done = rng.normal(size=envs), np.full(envs, (step + 1) % horizon == 0)
-        infos = [{"TimeLimit.truncated": bool(over)} for over in done]
-        for buffer in (own, plain):
-            buffer.add(state, after, action, reward, done, infos)
-        state = rng.normal(size=(envs, 3)).astype(np.float32) if done[0] else after
-    assert own.size() == plain.size()
-    sets = []
-    for buffer in (own, plain):
-        sample = buffer.sample(4000)
-        rows = np.concatenate([np.asarray(part) for part in sample[:5]], axis=1)
-        sets.append(np.unique(rows, axis=0))
-    # Every transition is drawn, and nothing else.
-    assert len(sets[0]) == plain.size() * envs
-    assert np.array_equal(*sets)
-
-
-def test_every_algorithm_has_a_method(tmp_path: Path) -> None:
-    algorithms = {make_config(tmp_path, method).method.algorithm for method in METHODS}
-    assert algorithms == {*FAMILIES["rl"].rules, "tqc"}
-
-
-def test_a_policy_from_outside_needs_its_module(finished: dict[str, RunResult], monkeypatch) -> None:
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if "own_rl" not in path])
-    monkeypatch.delitem(sys.modules, "tqc")
-    with pytest.raises(ResultsError, match=r"its method is 'tqc:FAMILY', outside plab: import 'tqc' before"):
-        load_policy(finished["tqc"].path)
-    monkeypatch.undo()
-    load_policy(finished["tqc"].path)
-
-
-# ---------------------------------------------------------------- learning, speed
+# ---------------------------------------------------------------- learning
 
 
 @pytest.mark.nightly
@@ -522,28 +531,13 @@ def test_ppo_learns_to_press_a_torus(tmp_path: Path) -> None:
     fast = ("sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=10", "sim.particles_scale=0.2")
     training = ("method.num_envs=10", "method.episodes=200", "method.steps_per_update=500")
     updates = ("method.minibatches=8", "method.lr_decay=false", "method.evaluate_every=20")
-    folder = f"results_dir={tmp_path}"
-    cfg = load_config(["task=Torus", "method=ppo", "progress=false", *fast, *training, *updates, folder])
+    words = [*fast, *training, *updates, "progress=false", f"results_dir={tmp_path}"]
+    cfg = load_config(["task=Torus", "method=ppo", *words])
     result = run(cfg)
     episodes = EpisodeBatch([cfg] * 32)
     episodes.reset()
     rng, reward = np.random.default_rng(0), np.zeros(32)
     for _ in range(cfg.sim.horizon):
         reward += episodes.step(rng.uniform(-1, 1, (32, 3))).reward
-    print(f"random episodes: {reward.mean():.3f}, best {reward.max():.3f}")
-    print(result.iterations[["episodes", "reward", "score", "train_reward", "train_score"]].to_string())
     # 0.12; after training 0.6 to 0.8 with three seeds.
     assert result.iterations[["reward", "train_reward"]].iloc[-1].min() > 2 * reward.max() > 0
-
-
-def test_benchmark_measures_every_part(tmp_path: Path, capsys) -> None:
-    table = tmp_path / "rl.csv"
-    overrides = COARSE[:-4]
-    bench.rl([*overrides, "--methods", "sac", "--envs", "2", "--batches", "1", "--csv", str(table)])
-    (row,) = pd.read_csv(table).to_dict("records")
-    assert (row["method"], row["num_envs"]) == ("sac", 2)
-    parts = [row[f"{part}_ms"] for part in PARTS]
-    assert min(parts) > 0
-    # Of 4 steps of 2 environments.
-    assert sum(parts) == pytest.approx(2 / row["steps_per_s"] * 1e3, rel=0.05)
-    assert "steps_per_s" in capsys.readouterr().out

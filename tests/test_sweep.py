@@ -1,263 +1,197 @@
-"""Sweeps by a runner that takes no time: what is run, in which batches, what is skipped and reported."""
+"""Sweeps with the toy runner: choice of runs, batches, failures, several processes, composition of jobs."""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
+import re
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import plab.sweep.plan as planning
 import toy_runner
 from plab.cli.run import main
-from plab.config import Config, load_config
+from plab.config import Config, build_scene, conf_folder, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.families import FAMILIES
 from plab.locks import acquire
 from plab.results import RunFile, config_hash, read, result_path
+from plab.runners.jobs import TogetherError
+from plab.sim.memory import batch_limit, kept_states
+from plab.sweep.carry import look_up
 from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
 from refusals import plugin
-
-COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+from same_runs import raising
+from toy_runner import COARSE, WHY, assert_complete, computed, configs
 
 
 @pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
+def _toy_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    toy_runner.install(monkeypatch)
 
 
 @pytest.fixture
-def toy(monkeypatch) -> Callable[..., list[Config]]:
-    """Let the toy runner do the work; returns a function that composes runs."""
-    for family in FAMILIES:
-        monkeypatch.setitem(FAMILIES, family, toy_runner.toy_family(family))
+def sweep(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[str, int], list[str]]]:
+    """Run a sweep; returns exit code, runs by status, lines on standard error."""
 
-    def configs(*overrides: str, seeds: tuple[int, ...] = (0, 1, 2)) -> list[Config]:
-        return [load_config([*COARSE, f"seed={seed}", *overrides]) for seed in seeds]
+    def call(*argv: str) -> tuple[int, dict[str, int], list[str]]:
+        capsys.readouterr()
+        code = main(["-m", *COARSE, *argv])
+        out, err = capsys.readouterr()
+        last = out.splitlines()[-1] if out else ""
+        counts = {what: int(number) for number, what in re.findall(r"(\d+) ([a-z ]+)", last)}
+        return code, {what: number for what, number in counts.items() if number}, err.splitlines()
 
-    return configs
-
-
-def sweep(*argv: str) -> int:
-    return main(["-m", *COARSE, *argv])
-
-
-def computed(folder: str = "results") -> list[str]:
-    """The lines that the toy runner has written."""
-    log = Path(folder) / "log"
-    return log.read_text().splitlines() if log.exists() else []
+    return call
 
 
-def assert_complete(cfgs: list[Config]) -> None:
-    """Assert that there is each result, right, and no other file."""
-    assert all(toy_runner.is_right(read(result_path(cfg)), cfg) for cfg in cfgs)
-    files = {path for path in Path("results").rglob("*") if path.is_file()}
-    assert files == {result_path(cfg) for cfg in cfgs} | {Path("results/log")}
-
-
-# ---------------------------------------------------------------- what is run
-
-
-def test_finished_runs_are_skipped(toy, capsys) -> None:
-    assert sweep("seed=0,1") == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
-    assert sweep("seed=0,1,2") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "2 of 3 runs finished before"
-    assert lines[-1] == "3 runs: 1 finished, 2 finished before"
-    assert len(computed()) == 3
-    assert_complete(toy())
-    assert sweep("seed=0,1,2", "force=true") == 0
-    assert len(computed()) == 6
-    assert_complete(toy())
-
-
-def test_only_what_changes_a_result_makes_it_another_run(toy) -> None:
-    assert sweep("seed=0,1", "checkpoint_seconds=0", "sim.memory_mb=1000", "progress=false") == 0
-    assert sweep("seed=0,1", "checkpoint_seconds=5", "sim.memory_mb=2000") == 0
+def test_each_run_is_computed_once_unless_forced(sweep) -> None:
+    assert sweep("seed=0,0", "progress=false") == (0, {"runs": 1, "finished": 1}, [])
+    # Settings without influence on the result make no other run.
+    counts = {"runs": 2, "finished": 1, "finished before": 1}
+    assert sweep("seed=0,1", "checkpoint_seconds=0", "sim.memory_mb=1000") == (0, counts, [])
     assert len(computed()) == 2
-    assert sweep("seed=0,1", "method.lr=0.05") == 0
+    assert sweep("seed=0,1", "force=true")[:2] == (0, {"runs": 2, "finished": 2})
     assert len(computed()) == 4
+    assert_complete(configs(seeds=(0, 1)))
 
 
-def test_a_glob_over_tasks(seen) -> None:
-    assert main(["-m", "task=glob(*)", "seed=0,1,2"]) == 0
-    runs = {(cfg.task.name, cfg.seed) for cfg in seen}
-    assert len(runs) == len(seen) == 30
-
-
-def test_a_small_experiment(seen) -> None:
+def test_jobs_of_a_glob_and_of_an_experiment(seen) -> None:
+    assert main(["-m", "task=glob(R*)"]) == 0
+    assert len(seen) == len({cfg.task.name for cfg in seen}) == 2
+    seen.clear()
     assert main(["+experiment=smoke"]) == 0
-    assert len({config_hash(cfg) for cfg in seen}) == len(seen) == 6
+    assert len(seen) == len({config_hash(cfg) for cfg in seen}) == 6
     assert {cfg.method.name for cfg in seen} == {"adam", "gd", "adam_h"}
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("experiment", "methods"),
-    [("paper_gradient", ("adam", "gd", "adam_h")), ("paper_rl", ("sac", "td3", "ppo"))],
-)
-def test_the_papers_runs(seen, experiment: str, methods: tuple[str, ...]) -> None:
-    assert main([f"+experiment={experiment}"]) == 0
-    runs = [(cfg.task.name, cfg.variant, cfg.method.name, cfg.seed) for cfg in seen]
-    assert sorted(runs) == sorted(product(suite_tasks(), SUITE_VARIANTS, methods, range(3)))
-    assert len({config_hash(cfg) for cfg in seen}) == 450
+def test_runs_of_the_paper(seen) -> None:
+    assert main(["+experiment=paper_gradient"]) == 0
+    runs = {(cfg.task.name, cfg.variant, cfg.method.name, cfg.seed) for cfg in seen}
+    assert runs == set(product(suite_tasks(), SUITE_VARIANTS, ("adam", "gd", "adam_h"), range(3)))
 
 
-def test_the_same_run_twice_is_one_run(toy, capsys) -> None:
-    assert sweep("seed=0,0,0") == 0
-    assert len(computed()) == 1
-    assert capsys.readouterr().out.splitlines()[-1] == "1 runs: 1 finished, 0 finished before"
+def test_failed_runs_do_not_stop_the_others(sweep) -> None:
+    code, counts, lines = sweep("seed=0,13,1")
+    assert (code, counts) == (1, {"runs": 3, "finished": 2, "failed": 1})
+    assert lines == [f"plab: Rope-v1 adam seed 13: {WHY}"]
+    left = read(result_path(configs(seeds=(13,))[0]).with_suffix(".partial.h5"))
+    assert (left.status, left.message, left.rows) == ("failed", WHY, 3)
+    # The same command again: only those that failed.
+    code, counts, _ = sweep("seed=0,13,1")
+    assert (code, counts) == (1, {"runs": 3, "finished before": 2, "failed": 1})
+    assert len(computed()) == 4
 
 
-def test_failed_runs_do_not_stop_the_others_and_are_reported(toy, capsys) -> None:
-    assert sweep("seed=0,13,1", "method=adam,gd") == 1
-    out, err = capsys.readouterr()
-    assert out.splitlines()[-1] == "6 runs: 4 finished, 0 finished before, 2 failed"
-    why = "iteration 3: environment step 1: the loss is not finite"
-    assert err.splitlines() == [f"plab: Rope-v1 {method} seed 13: {why}" for method in ("adam", "gd")]
-    (failed,) = toy(seeds=(13,))
-    left = read(result_path(failed).with_suffix(".partial.h5"))
-    assert (left.status, left.message, len(left.iterations)) == ("failed", why, 3)
-    # Again: only those that failed.
-    assert sweep("seed=0,13,1", "method=adam,gd") == 1
-    assert len(computed()) == 8
+def test_refused_runs_do_not_stop_the_others(sweep) -> None:
+    code, counts, lines = sweep("variant=1,9")
+    assert (code, counts) == (2, {"runs": 2, "finished": 1, "refused": 1})
+    assert len(lines) == 1 and "variant=9" in lines[0]
 
 
-def test_refused_runs_do_not_stop_the_others_and_are_reported(toy, capsys) -> None:
-    assert sweep("variant=1,9", "seed=0,1") == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2 and all("variant=9" in line and "does not exist" in line for line in lines)
-    assert len(computed()) == 2
+def test_a_bug_in_one_batch_does_not_stop_the_others(sweep) -> None:
+    with raising(KeyError("a bug"), 5, toy_runner, "advance"):
+        code, counts, lines = sweep("method=gd,adam", "hydra.launcher.batch_size=1")
+    assert (code, counts) == (1, {"runs": 2, "finished": 1, "failed": 1})
+    assert lines[0].startswith("Traceback") and lines[-1] == "plab: Rope-v1 gd seed 0: KeyError: 'a bug'"
+    assert read(result_path(configs("method=gd")[0]).with_suffix(".partial.h5")).rows == 5
 
 
-def test_a_bug_in_one_batch_does_not_stop_the_others(toy, monkeypatch, capsys) -> None:
-    intact = toy_runner.run_toy
-
-    def break_gd(jobs, note):
-        if jobs[0].cfg.method.name == "gd":
-            raise KeyError("a bug")
-        intact(jobs, note)
-
-    monkeypatch.setattr(toy_runner, "run_toy", break_gd)
-    assert sweep("method=gd,adam", "hydra.launcher.batch_size=1") == 1
-    err = capsys.readouterr().err
-    assert "Traceback" in err and err.splitlines()[-1] == "plab: Rope-v1 gd seed 0: KeyError: 'a bug'"
-    assert toy_runner.is_right(read(result_path(toy(seeds=(0,))[0])), toy(seeds=(0,))[0])
-
-
-def test_runs_that_cannot_share_a_simulator_are_halved(toy, monkeypatch, capsys) -> None:
-    from plab.runners.jobs import TogetherError
-
+def test_runs_that_cannot_share_a_simulator_are_halved(sweep, monkeypatch) -> None:
     sizes, intact = [], toy_runner.run_toy
 
-    def small_only(jobs, note):
+    def small_only(jobs) -> None:
         sizes.append(len(jobs))
         if len(jobs) > 2:
             raise TogetherError("out of memory")
-        intact(jobs, note)
+        intact(jobs)
 
     monkeypatch.setattr(toy_runner, "run_toy", small_only)
-    assert sweep("seed=0,1,2,3,4") == 0
+    assert sweep("seed=range(5)")[0] == 0
     assert sizes == [5, 2, 3, 1, 2]
-    assert_complete(toy(seeds=(0, 1, 2, 3, 4)))
+    assert_complete(configs(seeds=range(5)))
 
 
-def test_ctrl_c_closes_all_files_of_the_batch(toy, monkeypatch, capsys) -> None:
-    with monkeypatch.context() as patch:
-        calls = iter(range(100))
-        intact = toy_runner.advance
-        patch.setattr(toy_runner, "advance", lambda x: _interrupt() if next(calls) == 10 else intact(x))
-        assert sweep("seed=0,1,2") == 130
-    assert capsys.readouterr().err == "plab: stopped: run the same command again to resume\n"
-    left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in toy()]
-    assert [(one.status, len(one.iterations)) for one in left] == [("stopped", 4)] + [("stopped", 3)] * 2
-    assert sweep("seed=0,1,2") == 0
-    assert_complete(toy())
+def test_an_interrupted_batch_is_kept_and_resumed(sweep) -> None:
+    with raising(KeyboardInterrupt(), 10, toy_runner, "advance"):
+        code, _, lines = sweep("seed=0,1,2")
+    assert code == 130 and len(lines) == 1
+    left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in configs()]
+    assert [(one.status, one.rows) for one in left] == [("stopped", 4), ("stopped", 3), ("stopped", 3)]
+    assert sweep("seed=0,1,2")[:2] == (0, {"runs": 3, "finished": 3})
+    assert_complete(configs())
 
 
-def _interrupt() -> None:
-    raise KeyboardInterrupt
-
-
-# ---------------------------------------------------------------- several processes
-
-
-def test_what_another_process_computes_is_left_to_it(toy, capsys) -> None:
-    busy = toy(seeds=(1,))[0]
-    result_path(busy).parent.mkdir(parents=True)
-    lock = acquire(result_path(busy))
-    assert sweep("seed=0,1,2") == 1
-    out, err = capsys.readouterr()
-    assert out.splitlines()[-1] == "3 runs: 2 finished, 0 finished before, 1 under way in another process"
-    assert err.count("\n") == 1 and "Rope-v1 adam seed 1: " in err and "by another process" in err
-    assert len(computed()) == 2 and not result_path(busy).exists()
-    lock.release()
-    assert sweep("seed=0,1,2") == 0
-    assert_complete(toy())
-    assert main([*COARSE, "seed=3"]) == 0
-
-
-def test_a_single_run_that_another_process_computes(toy, capsys) -> None:
-    (busy,) = toy(seeds=(1,))
-    result_path(busy).parent.mkdir(parents=True)
-    lock = acquire(result_path(busy))
+def test_a_run_under_way_in_another_process_is_left_to_it(sweep, capsys) -> None:
+    busy = configs(seeds=(1,))[0]
+    other = RunFile(busy)
+    code, counts, lines = sweep("seed=0,1")
+    assert (code, counts) == (1, {"runs": 2, "finished": 1, "under way in another process": 1})
+    assert len(lines) == 1 and "Rope-v1 adam seed 1: " in lines[0] and str(result_path(busy)) in lines[0]
     assert main([*COARSE, "seed=1"]) == 1
-    assert capsys.readouterr().err == f"plab: {result_path(busy)} is being computed by another process\n"
-    lock.release()
+    assert str(result_path(busy)) in capsys.readouterr().err
+    other.release()
+    assert sweep("seed=0,1")[0] == 0
+    assert_complete(configs(seeds=(0, 1)))
 
 
-def test_what_another_process_leaves_behind_is_taken_up(toy, monkeypatch, capsys) -> None:
-    """The other process holds a run while the sweep goes by, and is gone at the end of it."""
-    given_up = toy(seeds=(1,))[0]
-    other = RunFile(given_up)
-    intact = toy_runner.run_toy
+def test_a_run_that_another_process_gives_up_is_taken_up(sweep, monkeypatch) -> None:
+    other, intact = RunFile(configs(seeds=(1,))[0]), toy_runner.run_toy
 
-    def end_of_the_other(jobs, note):
-        intact(jobs, note)
+    def end_of_the_other(jobs) -> None:
+        intact(jobs)
         other.release()
 
     monkeypatch.setattr(toy_runner, "run_toy", end_of_the_other)
-    assert sweep("seed=0,1,2") == 0
-    assert_complete(toy())
+    assert sweep("seed=0,1,2")[:2] == (0, {"runs": 3, "finished": 3})
+    assert_complete(configs())
 
 
-_SWEEP = """
-import sys
-import toy_runner
-from plab.families import FAMILIES
-from plab.cli.run import main
-FAMILIES["trajectory"] = toy_runner.toy_family("trajectory")
-toy_runner.PAUSE = 0.02
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def test_two_sweeps_at_once_compute_nothing_twice(toy) -> None:
-    command = [sys.executable, "-c", _SWEEP, "-m", *COARSE, "seed=range(12)", "hydra.launcher.batch_size=2"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    both = [subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL) for _ in range(2)]
-    codes = [process.wait() for process in both]
-    # Whoever ends first finds the other at work.
+@pytest.mark.nightly
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_several_processes_on_one_sweep_compute_nothing_twice(monkeypatch) -> None:
+    monkeypatch.setattr(toy_runner, "PAUSE", 0.005)
+    argv = ["-m", *COARSE, "seed=range(6)", "checkpoint_seconds=0", "hydra.launcher.batch_size=2"]
+    children = [_forked(argv) for _ in range(8)]
+    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    # A process that ends early says that others are at work.
     assert set(codes) <= {0, 1} and 0 in codes
-    names = [line.split()[-1] for line in computed()]
-    assert len(names) == len(set(names)) == 12
-    assert_complete(toy(seeds=tuple(range(12))))
+    assert len(computed()) == len(set(computed())) == 6
+    assert_complete(configs(seeds=range(6)))
 
 
-# ---------------------------------------------------------------- batches
+def _forked(argv: list[str]) -> int:
+    child = os.fork()
+    if child == 0:
+        try:
+            os._exit(main(argv))
+        finally:
+            os._exit(99)
+    return child
 
 
-def composed(*lines: str) -> list[Config]:
-    return [load_config(line.split()) for line in lines]
+def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
+    sweep("seed=0,13")
+    finished, failed, begun, absent, busy = configs(seeds=(0, 13, 2, 3, 4))
+    run = RunFile(begun)
+    run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(begun)}, keep=True)
+    run.release()
+    lock = acquire(result_path(busy))
+    ends = [look_up(cfg) for cfg in (finished, failed, begun, absent, busy)]
+    assert [one.status for one in ends] == ["finished", "failed", "lost", "lost", "elsewhere"]
+    assert ends[0].score == read(result_path(finished)).evaluation["score"]
+    assert ends[1].message == WHY and "1 iterations" in ends[2].message
+    assert str(result_path(busy)) in ends[4].message
+    lock.release()
 
 
 def test_batches_hold_what_one_simulator_can_serve() -> None:
-    cfgs = composed(
+    lines = (
         "variant=1",
         "variant=2 method=gd seed=4",
         "task=Move",
@@ -270,69 +204,29 @@ def test_batches_hold_what_one_simulator_can_serve() -> None:
         "method=ppo",
         "sim.particles_scale=0.06",
     )
-    batches = plan(cfgs, 100)
-    assert [[cfgs.index(cfg) for cfg in batch] for batch in batches] == [
-        [0, 1, 3],
-        [2],
-        [4, 8],
-        [5],
-        [6],
-        [7],
-        [9],
-        [10],
-    ]
+    cfgs = [load_config(line.split()) for line in lines]
+    batches = [[cfgs.index(cfg) for cfg in batch] for batch in plan(cfgs, 100)]
+    assert batches == [[0, 1, 3], [2], [4, 8], [5], [6], [7], [9], [10]]
 
 
-def test_batches_are_as_large_as_allowed_and_even() -> None:
-    cfgs = composed(*[f"sim.particles_scale=0.1 seed={seed}" for seed in range(10)])
-    assert [len(batch) for batch in plan(cfgs, 4)] == [3, 3, 4]
-    assert [len(batch) for batch in plan(cfgs, 1)] == [1] * 10
-    assert sum(plan(cfgs, 3), []) == cfgs  # noqa: RUF017
-    assert [len(batch) for batch in plan(cfgs)] == [10]
-    assert len(plan(composed(*[f"sim.memory_mb=1000 seed={seed}" for seed in range(4)]))) == 4
+def test_batches_are_as_large_as_allowed_and_even(monkeypatch) -> None:
+    def sizes(cfgs: list[Config], *settings: int | None, **more: int) -> list[int]:
+        batches = plan(cfgs, *settings, **more)
+        assert [cfg for batch in batches for cfg in batch] == cfgs
+        return [len(batch) for batch in batches]
 
-
-def test_batch_size_must_be_positive(capsys) -> None:
-    assert sweep("seed=0,1", "hydra.launcher.batch_size=0") == 2
-    assert "hydra.launcher.batch_size must be at least 1 or null, not 0" in capsys.readouterr().err
-
-
-class Queue:
-    """A launcher of other processes, of which nobody hears again; it stands for Hydra's list of them, too."""
-
-    @classmethod
-    def instance(cls) -> Queue:
-        return cls()
-
-    def instantiate_launcher(self, **settings: object) -> Queue:
-        return self
-
-    def launch(self, jobs: object, initial_job_idx: int) -> object:
-        raise RuntimeError("nobody is there")
-
-
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ("{_target_:queue}", "6 runs go to Queue in 1 jobs; hydra.launcher.batch_size=1 makes a job of each"),
-        ("{_target_:queue,n_jobs:2}", "6 runs go to Queue in 2 jobs"),
-        ("{_target_:queue,n_jobs:99}", "6 runs go to Queue in 6 jobs"),
-    ],
-)
-def test_other_launchers_get_a_job_per_process_or_say_that_it_is_one(
-    toy, monkeypatch, capsys, settings, said
-):
-    monkeypatch.setattr(plugin(), "Plugins", Queue)
-    assert sweep("seed=range(6)", f"hydra.launcher.inner={settings}") == 1
-    assert capsys.readouterr().out.splitlines()[0] == said
+    cfgs = configs(seeds=range(10))
+    assert sizes(cfgs) == [10] and sizes(cfgs, 4) == [3, 3, 4] and sizes(cfgs, 1) == [1] * 10
+    # One for each process.
+    assert sizes(cfgs, None, 3) == [3, 3, 4] and sizes(cfgs, None, 99) == [1] * 10
+    # Agents by the memory of the device, and of all processes that share it.
+    monkeypatch.setattr(planning, "most_environments", lambda *_: 40)
+    cfgs = configs("method=sac", "method.num_envs=5", seeds=range(8))
+    assert sizes(cfgs) == [8] and sizes(cfgs, sharing=2) == [4, 4] and sizes(cfgs, sharing=20) == [1] * 8
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_full_size_batches_fit_the_memory(device: str) -> None:
-    """What :class:`plab.sim.Simulator` will find, computed here without one."""
-    from plab.config import build_scene
-    from plab.sim.memory import batch_limit, kept_states
-
     scene = build_scene(load_config(["task=Rope"]))
     limits = [batch_limit(scene, "float32", device, memory) for memory in (1.0, 4000.0, 8000.0, 40000.0)]
     assert limits[0] == 1 and limits == sorted(limits) and limits[1] >= 3 and limits[-1] > limits[1]
@@ -343,7 +237,39 @@ def test_full_size_batches_fit_the_memory(device: str) -> None:
     assert limits[1] * 2 > limits[2] - 2
 
 
-# ---------------------------------------------------------------- composition
+HERE = "_target_:hydra._internal.core_plugins.basic_launcher.BasicLauncher"
+"""Hydra's own launcher, whose jobs are of this process, as another launcher."""
+
+
+def test_another_launcher_gets_a_job_per_batch(sweep, monkeypatch) -> None:
+    sizes, intact = [], toy_runner.run_toy
+    monkeypatch.setattr(toy_runner, "run_toy", lambda batch: sizes.append(len(batch)) or intact(batch))
+    ended = sweep("seed=0,1,2", f"hydra.launcher.inner={{{HERE}}}", "hydra.launcher.batch_size=2")
+    assert ended[:2] == (0, {"runs": 3, "finished": 3})
+    assert sorted(sizes) == [1, 2]
+    assert_complete(configs())
+
+
+def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> None:
+    asked = []
+
+    def launch(jobs: list, initial_job_idx: int) -> None:
+        asked.append(len(jobs))
+        raise RuntimeError("nobody is there")
+
+    queue = SimpleNamespace(launch=launch)
+    launchers = SimpleNamespace(instantiate_launcher=lambda **settings: queue)
+    monkeypatch.setattr(plugin(), "Plugins", SimpleNamespace(instance=lambda: launchers))
+    code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:2}")
+    assert (code, counts) == (1, {"runs": 6, "not under way": 6})
+    assert asked == [2] and "RuntimeError: nobody is there" in lines[0]
+
+
+def compose(overrides: list[str]):
+    from hydra import compose, initialize_config_dir
+
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        return compose("config", overrides=overrides, return_hydra_config=True)
 
 
 JOBS = [
@@ -352,36 +278,23 @@ JOBS = [
     [["method=sac", "method.profile=paper"], ["method=sac", "method.profile=release"]],
     [["+experiment=yield_ablation", "task.yield_stress=10"], ["+experiment=yield_ablation"]],
     [["task.manipulators.left.size=[0.05]"], ["task.manipulators.left.size=[0.06]", "sim=reference"]],
-    [["+task.random.reach=0.3", "variant=random"], ["+task.random.reach=0.2", "variant=random"]],
 ]
 
 
 @pytest.mark.parametrize("jobs", JOBS, ids=lambda jobs: jobs[0][0])
 def test_jobs_are_composed_as_hydra_does(jobs: list[list[str]]) -> None:
-    assert compose_jobs(jobs, _compose) == [load_config(job) for job in jobs]
+    assert compose_jobs(jobs, compose) == [load_config(job) for job in jobs]
 
 
-def _compose(overrides: list[str]):
-    from hydra import compose, initialize_config_dir
-
-    from plab.config import conf_folder
-
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        return compose("config", overrides=overrides, return_hydra_config=True)
-
-
-REFUSED = [
-    ("seed=abc", "could not be converted to Integer"),
-    ("seed=-1", "seed must be at least 0"),
-    ("method.lr=0", "method.lr must be positive"),
-    ("method.lrr=0.1", "unknown key"),
-    ("task.target.radius=0.6", "the target reaches outside the domain"),
-    ("task=Ropee", "did you mean Rope?"),
-]
-
-
-@pytest.mark.parametrize(("override", "reason"), REFUSED, ids=[override for override, _ in REFUSED])
-def test_a_job_that_makes_no_sense_is_refused(override: str, reason: str) -> None:
-    good, bad = compose_jobs([["variant=1"], [override]], _compose)
-    assert isinstance(good, Config)
-    assert isinstance(bad, Refused) and reason in bad.reason and bad.overrides == (override,)
+def test_mistaken_jobs_are_refused_one_by_one() -> None:
+    wrong = {
+        "seed=-1": "seed",
+        "method.lr=0": "method.lr",
+        "method.lrr=0.1": "method.lrr",
+        "task=Ropee": "Ropee",
+    }
+    good, *bad = compose_jobs([["variant=1"], *([override] for override in wrong)], compose)
+    assert good == load_config(["variant=1"])
+    for one, (override, named) in zip(bad, wrong.items(), strict=True):
+        assert isinstance(one, Refused) and one.overrides == (override,)
+        assert named in one.reason and "\n" not in one.reason

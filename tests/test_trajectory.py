@@ -1,31 +1,34 @@
-"""Trajectory optimisation on a coarse scene: update rules, best actions, resumption, failures."""
+"""Methods that descend by the gradient on a coarse scene: rules, whole runs, resumption, logs."""
 
 from __future__ import annotations
 
-import subprocess
+import json
+import math
 import sys
-import time
-import weakref
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from plab.config import Config, ConfigError, build_scene, load_config
-from plab.families import FAMILIES
+from plab.autograd import policy_gradient
+from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
 from plab.objective import scores
 from plab.problem import Problem
-from plab.results import RunResult, read, result_path
+from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.reuse import SimulatorCache
-from plab.runners import RunError, run_config, trajectory
-from plab.runners.common import measures, shared_problem
+from plab.runners import RunError, apg, run_config, trajectory
+from plab.runners.common import measures, shared_problem, simulator_key
+from plab.runners.environments import shared_batches
+from plab.runners.loggers import RunLog
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
-from same_runs import KeepsAll, assert_same_numbers
+from same_runs import assert_same_numbers, finished_as, stopped_at
 
-CACHE = KeepsAll()
+CACHE = SimulatorCache()
 
 ITERATIONS = 4
 
@@ -66,18 +69,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
 # ---------------------------------------------------------------- update rules
 
 
-@pytest.fixture
-def method(tmp_path: Path):
-    return make_config(tmp_path).method
-
-
-def test_first_actions_are_uniform_and_follow_the_seed(method) -> None:
-    first = ActionSequence(method, 50, 6, seed=7).actions
-    assert first.shape == (50, 6) and first.dtype == np.float64
-    assert np.abs(first).max() <= method.action_init
-    assert np.abs(first).max() > 0.9 * method.action_init and abs(first.mean()) < 0.1 * method.action_init
-    assert np.array_equal(first, ActionSequence(method, 50, 6, seed=7).actions)
-    assert not np.array_equal(first, ActionSequence(method, 50, 6, seed=8).actions)
+@pytest.fixture(scope="module")
+def method() -> MethodConfig:
+    return load_config(COARSE).method
 
 
 @pytest.mark.parametrize("seed", [0, 7, 2**32 + 5])
@@ -101,63 +95,20 @@ def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
     np.testing.assert_allclose(moved(2.0, long), 0.1 * 0.4 * long, rtol=1e-5)
 
 
-def test_gd_is_momentum_on_weighted_gradients(method) -> None:
-    """v <- 0.9 v + 0.1 g from v = 0, the first step included; actions <- clip(actions - lr v)."""
-    actions = ActionSequence(replace(method, optimizer="gd", lr=0.5, momentum=0.9), 2, 2, seed=0)
-    gradients = [np.array([[1.0, -2.0], [0.5, 30.0]]), np.array([[3.0, 1.0], [0.0, 0.0]]), np.ones((2, 2))]
-    expected, v = actions.actions, np.zeros((2, 2))
-    for gradient in gradients:
-        actions.step(gradient)
-        v = 0.9 * v + 0.1 * gradient
-        expected = np.clip(expected - 0.5 * v, -1.0, 1.0)
-        np.testing.assert_allclose(actions.actions, expected, rtol=1e-14, atol=1e-16)
-    assert actions.actions[1, 1] == -1.0
-
-
-def test_adam_is_adam(method) -> None:
-    actions = ActionSequence(replace(method, optimizer="adam", lr=0.1), 1, 3, seed=0)
-    gradients = [np.array([[1.0, -2e-3, 1e-9]]), np.array([[-0.5, 4.0, 0.0]])]
-    expected, m, s = actions.actions, np.zeros((1, 3)), np.zeros((1, 3))
-    for step, gradient in enumerate(gradients, start=1):
-        actions.step(gradient)
-        m, s = 0.9 * m + 0.1 * gradient, 0.999 * s + 0.001 * gradient**2
-        expected = expected - 0.1 * (m / (1 - 0.9**step)) / (np.sqrt(s / (1 - 0.999**step)) + 1e-8)
-        np.testing.assert_allclose(actions.actions, expected, rtol=1e-12)
-
-
 @pytest.mark.parametrize("optimizer", ["adam", "gd"])
-def test_rules_are_torchs_optimisers(method, optimizer: str) -> None:
-    ours = ActionSequence(replace(method, optimizer=optimizer, lr=0.03, momentum=0.8), 5, 4, seed=0)
-    theirs = torch.tensor(ours.actions, requires_grad=True)
-    if optimizer == "adam":
-        rule: torch.optim.Optimizer = torch.optim.Adam([theirs], 0.03, method.betas, method.eps)
-    else:
-        rule = torch.optim.SGD([theirs], 0.03, momentum=0.8, dampening=0.8)
-        # torch takes the first gradient undampened.
-        rule.state[theirs]["momentum_buffer"] = torch.zeros_like(theirs)
-    rng = np.random.default_rng(0)
-    for _ in range(100):
+def test_rules_are_adam_and_momentum(method, optimizer: str) -> None:
+    """Adam as published; v <- m v + (1 - m) g from v = 0, actions <- actions - lr v."""
+    settings = replace(method, optimizer=optimizer, lr=0.1, momentum=0.8, betas=[0.9, 0.99], eps=1e-6)
+    actions, rng = ActionSequence(settings, 5, 4, seed=0), np.random.default_rng(0)
+    expected, m, s, v = actions.actions, *np.zeros((3, 5, 4))
+    for step in range(1, 101):
         gradient = rng.normal(size=(5, 4)) * 10.0 ** rng.integers(-6, 3)
-        ours.step(gradient)
-        theirs.grad = torch.tensor(gradient)
-        rule.step()
-        with torch.no_grad():
-            theirs.clamp_(-1.0, 1.0)
-        np.testing.assert_allclose(ours.actions, theirs.detach().numpy(), rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("optimizer", sorted(FAMILIES["trajectory"].rules))
-def test_restored_actions_go_on_alike(method, optimizer: str) -> None:
-    method = replace(method, optimizer=optimizer)
-    rng = np.random.default_rng(0)
-    one, other = ActionSequence(method, 3, 2, seed=0), ActionSequence(method, 3, 2, seed=1)
-    one.step(rng.normal(size=(3, 2)))
-    other.restore(one.state())
-    for _ in range(3):
-        gradient = rng.normal(size=(3, 2))
-        one.step(gradient)
-        other.step(gradient)
-        assert np.array_equal(one.actions, other.actions)
+        actions.step(gradient)
+        m, s, v = 0.9 * m + 0.1 * gradient, 0.99 * s + 0.01 * gradient**2, 0.8 * v + 0.2 * gradient
+        change = v if optimizer == "gd" else m / (1 - 0.9**step) / (np.sqrt(s / (1 - 0.99**step)) + 1e-6)
+        expected = np.clip(expected - 0.1 * change, -1.0, 1.0)
+        np.testing.assert_allclose(actions.actions, expected, rtol=1e-11, atol=1e-14)
+    assert np.abs(expected).max() == 1.0
 
 
 # ---------------------------------------------------------------- whole runs
@@ -171,6 +122,7 @@ def test_file_holds_the_whole_run(finished: RunResult) -> None:
     np.testing.assert_allclose(rows["loss"], terms @ [10.0, 10.0, 1.0], rtol=1e-12)
     # reward = T * initial loss - loss: their sum does not depend on the actions.
     np.testing.assert_allclose(rows["loss"] + rows["reward"], rows["loss"][0] + rows["reward"][0], rtol=1e-12)
+    assert rows["steps_gradient"].tolist() == [3, 6, 9, 12] and not rows["steps_forward"].any()
     judged = scores(finished.masses["initial"], finished.masses["final"], finished.masses["target"])
     assert finished.evaluation["score"] == judged.score
     assert finished.evaluation["iou"] == judged.iou_final
@@ -179,150 +131,124 @@ def test_file_holds_the_whole_run(finished: RunResult) -> None:
     assert finished.resume is None
 
 
-def test_best_actions_are_kept(tmp_path: Path) -> None:
-    # Steps this large overshoot, so that the last actions are not the best.
-    cfg = make_config(tmp_path, "method.lr=1.0", "method.iterations=5")
-    result = run(cfg)
-    best = int(result.iterations["loss"].argmin())
-    assert result.best_iteration == best
-    assert result.best_loss == result.iterations["loss"][best]
-    assert np.abs(result.best_actions).max() <= 1.0
-    problem = shared_problem(CACHE, [cfg])
-    problem.simulator.set_contact("soft", cfg.method.softness)
-    again = problem.rollout(result.best_actions[None], gradient=True)
-    assert again.loss.sum() == result.best_loss
-    assert again.scores[0].iou_final == pytest.approx(result.iterations["iou"][best], rel=1e-12)
-    problem.simulator.set_contact("hard")
+# With steps of 1 actions overshoot, so that the last are not the best.
+STEEP = ("method.lr=1.0", "method.iterations=8")
+
+
+@pytest.mark.parametrize("words", [STEEP, ("method=gd",), ("method=adam_h",)])
+def test_rows_are_those_of_the_rule_by_the_simulators_gradient(tmp_path: Path, words) -> None:
+    cfg = make_config(tmp_path, *words)
+    result, problem = run(cfg), shared_problem(CACHE, [cfg])
+    simulator = problem.simulator
+    simulator.set_contact(cfg.method.contact, cfg.method.softness)
+    sequence, tried, rows = ActionSequence(cfg.method, 3, 6, cfg.seed), [], result.iterations
+    for _, row in rows.iterrows():
+        tried.append(sequence.actions)
+        done = problem.rollout(sequence.actions[None], gradient=True)
+        assert (row["loss"], row["gradient_norm"]) == (done.loss.sum(), np.linalg.norm(done.gradient[0]))
+        assert done.scores[0].iou_final == pytest.approx(row["iou"], rel=1e-12)
+        sequence.step(done.gradient[0])
+    best = int(rows["loss"].argmin())
+    assert (result.best_iteration, result.best_loss) == (best, rows["loss"][best])
+    assert np.array_equal(result.best_actions, tried[best])
+    assert best < len(rows) - 1 or words != STEEP
+    simulator.set_contact("hard")
     hard = problem.rollout(result.best_actions[None], gradient=False)
     assert measures(hard) == result.evaluation
     assert np.array_equal(hard.final_mass[0], result.masses["final"])
+    # Only adam_h optimises in the model that judges.
+    same = result.evaluation["loss"] == pytest.approx(result.best_loss, rel=1e-12)
+    assert same == (cfg.method.contact == "hard") == ("method=adam_h" in words)
 
 
-def test_adam_h_rolls_out_in_the_hard_model(tmp_path: Path, finished: RunResult) -> None:
-    result = run(make_config(tmp_path, "method=adam_h"))
-    assert result.evaluation["loss"] == pytest.approx(result.best_loss, rel=1e-12)
-    assert finished.evaluation["loss"] != pytest.approx(finished.best_loss, rel=1e-12)
-
-
-def test_gd_runs(tmp_path: Path) -> None:
-    assert len(run(make_config(tmp_path, "method=gd")).iterations) == ITERATIONS
-
-
-def test_finished_run_is_not_repeated(tmp_path: Path, finished: RunResult, monkeypatch, capsys) -> None:
+def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypatch, capsys) -> None:
     cfg = make_config(Path(finished.config["results_dir"]))
     before = finished.path.stat().st_mtime_ns
-    monkeypatch.setattr(trajectory, "shared_problem", None)
-    assert run_config(cfg, CACHE) == finished.evaluation["score"]
+    with monkeypatch.context() as patch:
+        patch.setattr(trajectory, "shared_problem", None)
+        assert run_config(cfg, CACHE) == finished.evaluation["score"]
     assert finished.path.stat().st_mtime_ns == before
     out = capsys.readouterr().out
     assert out.count("\n") == 1
     assert str(finished.path) in out and f"{finished.evaluation['score']:.4f}" in out
-
-
-def test_the_next_variant_in_the_same_simulator_is_as_if_alone(tmp_path: Path) -> None:
-    first, other = (make_config(tmp_path, f"variant={variant}") for variant in (1, 3))
-    # Beside another simulator kernels would be compiled anew.
-    CACHE.clear()
-    cache = SimulatorCache()
-    run_config(first, cache)
-    kept = weakref.ref(shared_problem(cache, [first]).simulator)
-    assert kept().scenes[0] == build_scene(first)
-    run_config(other, cache)
-    assert shared_problem(cache, [other]).simulator is kept()
-    assert kept().scenes[0] == build_scene(other) != build_scene(first)
-    # Of another kind, hence a simulator of its own.
-    shared_problem(cache, [make_config(tmp_path, "sim.substeps=6")])
-    assert kept() is None
-    cache.clear()
-    alone = make_config(tmp_path / "alone", "variant=3")
-    run_config(alone, SimulatorCache())
-    assert_same_numbers(read(result_path(other)), read(result_path(alone)))
-
-
-def test_force_repeats_with_the_same_numbers(tmp_path: Path, finished: RunResult) -> None:
-    cfg = make_config(tmp_path)
-    result_path(cfg).parent.mkdir(parents=True)
-    result_path(cfg).write_bytes(finished.path.read_bytes())
-    before = result_path(cfg).stat().st_mtime_ns
+    # Another variant and material in the same simulator leave nothing behind.
+    other = make_config(cfg.results_dir, "variant=3", "task.yield_stress=20")
+    simulator = shared_problem(CACHE, [cfg]).simulator
+    assert simulator.scenes[0] == build_scene(cfg) != build_scene(other)
+    assert run(other).iterations["loss"][0] != finished.iterations["loss"][0]
+    assert shared_problem(CACHE, [other]).simulator is simulator
+    assert simulator.scenes[0] == build_scene(other)
     assert_same_numbers(run(replace(cfg, force=True)), finished)
-    assert result_path(cfg).stat().st_mtime_ns > before
+    assert finished.path.stat().st_mtime_ns > before
+
+
+def test_another_kind_of_scene_has_a_simulator_of_its_own(tmp_path: Path) -> None:
+    words = [
+        "sim.substeps=6",
+        "sim.particles_scale=0.04",
+        "sim.precision=float32",
+        "method.loss_weights.sdf=0",
+    ]
+    cfgs = [make_config(tmp_path, word) for word in ("seed=1", *words)]
+    assert len({simulator_key(cfg, build_scene(cfg)) for cfg in cfgs}) == 5
+
+
+def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
+    cache, made = SimulatorCache(), iter(range(9))
+
+    def get(key: str, error: type[Exception] | None = None) -> int:
+        return cache.get(key, lambda: next(made), check=Mock(side_effect=error))
+
+    assert [get("a"), get("a"), get("b"), get("a"), get("a", RuntimeError), get("a")] == [0, 0, 1, 2, 3, 3]
+    with pytest.raises(ValueError):
+        get("a", ValueError)
+    cache.clear()
+    assert get("a") == 4
 
 
 # ---------------------------------------------------------------- interruptions, failures
 
 
-def break_rollout(monkeypatch: pytest.MonkeyPatch, at: int, what) -> None:
-    """Let the rollouts from number ``at`` on go through ``what``."""
-    intact, calls = Problem.rollout, iter(range(1_000))
+def break_rollout(monkeypatch: pytest.MonkeyPatch, where: type, at: int, error: BaseException) -> None:
+    """Raise an error instead of a rollout, counted from 0."""
+    intact, calls = where.rollout, iter(range(1_000))
 
     def rollout(self, actions, **options):
-        result = intact(self, actions, **options)
-        return what(result) if next(calls) >= at else result
+        if next(calls) >= at:
+            raise error
+        return intact(self, actions, **options)
 
-    monkeypatch.setattr(Problem, "rollout", rollout)
-
-
-def _raise(error: BaseException):
-    raise error
+    monkeypatch.setattr(where, "rollout", rollout)
 
 
-@pytest.mark.parametrize("at", [1, 3, ITERATIONS], ids=["early", "late", "evaluation"])
-def test_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, finished, monkeypatch, at: int) -> None:
+@pytest.mark.parametrize(
+    ("at", "error", "status", "message"),
+    [
+        (1, OSError, "failed", "OSError: gone"),
+        (2, KeyboardInterrupt, "stopped", "interrupted"),
+        # In the final evaluation.
+        (ITERATIONS, OSError, "failed", "OSError: gone"),
+    ],
+)
+def test_resumed_run_equals_an_uninterrupted_one(
+    tmp_path: Path, finished, monkeypatch, at: int, error: type, status: str, message: str
+) -> None:
     cfg = make_config(tmp_path)
-    with monkeypatch.context() as patch:
-        break_rollout(patch, at, lambda _: _raise(OSError("gone")))
-        with pytest.raises(OSError, match="gone"):
-            run_config(cfg, CACHE)
+    with monkeypatch.context() as patch, pytest.raises(error):
+        break_rollout(patch, Problem, at, error("gone"))
+        run_config(cfg, CACHE)
     left = read(result_path(cfg).with_suffix(".partial.h5"))
-    assert (left.status, left.message, len(left.iterations)) == ("failed", "OSError: gone", at)
+    assert (left.status, left.message, len(left.iterations)) == (status, message, at)
     resumed = run(cfg)
     assert_same_numbers(resumed, finished)
     assert resumed.provenance["resumed"] == 1
     assert not result_path(cfg).with_suffix(".partial.h5").exists()
 
 
-def test_interrupt_keeps_the_partial_and_is_passed_on(tmp_path: Path, finished, monkeypatch) -> None:
+@pytest.mark.parametrize(("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)])
+def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: type, raised: type) -> None:
     cfg = make_config(tmp_path)
-    with monkeypatch.context() as patch:
-        break_rollout(patch, 2, lambda _: _raise(KeyboardInterrupt()))
-        with pytest.raises(KeyboardInterrupt):
-            run_config(cfg, CACHE)
-    left = read(result_path(cfg).with_suffix(".partial.h5"))
-    assert (left.status, len(left.iterations)) == ("stopped", 2)
-    assert_same_numbers(run(cfg), finished)
-
-
-def test_run_killed_at_a_random_moment_resumes_to_the_same_numbers(tmp_path: Path, finished) -> None:
-    cfg = make_config(tmp_path)
-    partial = result_path(cfg).with_suffix(".partial.h5")
-    command = [sys.executable, "-m", "plab.run", *COARSE, f"results_dir={tmp_path}", "checkpoint_seconds=0"]
-    process = subprocess.Popen(command)
-    try:
-        while not partial.exists() and process.poll() is None:
-            time.sleep(0.001)
-        # Somewhere in the iterations that follow the first.
-        time.sleep(np.random.default_rng().uniform(0.0, finished.iterations["seconds"][1:].sum()))
-    finally:
-        process.kill()
-        process.wait()
-    assert_same_numbers(run(cfg), finished)
-
-
-@pytest.mark.parametrize(
-    ("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)], ids=["state", "memory"]
-)
-def test_a_rollout_that_fails_ends_the_run(
-    tmp_path: Path, monkeypatch, error: type[Exception], raised: type[Exception]
-) -> None:
-    cfg = make_config(tmp_path)
-    intact, calls = Simulator.rollout, iter(range(1_000))
-
-    def rollout(self, actions, **options):
-        if next(calls) == 2:
-            raise error("environment 0, step 2: position is nan")
-        return intact(self, actions, **options)
-
-    monkeypatch.setattr(Simulator, "rollout", rollout)
+    break_rollout(monkeypatch, Simulator, 2, error("environment 0, step 2: position is nan"))
     with pytest.raises(raised) as caught:
         run_config(cfg, CACHE)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"
@@ -331,9 +257,145 @@ def test_a_rollout_that_fails_ends_the_run(
     assert left.best_actions is not None
 
 
-def test_progress_is_plain_lines_without_a_terminal(tmp_path: Path, capsys) -> None:
-    run_config(replace(make_config(tmp_path), progress=True), CACHE)
-    # Taichi has lines of its own to say.
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Rope-v1")]
-    assert len(lines) == 2
-    assert lines[1].startswith(f"Rope-v1 adam seed 0 {ITERATIONS}/{ITERATIONS}, 0:00:00 left, loss ")
+# ---------------------------------------------------------------- logs
+
+
+def assert_rows_are_shown(result: RunResult) -> None:
+    """Assert that TensorBoard shows each row and the final evaluation once."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(result.path.with_suffix(".tensorboard")), {"scalars": 0}).Reload()
+    got = {name: [(e.step, e.value) for e in events.Scalars(name)] for name in events.Tags()["scalars"]}
+    rows = result.iterations
+    for name in set(rows) - {"iteration", "steps"}:
+        finite = rows[rows[name].map(math.isfinite)]
+        assert [step for step, _ in got.get(name, [])] == list(finite["steps"])
+        np.testing.assert_allclose([value for _, value in got.get(name, [])], finite[name], rtol=1e-6)
+    last = int(rows["steps"].iloc[-1]) + 3
+    for name, value in result.evaluation.items():
+        ((step, shown),) = got[f"final/{name}"]
+        assert step == last and shown == pytest.approx(value, rel=1e-6)
+
+
+def test_tensorboard_shows_the_rows_as_one_curve(finished, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("tensorboard")
+    cfg = make_config(tmp_path, "logger=tensorboard", "checkpoint_seconds=1e6")
+    # Killed in the third iteration: the file has the first alone, the log has the second, too.
+    with monkeypatch.context() as patch, stopped_at(2):
+        patch.setattr(RunFile, "close", lambda run, *_: run.release())
+        run_config(cfg, CACHE)
+    result = run(cfg)
+    assert result.provenance["resumed"] == 1
+    assert_rows_are_shown(result)
+    finished_as(cfg, finished)
+
+
+def test_a_log_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    cfg = make_config(tmp_path, "logger=tensorboard")
+    folder = result_path(cfg).with_suffix(".tensorboard")
+    folder.parent.mkdir(parents=True)
+    folder.write_text("no folder")
+    with pytest.raises(ResultsError, match="logger=tensorboard fails: ") as caught:
+        run_config(cfg, CACHE)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatch) -> None:
+    began, logged = [], []
+    log = SimpleNamespace(log=logged.append, define_metric=lambda *_, **__: None, finish=lambda: None)
+
+    def init(**options):
+        began.append(options)
+        if options["project"] == "closed":
+            raise OSError("no\nanswer")
+        return log
+
+    fake = SimpleNamespace(init=init, Settings=dict, Error=OSError)
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    monkeypatch.delenv("WANDB_PROJECT", raising=False)
+    cfg = make_config(tmp_path, "logger=wandb")
+    run = SimpleNamespace(path=result_path(cfg), result=SimpleNamespace(config={"seed": 0}))
+    given = RunLog(cfg, run)
+    assert given.wanted and not began
+    given.write({"loss": 1.5, "score": math.nan}, 8)
+    given.write({"loss": 1.0}, 12)
+    assert logged == [{"loss": 1.5, "steps": 8}, {"loss": 1.0, "steps": 12}]
+    (options,) = began
+    name = f"Rope-v1-adam-{result_path(cfg).stem}"
+    assert (options["project"], options["name"], options["id"]) == ("plab", name, name)
+    assert (options["dir"], options["config"], options["resume"]) == (str(tmp_path), {"seed": 0}, "allow")
+    monkeypatch.setenv("WANDB_PROJECT", "closed")
+    with pytest.raises(ResultsError, match=r"^logger=wandb fails: no answer .*WANDB_MODE.*logger=none"):
+        RunLog(cfg, run).write({"loss": 1.0}, 0)
+    quiet = RunLog(replace(cfg, logger="none"), run)
+    quiet.write({"loss": 1.0}, 0)
+    assert not quiet.wanted and len(began) == 2
+
+
+@pytest.mark.nightly
+def test_wandb_gets_the_rows(tmp_path: Path, monkeypatch) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    wandb.teardown()
+    result = run(make_config(tmp_path, "logger=wandb"))
+    # Its own process writes the files.
+    wandb.teardown()
+    name = f"Rope-v1-adam-{result.path.stem}"
+    written = next((tmp_path / "wandb").glob(f"offline-run-*/run-{name}.wandb")).read_bytes()
+    for value in (*result.iterations["loss"], *result.evaluation.values()):
+        assert json.dumps(value).encode() in written
+
+
+def test_the_logger_is_no_part_of_the_hash(tmp_path: Path) -> None:
+    cfgs = [make_config(tmp_path, f"logger={name}") for name in ("none", "tensorboard", "wandb")]
+    assert len(set(map(result_path, cfgs))) == 1
+    with pytest.raises(ConfigError, match="logger 'mlflow'"):
+        make_config(tmp_path, "logger=mlflow")
+
+
+# ---------------------------------------------------------------- policies: apg
+
+
+APG = ("method=apg", "method.hidden=[16,16]", "method.lr=0.01")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    """An uninterrupted run of apg."""
+    return run(make_config(tmp_path_factory.mktemp("apg"), *APG))
+
+
+def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_path: Path) -> None:
+    rows, cfg = trained.iterations, make_config(tmp_path, *APG)
+    assert rows["steps"].tolist() == [3 * i for i in range(ITERATIONS)]
+    assert not rows["steps_forward"].any()
+    assert rows["steps_gradient"].tolist() == [3 * (i + 1) for i in range(ITERATIONS)]
+    (batch,) = shared_batches(CACHE, ([cfg], 1, cfg.method.contact))
+    sizes = *batch.observation_space.shape, 6
+    policy = apg.PolicyTraining(cfg.method, *sizes, cfg.seed, torch.device("cpu")).policy
+    adam = torch.optim.Adam(policy.parameters(), 0.01)
+    for _, row in rows.iterrows():
+        first = batch.reset()[1]["loss"][0]
+        adam.zero_grad()
+        done = policy_gradient(batch, policy, 3)
+        norm = torch.cat([one.grad.flatten() for one in policy.parameters()]).norm()
+        assert row["loss"] == done.loss.double().sum()
+        assert row["reward"] == pytest.approx(3 * first - row["loss"], rel=1e-6)
+        assert row["loss_sdf"] == pytest.approx(float(done.terms[:, 0, 1].sum()), rel=1e-6)
+        assert row["gradient_norm"] == pytest.approx(float(norm), rel=1e-6)
+        adam.step()
+    assert rows["loss"].iloc[-1] < rows["loss"].iloc[0]
+    assert trained.best_loss == rows["loss"].min()
+    judged = scores(trained.masses["initial"], trained.masses["final"], trained.masses["target"])
+    assert trained.evaluation["score"] == judged.score
+
+
+def test_apg_resumes_to_the_same_numbers(tmp_path: Path, trained: RunResult, monkeypatch) -> None:
+    cfg = make_config(tmp_path, *APG)
+    with stopped_at(2, apg, "policy_gradient"):
+        run_config(cfg, CACHE)
+    assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
+    again = run(cfg)
+    assert_same_numbers(again, trained)
+    assert again.provenance["resumed"] == 1

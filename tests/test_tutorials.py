@@ -1,4 +1,4 @@
-"""What the tutorials show is what happens: their code is run, their excerpts and changes are the source's."""
+"""Tutorials: their Python code is run once, their excerpts and changes are the source's."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from typing import Any
 
 import pytest
 
+import plab.problem
+import plab.sim
+import synthetic
 from plab.config import Config, load_config
 from plab.results import RunResult, load, read
 from plab.runners import run_config
-from same_runs import stopped_at
+from same_runs import KeepsAll, stopped_at
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -25,6 +28,7 @@ METHOD = ROOT / "examples" / "own_method"
 RL = ROOT / "examples" / "own_rl"
 SMALL = ("sim.grid_size=32", "sim.substeps=10", "sim.dt=2e-4", "sim.particles_scale=0.05")
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
+CACHE = KeepsAll()
 
 # Run in a copy of plab that has the disc: the gradient must be what differences are.
 DISC = """
@@ -56,11 +60,9 @@ assert (np.abs(gradient).max(axis=(0, 1)) > 1e-3 * np.abs(gradient).max()).all()
 slope = (gradient * direction).sum()
 # Nodes come into reach of contact and leave it: over longer ways the loss has jumps.
 difference = (loss(1e-6) - loss(-1e-6)) / 2e-6
-assert abs(difference) > 1e-3, difference
-assert abs(slope - difference) < 1e-6 * abs(difference), (slope, difference)
+assert abs(difference) > 1e-3 and abs(slope - difference) < 1e-6 * abs(difference), (slope, difference)
 (part,) = manipulator_parts(tool)
 assert np.abs(part.vertices[:, 1]).max() < 0.0301 and 0.089 < np.abs(part.vertices[:, 0]).max() < 0.0901
-print("as it should be")
 """
 
 
@@ -78,12 +80,12 @@ def run_page(page: str, *changes: tuple[str, str]) -> dict[str, Any]:
     return names
 
 
-# -------------------------------------------------------------------------------------------- run as they are
+# --------------------------------------------------------------------------------------- run as they are
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What a page composes is coarse, unless it says otherwise, and on the CPU; the folder is empty."""
+    """Compose coarse configurations on the CPU; keep simulators from one page to the next."""
 
     def coarse(overrides: Sequence[str] = (), config_dir: str | None = None) -> Config:
         words = [word for word in overrides if word != "sim.device=cuda"]
@@ -91,40 +93,47 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         less = (word for word in SMALL if word.partition("=")[0] not in given)
         return load_config([*words, *less], config_dir)
 
+    def kept(scenes: Sequence[Any], terms: Sequence[Any], **options: Any) -> plab.sim.Simulator:
+        key = repr((scenes, [term.name for term in terms]))
+        return CACHE.get(key, lambda: build(scenes, terms=terms, **options), check=build.state)
+
+    build = plab.sim.Simulator
     monkeypatch.chdir(tmp_path)
     for module in ("plab.config", "plab.envs.core"):
         monkeypatch.setattr(f"{module}.load_config", coarse)
+    for module in ("plab.sim", "plab.problem"):
+        monkeypatch.setattr(f"{module}.Simulator", kept)
 
 
-def test_quick_start():
-    assert run_page("index.md")["result"].gradient.shape == (4, 10, 6)
+FEWER = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
+"""Four environments instead of many."""
 
 
 @pytest.mark.usefixtures("small")
-def test_readme():
-    names = run_page("../README.md")
-    assert names["result"].gradient.shape == (4, 10, 6) and names["envs"].num_envs == 64
+@pytest.mark.parametrize(("page", "changes"), [("index.md", []), ("../README.md", FEWER[:1])])
+def test_quick_start_and_readme(page, changes):
+    names = run_page(page, *changes)
+    assert names["result"].gradient.shape == (4, 10, 6)
+    assert names.get("envs") is None or names["envs"].num_envs == 4
 
 
 @pytest.mark.usefixtures("small")
 def test_environments():
-    """With four environments instead of 64 or 16, and one update of the agent."""
-    fewer = [(f"num_envs={number}", "num_envs=4") for number in (64, 16)]
-    fewer += [("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200")]
-    names = run_page("environments.md", *fewer)
+    """With one update of the agent."""
+    names = run_page("environments.md", *FEWER, ("] * 64", "] * 4"), ("(64,", "(4,"), ("100_000", "200"))
     assert names["info"]["score"] >= 0.0
     assert names["infos"]["final_info"]["score"].shape == (4,)
     assert names["model"].num_timesteps == 200
     assert names["done"].reward.shape == (4,) and names["done"].truncated
 
 
-@pytest.mark.usefixtures("small")
-def test_results(monkeypatch):
+def test_results(monkeypatch, tmp_path):
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    run_config(load_config(["task=Move", *SMALL, "sim.horizon=5", "method.iterations=2", "progress=false"]))
+    monkeypatch.chdir(tmp_path)
+    synthetic.save(synthetic.run(tmp_path / "results", task="Move"))
     names = run_page("results.md")
     assert len(names["table"]) == 1 and names["table"]["task.yield_stress"].notna().all()
-    assert len(names["run"].iterations) == 2
+    assert len(names["run"].iterations) == synthetic.ROWS
 
 
 @pytest.mark.usefixtures("small")
@@ -134,22 +143,20 @@ def test_rendering():
     assert run_page("rendering.md")["picture"].shape == (360, 480, 3)
 
 
-# -------------------------------------------------------------------------------------------- own method
+# --------------------------------------------------------------------------------------------- own method
 
 
 @pytest.mark.parametrize("excerpt", [*blocks("own_method.md", "python"), *blocks("own_method.md", "yaml")])
 def test_excerpts_are_from_the_methods(excerpt):
     files = [path for folder in (METHOD, RL) for path in folder.rglob("*.*")]
-    assert any(
-        excerpt in file.read_text(encoding="utf-8") for file in files if file.suffix in (".py", ".yaml")
-    )
+    sources = [file for file in files if file.suffix in (".py", ".yaml")]
+    assert any(excerpt in file.read_text(encoding="utf-8") for file in sources)
 
 
-def plab(folder: Path, *words: str, path: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run one of plab's command lines in a folder, perhaps with another one where modules are found."""
-    found = [str(path)] if path else []
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*found, str(SRC)])}
-    command = [sys.executable, "-m", *words]
+def python(folder: Path, *words: str, path: Path = SRC) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder, with modules of a source tree."""
+    environment = os.environ | {"PYTHONPATH": str(path)}
+    command = [sys.executable, *words]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
@@ -157,25 +164,33 @@ SEARCH = ("--config-dir", str(METHOD / "conf"), "method=random_search", *COARSE,
 
 
 def test_a_method_of_ones_own(tmp_path):
-    first = plab(tmp_path, "plab.run", *SEARCH)
-    assert (first.returncode, first.stderr) == (0, "")
+    done = python(tmp_path, "-m", "plab.run", "-m", *SEARCH, "seed=0,1")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
     table = load(tmp_path / "results", keys=["method.family"])
     columns = ["method", "status", "iterations", "method.family"]
-    assert table[columns].values.tolist() == [["random_search", "finished", 4, "random_search:FAMILY"]]
-    # Whoever reads the results may have the module or not.
-    for path in (None, METHOD):
-        assert plab(tmp_path, "plab.results", "check", "results", path=path).returncode == 0
-    seen = plab(tmp_path, "plab.status", "results", "method=random_search", "--csv")
-    assert seen.returncode == 0 and "random_search" in seen.stdout
-    refused = plab(tmp_path, "plab.run", *SEARCH, "method.spread=0")
-    assert refused.returncode == 2 and refused.stderr == "plab: method.spread must be positive, not 0\n"
+    assert table[columns].values.tolist() == [["random_search", "finished", 4, "random_search:FAMILY"]] * 2
+    # Whoever reads the results need not have the module.
+    assert python(tmp_path, "-m", "plab.results", "check", "results").returncode == 0
+    refused = python(tmp_path, "-m", "plab.run", *SEARCH, "method.spread=0")
+    assert refused.returncode == 2 and refused.stderr.startswith("plab: method.spread")
+    assert refused.stderr.count("\n") == 1
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_other_processes_find_the_module_of_a_method(tmp_path, launcher):
+    pytest.importorskip(launcher.partition("_")[0])
+    words = ("seed=0,1", f"hydra/launcher=batch_{launcher}")
+    done = python(tmp_path, "-m", "plab.run", "-m", *SEARCH, *words)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
 
 
 def test_an_interrupted_search_goes_on(tmp_path):
     def result(folder: str) -> RunResult:
-        run_config(
-            load_config([*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"], SEARCH[1])
-        )
+        words = [*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"]
+        run_config(load_config(words, SEARCH[1]), CACHE)
         (path,) = (tmp_path / folder).rglob("*.h5")
         return read(path)
 
@@ -186,16 +201,6 @@ def test_an_interrupted_search_goes_on(tmp_path):
     assert parts.provenance["resumed"] == 1
     assert parts.iterations["loss"].tolist() == whole.iterations["loss"].tolist()
     assert parts.evaluation == whole.evaluation
-
-
-@pytest.mark.parametrize("launcher", ["batch", "batch_joblib", "batch_submitit_local"])
-def test_a_sweep_over_a_method_of_ones_own(tmp_path, launcher):
-    """In this process, and in others, which have to find the module, too."""
-    if launcher != "batch":
-        pytest.importorskip(launcher.split("_")[1])
-    done = plab(tmp_path, "plab.run", "-m", *SEARCH, "seed=0,1", f"hydra/launcher={launcher}")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
 
 
 # -------------------------------------------------------------------------------------------- own manipulator
@@ -213,37 +218,21 @@ def apply(page: str, root: Path) -> None:
         path.write_text(text.replace(old, new), encoding="utf-8")
 
 
-def copy_with_the_disc(folder: Path) -> Path:
-    shutil.copytree(SRC, folder / "src", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "conf", folder / "conf")
-    apply("developers/own_manipulator.md", folder)
-    return folder / "src"
+@pytest.fixture
+def with_the_disc(tmp_path) -> Path:
+    """A copy of the source tree with the page's changes."""
+    shutil.copytree(SRC, tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "conf", tmp_path / "conf")
+    apply("developers/own_manipulator.md", tmp_path)
+    return tmp_path / "src"
 
 
-def test_the_changes_for_a_manipulator_fit_the_source(tmp_path):
-    source = copy_with_the_disc(tmp_path)
+def test_the_changes_for_a_manipulator_fit_the_source(tmp_path, with_the_disc):
     code = "from plab.scene import MANIPULATOR_SHAPES; print(MANIPULATOR_SHAPES['Disc'].size_names)"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": str(source)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == "('radius', 'r')\n"
+    assert python(tmp_path, "-c", code, path=with_the_disc).stdout == "('radius', 'r')\n"
 
 
 @pytest.mark.nightly
-def test_a_manipulator_of_ones_own(tmp_path):
-    source = copy_with_the_disc(tmp_path)
-    script = tmp_path / "disc.py"
-    script.write_text(DISC, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        env=os.environ | {"PYTHONPATH": str(source)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_a_manipulator_of_ones_own(tmp_path, with_the_disc):
+    done = python(tmp_path, "-c", DISC, path=with_the_disc)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("as it should be\n")

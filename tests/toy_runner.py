@@ -1,41 +1,50 @@
-"""A runner that takes no time, for tests of what is around the runners: files, locks, sweeps, kills.
-
-Each run follows a sequence of numbers that its configuration alone determines, and keeps in its file what the
-next number depends on: a run that lost, repeated or mixed up an iteration ends with other numbers.
+"""Runner without a simulation. Each loss follows from the state in the partial file, the first state from the
+configuration: a run that lost, repeated or mixed up an iteration ends with other numbers.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from plab.config import Config
-from plab.families import FAMILIES, Family
-from plab.results import RunResult, config_hash, result_path
+from plab.config import Config, load_config
+from plab.families import FAMILIES
+from plab.results import config_hash, read, result_path
 from plab.runners import Runner
 from plab.runners.jobs import Job, RunError
 
-ITERATIONS = 12
+COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
+ITERATIONS = 12
 PAUSE = 0.0
-"""Time that an iteration of a batch takes [s]."""
+"""Time of an iteration of a batch [s]."""
 
 FAILING_SEED = 13
-"""Runs with this seed break off in iteration 3."""
+WHY = "iteration 3: environment step 1: the loss is not finite"
+"""Message of the runs with this seed, which break off in iteration 3."""
 
 
-def start(cfg: Config) -> np.ndarray:
-    return np.frombuffer(hashlib.sha256(config_hash(cfg).encode()).digest(), np.uint32).astype(np.float64)
+def install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replace the runners of all families."""
+    for name, family in FAMILIES.items():
+        monkeypatch.setitem(FAMILIES, name, replace(family, runner=ToyRunner, population=ToyRunner))
 
 
-def advance(state: np.ndarray) -> np.ndarray:
-    return np.modf(np.sin(state) * 1e4)[0]
+@cache
+def _composed(*overrides: str) -> Config:
+    return load_config(overrides)
+
+
+def configs(*overrides: str, seeds: Sequence[int] = (0, 1, 2)) -> list[Config]:
+    """Compose one run per seed."""
+    return [_composed(*COARSE, f"seed={seed}", *overrides) for seed in seeds]
 
 
 def expected(cfg: Config) -> list[float]:
@@ -47,49 +56,56 @@ def expected(cfg: Config) -> list[float]:
     return losses
 
 
-def is_right(result: RunResult, cfg: Config) -> bool:
-    """Whether a finished file holds what its run gives if nothing disturbs it."""
-    return (
-        result.status == "finished"
-        and result.config_hash == config_hash(cfg)
-        and result.iterations["iteration"].tolist() == list(range(ITERATIONS))
-        and result.iterations["loss"].tolist() == expected(cfg)
-        and result.evaluation["score"] == abs(expected(cfg)[-1]) % 1.0
-    )
+def computed() -> list[str]:
+    """Return the name of each result that a process has begun to compute, in order."""
+    log = Path("results/log")
+    return log.read_text().splitlines() if log.exists() else []
 
 
-def run_toy(jobs: Sequence[Job], note: str = "") -> None:
-    """The runner; appends a line per computed run and process to ``log`` in the results folder."""
+def assert_complete(cfgs: Sequence[Config]) -> None:
+    """Assert that each result is there and right, and no other file."""
+    for cfg in cfgs:
+        result = read(result_path(cfg))
+        assert result.status == "finished" and result.config_hash == config_hash(cfg)
+        assert result.iterations["iteration"].tolist() == list(range(ITERATIONS))
+        assert result.iterations["loss"].tolist() == expected(cfg)
+        assert result.evaluation["score"] == abs(expected(cfg)[-1]) % 1.0
+    files = {path for path in Path("results").rglob("*") if path.is_file()}
+    assert files == {result_path(cfg) for cfg in cfgs} | {Path("results/log")}
+
+
+def start(cfg: Config) -> np.ndarray:
+    """Return the state before the first iteration."""
+    return np.frombuffer(hashlib.sha256(config_hash(cfg).encode()).digest(), np.uint32).astype(np.float64)
+
+
+def advance(state: np.ndarray) -> np.ndarray:
+    """Return the next state."""
+    return np.modf(np.sin(state) * 1e4)[0]
+
+
+def run_toy(jobs: Sequence[Job]) -> None:
+    """Carry out a batch, and append the name of each result to ``log`` in the results folder."""
     for job in jobs:
-        log = Path(job.cfg.results_dir) / "log"
-        with log.open("a") as file:
-            file.write(f"{os.getpid()} {len(jobs)} {note.strip()} {result_path(job.cfg).name}\n")
+        with (Path(job.cfg.results_dir) / "log").open("a") as file:
+            file.write(f"{result_path(job.cfg).name}\n")
     states = [start(job.cfg) if job.run.result.resume is None else job.run.result.resume["x"] for job in jobs]
-    while active := [k for k, job in enumerate(jobs) if job.open and _count(job) < ITERATIONS]:
+    while active := [k for k, job in enumerate(jobs) if job.open and job.run.result.rows < ITERATIONS]:
         time.sleep(PAUSE)
         for k in active:
-            job, iteration = jobs[k], _count(jobs[k])
+            job, iteration = jobs[k], jobs[k].run.result.rows
             if job.cfg.seed == FAILING_SEED and iteration == 3:
-                job.fail(RunError("iteration 3: environment step 1: the loss is not finite"))
+                job.fail(RunError(WHY))
                 continue
             states[k] = advance(states[k])
             job.run.record({"iteration": iteration, "loss": float(states[k].sum())}, {"x": states[k].copy()})
     for job in jobs:
         if job.open:
-            job.run.finish({"score": abs(float(job.run.result.iterations["loss"].iloc[-1])) % 1.0}, {})
+            job.run.finish({"score": abs(float(job.run.result.columns["loss"][-1])) % 1.0}, {})
 
 
 class ToyRunner(Runner):
-    """What a family names; :func:`run_toy` may be replaced."""
+    """Runner of a family; tests may replace :func:`run_toy`."""
 
     def run(self) -> None:
-        run_toy([track.job for track in self.tracks], self._note)
-
-
-def toy_family(name: str) -> Family:
-    """Return one of plab's families with this runner."""
-    return replace(FAMILIES[name], runner=ToyRunner, population=ToyRunner)
-
-
-def _count(job: Job) -> int:
-    return len(job.run.result.iterations)
+        run_toy([track.job for track in self.tracks])

@@ -1,10 +1,10 @@
-"""Mutation test of the test suite: each fault of mutants.yaml is put into a copy of plab, and the tests have to find it.
+"""Mutation test of the test suite: the tests have to find each of the faults in mutants.yaml.
 
-    python tools/mutation.py --jobs 2 --out tools/mutants_found.csv     # all of them; takes hours on two cores
-    python tools/mutation.py --only 3,17                                # two of them, by number
+    python tools/mutation.py --log build/mutation.csv          # all faults; takes hours on two cores
+    python tools/mutation.py --log build/mutation.csv --only 3,17
 
-A fault is found by the first test that fails with it and passes without it. Test files run in the order in which they mention the faulty
-module, each in a process of its own, as `make test` selects them.
+A fault is found by a test that fails with it and passes without it. Test files run one process each, those
+first that mention the faulty module most. The log has a row per fault and file; a second call resumes from it.
 """
 
 from __future__ import annotations
@@ -19,151 +19,161 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 
 ROOT = Path(__file__).parents[1]
 COPIED = ("src", "tests", "conf", "docs", "examples", "reports", "tools", "benchmarks")
+HEADER = ("number", "area", "file", "tests", "found_by", "seconds")
 
 
-def copy(root: Path, to: Path) -> None:
-    """Copy a checkout without its environment, its history and its results, by hard links."""
+def mutated_copy(root: Path, to: Path, mutant: dict[str, str]) -> None:
+    """Copy a checkout by hard links and put a fault into it; ValueError unless its text occurs once."""
     to.mkdir(parents=True)
-    for name in COPIED:
-        if (root / name).exists():
-            ignore = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(root / name, to / name, copy_function=os.link, ignore=ignore)
-    for path in root.iterdir():
-        if path.is_file():
-            os.link(path, to / path.name)
-
-
-def mutate(folder: Path, mutant: dict[str, str]) -> None:
-    """Write the fault into a copy; ValueError unless the faulty text is there exactly once."""
-    path = folder / mutant["file"]
+    for name in filter(lambda name: (root / name).exists(), COPIED):
+        ignore = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(root / name, to / name, copy_function=os.link, ignore=ignore)
+    for path in filter(Path.is_file, root.iterdir()):
+        os.link(path, to / path.name)
+    path = to / mutant["file"]
     text = path.read_text(encoding="utf-8")
     if text.count(mutant["old"]) != 1:
-        raise ValueError(f"{mutant['file']}: {text.count(mutant['old'])} times: {mutant['old']}")
+        raise ValueError(f"{mutant['file']} must have this text once: {mutant['old']}")
     path.unlink()
     path.write_text(text.replace(mutant["old"], mutant["new"]), encoding="utf-8")
 
 
-def ordered(folder: Path, file: str) -> list[Path]:
-    """Return the test files, those first that mention a module most."""
-    parts = Path(file).with_suffix("").parts[1:]
-    stem, package = parts[-1], parts[-2]
+def by_relevance(root: Path, file: str, first: list[str]) -> list[str]:
+    """Return the test files: those named, then those that mention a module most."""
+    package, stem = Path(file).with_suffix("").parts[-2:]
 
     def mentions(path: Path) -> int:
         text = path.read_text(encoding="utf-8")
         named = 20 * (stem in path.stem) + 8 * (package in path.stem)
         return named + 5 * len(re.findall(rf"\b{stem}\b", text)) + len(re.findall(rf"\b{package}\b", text))
 
-    return sorted((folder / "tests").rglob("test_*.py"), key=lambda path: (-mentions(path), path.name))
+    paths = sorted((root / "tests").rglob("test_*.py"), key=lambda path: (-mentions(path), path.name))
+    names = [str(path.relative_to(root)) for path in paths]
+    return sorted(names, key=lambda name: first.index(name) if name in first else len(first))
 
 
+@dataclass
 class Suite:
-    """Runs test files of a copy in processes of their own."""
+    """The tests of a checkout, run a file at a time in processes that stay on a core each."""
 
-    def __init__(self, marks: str, seconds: float, pin: bool) -> None:
-        """Keep the marks to select by, the time limit of a file [s], and whether jobs stay on one core."""
-        self.marks, self.seconds = marks, seconds
-        self.cores: queue.Queue[int] = queue.Queue()
+    root: Path
+    marks: str
+    known: list[str]
+    seconds: float
+    cores: queue.Queue[int] = field(default_factory=queue.Queue)
+
+    def __post_init__(self) -> None:
         for core in sorted(os.sched_getaffinity(0)):
             self.cores.put(core)
-        self.pin = pin
 
-    def fails(self, folder: Path, tests: str, core: int, skipped: list[str]) -> str | None:
-        """Return the first failing test of a file, or the file if none can be named, or None."""
+    def failing(self, folder: Path, tests: str, skipped: list[str]) -> str:
+        """Return the first failing test, the file if that cannot be told, or nothing."""
+        core = self.cores.get()
+        path = os.pathsep.join([str(folder / "src"), os.environ.get("PYTHONPATH", "")])
         environment = os.environ | {
-            "PYTHONPATH": f"{folder / 'src'}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+            "PYTHONPATH": path,
+            "OMP_NUM_THREADS": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
         }
-        environment |= {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-x",
-            "-q",
-            "-rfE",
-            "-p",
-            "no:cacheprovider",
-            "-p",
-            "no:benchmark",
-        ]
-        command += ["-m", self.marks, tests, *(f"--deselect={test}" for test in skipped)]
-        if self.pin:
-            command = ["taskset", "-c", str(core), *command]
-        with tempfile.TemporaryDirectory() as temporary:
-            environment["TMPDIR"] = temporary
-            try:
+        options = ["-x", "-q", "-rfE", "-p", "no:cacheprovider", "-p", "no:benchmark", "-m", self.marks]
+        command = ["taskset", "-c", str(core), sys.executable, "-m", "pytest", *options, tests]
+        command += [f"--deselect={test}" for test in skipped]
+        try:
+            with tempfile.TemporaryDirectory() as temporary:
+                environment["TMPDIR"] = temporary
                 done = subprocess.run(
-                    command,
-                    cwd=folder,
-                    env=environment,
-                    timeout=self.seconds,
-                    text=True,
-                    stdout=-1,
-                    stderr=-2,
+                    command, cwd=folder, env=environment, timeout=self.seconds, text=True, capture_output=True
                 )
-            except subprocess.TimeoutExpired:
-                return f"{tests} (time limit)"
-        # 5: nothing selected.
+        except subprocess.TimeoutExpired:
+            return tests
+        finally:
+            self.cores.put(core)
+        # 5: no test was selected.
         if done.returncode in (0, 5):
-            return None
-        found = re.search(r"^(?:FAILED|ERROR) (\S+(?:\[.*?\])?)(?: - |$)", done.stdout, re.MULTILINE)
+            return ""
+        found = re.search(r"^(?:FAILED|ERROR) (tests/\S+(?:\[.*?\])?)(?: - |$)", done.stdout, re.MULTILINE)
         return found.group(1) if found else tests
 
-    def finder(self, root: Path, mutant: dict[str, str]) -> tuple[str, float]:
-        """Return the test that finds a fault, or nothing, and how long that took [s]."""
-        start, core = time.monotonic(), self.cores.get()
-        base = Path(tempfile.mkdtemp(prefix="plab-mutant-", dir=root.parent))
-        try:
-            copy(root, base / "mutant")
-            copy(root, base / "clean")
-            mutate(base / "mutant", mutant)
-            for path in ordered(base / "mutant", mutant["file"]):
-                tests, skipped = str(path.relative_to(base / "mutant")), list[str]()
-                while found := self.fails(base / "mutant", tests, core, skipped):
-                    name = found.removesuffix(" (time limit)")
-                    if self.fails(base / "clean", name, core, []) is None:
-                        return found, time.monotonic() - start
-                    if name == tests:
-                        break
-                    skipped.append(name)
-            return "", time.monotonic() - start
-        finally:
-            shutil.rmtree(base, ignore_errors=True)
-            self.cores.put(core)
+    def finder(self, folder: Path, tests: str) -> str:
+        """Return the test of a file that fails in a faulty copy and passes without the fault, or nothing."""
+        skipped = [test for test in self.known if test.startswith(f"{tests}::")]
+        if tests in self.known:
+            return ""
+        while found := self.failing(folder, tests, skipped):
+            if not self.failing(self.root, found, skipped):
+                return found
+            if found == tests:
+                break
+            skipped.append(found)
+        return ""
 
 
 def main() -> None:
-    """Test all faults, or some, and write a row for each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Try faults, write a row for each fault and test file, and print which faults are found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--log", type=Path, required=True, help="CSV file, continued if it exists")
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout whose tests are tried")
     parser.add_argument("--only", default="", help="numbers of faults, with commas between")
-    parser.add_argument("--jobs", type=int, default=2, help="faults tried at once")
+    parser.add_argument("--first", default="", help="test files to begin with, with commas between")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="files at once")
     parser.add_argument("--marks", default="not nightly and not gpu", help="pytest's -m")
-    parser.add_argument("--seconds", type=float, default=900.0, help="time limit of a test file")
-    parser.add_argument("--pin", action="store_true", help="keep each job on a core of its own")
-    parser.add_argument("--out", type=Path, default=Path("mutants_found.csv"))
+    parser.add_argument("--known", type=Path, help="list of tests or files that fail without a fault, too")
+    parser.add_argument("--seconds", type=float, default=900.0, help="time limit of a test file [s]")
+    parser.add_argument("--deadline", type=float, default=1e9, help="no file is started after so long [s]")
     args = parser.parse_args()
-    mutants = list(enumerate(yaml.safe_load((ROOT / "tools/mutants.yaml").read_text(encoding="utf-8"))))
-    if args.only:
-        mutants = [mutants[int(number)] for number in args.only.split(",")]
-    suite = Suite(args.marks, args.seconds, args.pin)
-    with ThreadPoolExecutor(args.jobs) as pool, open(args.out, "w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(["number", "area", "file", "found_by", "seconds"])
-        jobs = {pool.submit(suite.finder, args.root.resolve(), mutant): (n, mutant) for n, mutant in mutants}
-        for job in as_completed(jobs):
-            (number, mutant), (found, seconds) = jobs[job], job.result()
-            rows.writerow([number, mutant["area"], mutant["file"], found, round(seconds)])
+    start, root = time.monotonic(), args.root.resolve()
+    mutants = dict(enumerate(yaml.safe_load((ROOT / "tools/mutants.yaml").read_text(encoding="utf-8"))))
+    numbers = [int(number) for number in args.only.split(",")] if args.only else list(mutants)
+    suite = Suite(root, args.marks, args.known.read_text().split() if args.known else [], args.seconds)
+    rows = list(csv.DictReader(args.log.open(encoding="utf-8"))) if args.log.exists() else []
+    tried = {(int(row["number"]), row["tests"]) for row in rows}
+    found = {int(row["number"]): row["found_by"] for row in rows if row["found_by"]}
+    first = args.first.split(",") if args.first else []
+    orders = {number: by_relevance(root, mutants[number]["file"], first) for number in numbers}
+    work = [
+        (number, order[rank]) for rank in range(200) for number, order in orders.items() if rank < len(order)
+    ]
+    open_files = dict.fromkeys(numbers, 0)
+    with tempfile.TemporaryDirectory(dir=root.parent) as base, args.log.open("a", encoding="utf-8") as file:
+        log = csv.writer(file)
+        if not rows:
+            log.writerow(HEADER)
+        for number in numbers:
+            mutated_copy(root, Path(base) / str(number), mutants[number])
+
+        def try_one(number: int, tests: str) -> None:
+            if number in found or (number, tests) in tried:
+                return
+            if time.monotonic() - start > args.deadline:
+                open_files[number] += 1
+                return
+            began = time.monotonic()
+            result = suite.finder(Path(base) / str(number), tests)
+            if result:
+                found[number] = result
+            mutant = mutants[number]
+            log.writerow(
+                [number, mutant["area"], mutant["file"], tests, result, round(time.monotonic() - began)]
+            )
             file.flush()
-            print(f"{number:3d} {mutant['file']}: {found or 'NOT FOUND'} ({seconds:.0f} s)", flush=True)
+
+        with ThreadPoolExecutor(args.jobs) as pool:
+            for job in [pool.submit(try_one, *one) for one in work]:
+                job.result()
+    for number in numbers:
+        state = found.get(number) or (
+            f"open, {open_files[number]} files" if open_files[number] else "NOT FOUND"
+        )
+        print(f"{number:3d} {mutants[number]['area']:11s} {mutants[number]['file']}: {state}")
+    print(f"{sum(number in found for number in numbers)} of {len(numbers)} found")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,126 @@
+"""Rollouts for the tests on CUDA: moving, strained starts, random targets, and all their results."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+
+import numpy as np
+
+from plab.losses import make_terms
+from plab.sim import Simulator, State
+from suite import Kinetic, batch
+
+Results = dict[str, np.ndarray]
+
+SCENES = batch()
+ALL = tuple(range(len(SCENES)))
+STEPS = 3
+
+
+def simulator_of(
+    scenes: Sequence[int],
+    precision: str,
+    contact: str,
+    *,
+    device: str = "cuda",
+    deterministic: bool = True,
+) -> Simulator:
+    """A simulator of some scenes, partly strained beyond the series' reach; ``contact`` is a loss term."""
+    terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0}, {"contact": contact})
+    kinetic = Kinetic()
+    kinetic.name, kinetic.weight = "kinetic", 3.0
+    simulator = Simulator(
+        [SCENES[k] for k in scenes],
+        terms=(*terms, kinetic),
+        precision=precision,
+        device=device,
+        full_gradient=True,
+        deterministic=deterministic,
+    )
+    rest, n = simulator.state(), SCENES[0].grid_size
+    particles = rest.x.shape[1]
+    drawn = [np.random.default_rng(100 + k) for k in scenes]
+    simulator.set_target(
+        np.stack([0.3 * SCENES[0].particle_mass * rng.random((n, n, n)) for rng in drawn]),
+        np.stack([rng.random((n, n, n)) for rng in drawn]),
+    )
+    strain = np.where(np.arange(particles) % 17 == 0, 0.3, 0.02)[:, None, None]
+    start = State(
+        rest.x,
+        np.stack([rng.normal(scale=1.0, size=(particles, 3)) for rng in drawn]),
+        np.stack([rng.normal(scale=20.0, size=(particles, 3, 3)) for rng in drawn]),
+        np.stack([np.eye(3) + strain * rng.normal(size=(particles, 3, 3)) for rng in drawn]),
+        rest.poses,
+    )
+    simulator.set_initial_state(start)
+    return simulator
+
+
+def actions_of(scenes: Sequence[int]) -> np.ndarray:
+    """Actions of which some are clipped, the same of a scene in any batch, shape [batch, STEPS, action]."""
+    size = STEPS, SCENES[0].action_dim
+    return np.stack([np.random.default_rng(7 + k).uniform(-1.2, 1.2, size=size) for k in scenes])
+
+
+def computed(simulator: Simulator, scenes: Sequence[int] = ALL) -> Results:
+    """All that a rollout gives, by environment, copied out: the next simulator takes this one's memory."""
+    rollout = simulator.rollout(actions_of(scenes))
+    state, first = simulator.state(), simulator.state_gradient()
+    out = {name: getattr(state, name) for name in ("x", "v", "C", "F", "poses")}
+    out |= {f"{name}_bar": getattr(first, name) for name in ("x", "v", "C", "F", "poses")}
+    out |= {"terms": rollout.step_terms, "gradient": rollout.gradient, "mass": simulator.mass_tensor()}
+    out |= {"initial_terms": rollout.initial_terms, "material": simulator.material_gradient()}
+    return {name: np.array(values) for name, values in out.items()}
+
+
+def results_of(scenes: Sequence[int], precision: str, contact: str, times: int = 1) -> list[Results]:
+    """Results of a deterministic simulator of some scenes, each time; the simulator is gone before there is
+    another, as only then its kernels are not compiled anew."""
+    simulator = simulator_of(scenes, precision, contact)
+    results = [computed(simulator, scenes) for _ in range(times)]
+    del simulator
+    gc.collect()
+    return results
+
+
+def relative_error(got: np.ndarray, want: np.ndarray) -> float:
+    """Largest difference, relative to the largest value."""
+    return float(np.abs(got - want).max() / np.abs(want).max())
+
+
+def assert_agreement(got: Results, want: Results, tolerance: float) -> None:
+    """Compare results to a tolerance, and print the errors (``pytest -s``)."""
+    errors = {name: relative_error(got[name], want[name]) for name in want}
+    print(", ".join(f"{name} {error:.1e}" for name, error in errors.items()))
+    assert max(errors.values()) < tolerance, errors
+
+
+def assert_same_bits(got: Results, want: Results) -> None:
+    different = [name for name in want if got[name].tobytes() != want[name].tobytes()]
+    assert not different, {name: relative_error(got[name], want[name]) for name in different}
+
+
+def assert_cuda_agrees_with_the_cpu(contact: str) -> None:
+    """In both contact models, in steps without a history, and where states of the way back are recomputed."""
+    wants = []
+    for device in ("cpu", "cuda"):
+        simulator = simulator_of(ALL, "float64", contact, device=device, deterministic=False)
+        results = []
+        for model in ("hard", "soft"):
+            simulator.set_contact(model)
+            simulator.reset()
+            results.append(computed(simulator))
+        simulator.reset()
+        for action in np.swapaxes(actions_of(ALL), 0, 1):
+            simulator.step(action)
+        steps = {"x": simulator.state().x, "observed": simulator.observe(3), "losses": simulator.losses()}
+        results.append({name: np.array(values) for name, values in steps.items()})
+        if device == "cpu":
+            wants = results
+    for got, want in zip(results, wants, strict=True):
+        assert_agreement(got, want, 1e-10)
+    # Room for the states of two environment steps of three, and two checkpoints.
+    fewer = (SCENES[0].substeps - 2) * simulator._particles.slot_bytes
+    simulator.memory_mb = (simulator.memory_bytes() - fewer) / 1e6
+    assert_agreement(computed(simulator), results[1], 1e-10)

@@ -1,0 +1,116 @@
+"""Benchmarks of stability and accuracy: refusals, common scenes, cases that survive, errors, diagrams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
+from plab.bench.precision import angle
+from plab.bench.stability import run_cases, run_refusals
+from plab.bench.stress_cases import StressPlan, refusals, stress_cases
+from plab.cli import bench
+from plab.report.costs import diagrams
+from plab.report.figures import save, style
+from plab.scene import Body, SceneError
+
+
+def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:
+    for scene in refusals().values():
+        with pytest.raises(SceneError):
+            scene.validate()
+    said = {row["case"]: row["where"] for row in run_refusals()}
+    assert "substeps >= 112" in said["E times 100 without more substeps"]
+    assert "0.3 " in said["manipulator moves by cells per substep"]
+    assert "substeps >= 64" in said["manipulator moves by cells per substep"]
+    assert "lower_bound" in said["manipulator's bounds are the wrong way round"]
+
+
+@pytest.mark.nightly
+def test_few_particles_survive(tmp_path: Path) -> None:
+    cases = [c for c in stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
+    found = list(run_cases(cases, "float32"))
+    assert len(found) == 4
+    assert {row["outcome"] for row in found} == {"survived"}
+    path = tmp_path / "new" / "norms.csv"
+    bench._write_norms(found, path)
+    table = pd.read_csv(path).set_index(["case", "back"])["norm"]
+    assert len(table) == 4 * 3 and np.isfinite(table).all()
+    for row in found:
+        # The last step is none back.
+        assert table[row["case"], 0] == pytest.approx(row["norms"][2], rel=1e-5)
+    assert path.with_suffix(".png").stat().st_size > 1000
+
+
+def test_angle_is_exact_for_small_and_large_ones() -> None:
+    a = np.random.default_rng(0).normal(size=(5, 3))
+    assert angle(a, a) == 0.0
+    assert angle(a, -3.0 * a) == pytest.approx(180.0)
+    assert angle(np.array([1.0, 0.0]), np.array([1.0, 1e-9])) == pytest.approx(np.degrees(1e-9), rel=1e-6)
+
+
+def test_lattices_fill_bodies_evenly_and_every_setting_has_a_scene() -> None:
+    box = Body("box", (0.5, 0.3, 0.4), (0.2, 0.1, 0.05), 1)
+    ball = Body("sphere", (0.5, 0.6, 0.5), (0.1,), 1)
+    inside, round_ = lattice((box, ball), 0.01)
+    assert len(inside) == 20 * 10 * 5
+    np.testing.assert_allclose(inside.mean(axis=0), box.center, atol=1e-12)
+    assert (np.abs(inside - box.center) < box.half_extent()).all()
+    assert len(round_) == pytest.approx(4.0 / 3.0 * np.pi * 10**3, rel=0.02)
+    assert np.linalg.norm(round_ - ball.center, axis=1).max() <= 0.1
+    for plan, spread in ((Plan(), 1.5), (QUICK, 1.6)):
+        settings = [*plan.settings(), *plan.references().values()]
+        for attempt in attempts_at(TASKS, plan):
+            for setting in settings:
+                scene, x = attempt.start(setting)
+                scene.validate()
+                assert len(x) == scene.particle_count
+                assert scene.substeps * scene.dt == pytest.approx(19e-4)
+            # As many particles per cell on every grid, but for whole numbers of them across a thin body.
+            per_cell = [len(attempt.start(s)[1]) / s.grid**3 for s in settings if s.axis == "grid"]
+            assert max(per_cell) < spread * min(per_cell)
+
+
+def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
+    common = {"axis": "substeps", "task": "Move", "material": "series", "grid": 64, "particles": 100}
+    common |= {"contact": "soft", "precision": "float32"}
+    names = ("positions", "mass", "score", "gradient", "angle_deg")
+    table = [
+        {**common, "substeps": n, "ms_per_step": f"{n}.0", "outcome": "stable" if n > 5 else "broke off"}
+        | dict.fromkeys(names, f"{1 / n}" if n > 5 else "nan")
+        for n in (5, 10, 20)
+    ]
+    with style():
+        (drawing,) = diagrams(pd.DataFrame(table, columns=COLUMNS))
+    assert len(drawing.figure.axes) == 5
+    for panel in drawing.figure.axes:
+        # A line and what broke off.
+        assert [tuple(line.get_xdata()) for line in panel.get_lines()] == [(10.0, 20.0), (5.0,)]
+        assert [text.get_text() for text in panel.texts] == ["10", "20", "5"]
+    save([drawing], tmp_path, {"footer": []})
+    assert all((tmp_path / f"Move_substeps.{kind}").stat().st_size > 5000 for kind in ("png", "pdf"))
+
+
+@pytest.mark.nightly
+def test_every_quick_case_survives_and_float32_is_close_to_float64(tmp_path: Path) -> None:
+    assert bench.stability(["--quick", "--precision", "float32"]) == 0
+    out, summary = tmp_path / "rows.csv", tmp_path / "new" / "summary.md"
+    command = ["--task", "Move", "--variant", "1", "--particles", "200", "--csv", str(out)]
+    assert bench.precision([*command, "--markdown", str(summary)]) == 0
+    table = pd.read_csv(out, keep_default_na=False)
+    assert list(table["actions"]) == ["demonstration", "random"] and (table["failures"] == "").all()
+    assert table["difference"].abs().max() < 0.01
+    assert "| Move | random |" in summary.read_text(encoding="utf-8")
+
+
+@pytest.mark.nightly
+def test_finer_steps_come_closer_to_the_reference() -> None:
+    plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(24, 32), steps=6, particles=200)
+    table = pd.DataFrame(rows(["Move"], plan)).query("contact == 'hard' and material == 'series'")
+    for precision, some in table[table["axis"] == "substeps"].groupby("precision"):
+        errors = some.set_index("substeps")["positions"].astype(float)
+        assert errors[20] < errors[5], precision

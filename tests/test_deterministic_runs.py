@@ -1,0 +1,49 @@
+"""Deterministic on CUDA: float64 in fixed point, a long rollout, and a whole run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cuda_scenes import ALL, assert_agreement, assert_same_bits, computed, results_of, simulator_of
+from plab.config import load_config
+from plab.problem import Problem
+from plab.results import read, result_path
+from plab.runners import run_config
+
+DETERMINISTIC = ["task=Move", "sim.device=cuda", "sim.deterministic=true"]
+
+pytestmark = [pytest.mark.gpu]
+
+
+def test_float64_has_the_same_bits_and_computes_what_the_cpu_does() -> None:
+    """In fixed point, whose units are far below float32's digits, and above float64's."""
+    got, again = results_of(ALL, "float64", "all", times=2)
+    assert_same_bits(again, got)
+    some = [10, 2, 8]
+    [part] = results_of(some, "float64", "all")
+    assert_same_bits(part, {name: values[some] for name, values in got.items()})
+    assert_agreement(got, computed(simulator_of(ALL, "float64", "all", device="cpu")), 1e-6)
+
+
+def test_a_thousand_steps_and_their_gradient_have_the_same_bits() -> None:
+    simulator = Problem([load_config(DETERMINISTIC)]).simulator
+    actions = np.random.default_rng(0).uniform(-1, 1, size=(1, 1000, simulator.action_dim))
+    seen = []
+    for _ in range(2):
+        rollout = simulator.rollout(actions)
+        seen.append([np.array(rollout.gradient).tobytes(), np.array(simulator.state().x).tobytes()])
+    assert seen[0] == seen[1]
+
+
+def test_two_runs_of_adam_end_with_the_same_actions(tmp_path: Path) -> None:
+    words = [*DETERMINISTIC, "method=adam", "method.iterations=200", "sim.horizon=10", "progress=false"]
+    cfgs = [load_config([*words, f"results_dir={tmp_path / folder}"]) for folder in ("once", "again")]
+    for cfg in cfgs:
+        run_config(cfg)
+    once, again = (read(result_path(cfg)) for cfg in cfgs)
+    assert once.best_actions.tobytes() == again.best_actions.tobytes()
+    for column in ("loss", "score"):
+        assert once.iterations[column].to_numpy().tobytes() == again.iterations[column].to_numpy().tobytes()

@@ -1,0 +1,394 @@
+"""A block of plasticine and all seven manipulators: states against the plain reference, gradients against
+autograd and central differences, contact.
+
+One simulator, compiled once, serves all tests. Which manipulator touches the block is a matter of the poses,
+hence of the state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+import reference_mpm as reference
+from plab.losses import make_terms
+from plab.scene import sample_particles
+from plab.sim import Simulator, State
+from suite import DEVICE, FAR, KINDS, NEAR, assert_same_state, batch, reference_state, scene
+
+SCENES = batch()
+BATCH = len(SCENES)
+SCENE = scene(KINDS)
+STEPS = 2
+"""Length of the rollouts, in environment steps of seven substeps."""
+
+WEIGHTS = np.array([10.0, 10.0, 1.0])
+ALPHA = {"soft": 666.0, "hard": 0.0}
+GRIDS = (BATCH, *[SCENE.grid_size] * 3)
+
+TOUCHING = {kind: (kind,) for kind in KINDS if kind != "Cylinder"} | {"Cylinder": ("Cylinder", "Sphere")}
+"""Cases: a manipulator at the block; the static one together with one that moves."""
+
+X = sample_particles(SCENE)
+COUNT = len(X)
+MATERIAL = (SCENE.youngs_modulus, SCENE.poisson_ratio, SCENE.yield_stress)
+ELASTIC = (*MATERIAL[:2], math.inf)
+ACTIONS = np.random.default_rng(7).uniform(-0.9, 0.9, size=(STEPS, SCENE.action_dim))
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    terms = make_terms(dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True)))
+    return Simulator(SCENES, terms=terms, precision="float64", device=DEVICE, full_gradient=True)
+
+
+@pytest.fixture
+def touched(simulator: Simulator) -> Simulator:
+    """The simulator with soft contact and an empty target: |mass - target| has no kink then."""
+    nodes = np.stack(np.meshgrid(*[np.arange(n) / n for n in GRIDS[1:]], indexing="ij"), axis=-1)
+    distance = np.linalg.norm(nodes - (0.6, 0.35, 0.42), axis=-1)
+    simulator.set_target(np.zeros(GRIDS), np.broadcast_to(distance, GRIDS))
+    simulator.set_contact("soft")
+    return simulator
+
+
+# -------------------------------------------------------------------------------------- the plain reference
+
+
+def test_states_from_rest_agree_with_the_reference(simulator: Simulator) -> None:
+    simulator.set_scenes(SCENES)
+    simulator.set_contact("soft")
+    actions = np.random.default_rng(8).uniform(-0.9, 0.9, size=(BATCH, SCENE.action_dim))
+    simulator.step(actions)
+    got = simulator.state()
+    for e, made in enumerate(SCENES):
+        start = reference.initial_state(made)
+        assert_same_state(got, e, reference.env_step(made, start, torch.tensor(actions[e]), ALPHA["soft"]))
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_rollouts_and_their_gradients_agree_with_the_reference(simulator: Simulator, turn: int) -> None:
+    """From moving, strained starts; strains of 0.02 are the material's series, of 0.15 its singular values.
+
+    Environments differ in strain and contact model, and exchange both between the two turns.
+    """
+    contacts = [("soft", "hard")[(e // 2 + turn) % 2] for e in range(BATCH)]
+    strains = np.array([(0.02, 0.15)[(e + turn) % 2] for e in range(BATCH)])[:, None, None, None]
+    rng = np.random.default_rng(11)
+    simulator.set_scenes(SCENES)
+    simulator.set_contact(contacts)
+    rest = simulator.state()
+    mass, sdf = 0.3 * SCENE.particle_mass * rng.random(GRIDS), rng.random(GRIDS)
+    simulator.set_target(mass, sdf)
+    v, c = rng.normal(size=rest.v.shape), rng.normal(scale=20.0, size=rest.C.shape)
+    # No two singular values are equal: autograd differentiates the decomposition.
+    start = State(rest.x, v, c, np.eye(3) + strains * rng.normal(size=c.shape), rest.poses)
+    simulator.set_initial_state(start)
+    actions = rng.uniform(-0.9, 0.9, size=(BATCH, STEPS, SCENE.action_dim))
+    got = simulator.rollout(actions)
+    end, terms, masses = simulator.state(), simulator.losses(), simulator.mass_tensor()
+    for e, made in enumerate(SCENES):
+        u = torch.tensor(actions[e], requires_grad=True)
+        target = torch.tensor(mass[e]), torch.tensor(sdf[e])
+        given = reference_state(start, e)
+        loss, last = reference.rollout_loss(made, given, u, ALPHA[contacts[e]], *target, tuple(WEIGHTS))
+        (gradient,) = torch.autograd.grad(loss, u)
+        last = reference.State(*(part.detach() for part in vars(last).values()))
+        assert_same_state(end, e, last)
+        np.testing.assert_allclose(
+            terms[e], reference.loss_terms(made, last, *target), rtol=1e-10, atol=1e-12
+        )
+        np.testing.assert_allclose(masses[e], reference.mass_tensor(made, last.x), atol=1e-15)
+        assert (got.step_terms[e] @ WEIGHTS).sum() == pytest.approx(loss.item(), rel=1e-9)
+        error = np.abs(got.gradient[e] - gradient.numpy()).max() / gradient.abs().max().item()
+        assert error < 1e-7, f"environment {e}: {error:.2e}"
+
+
+# ------------------------------------------------------------------------------------- central differences
+
+SIZES = 10.0 ** -np.arange(3.0, 5.6, 0.5)
+"""Half widths: the error falls as h^2 to that of rounding, which grows as 1 / h."""
+
+BOTTOM = 1e-6 if DEVICE == "cpu" else 2e-6
+"""Largest relative error of the best width; on CUDA losses differ by rounding from run to run."""
+
+
+class Point(NamedTuple):
+    """Arguments of one environment's loss.
+
+    Attributes:
+        state: Initial state.
+        actions: Actions, shape [STEPS, A].
+        material: Young's modulus, Poisson ratio and yield stress.
+    """
+
+    state: State
+    actions: np.ndarray = ACTIONS
+    material: tuple[float, float, float] = MATERIAL
+
+
+Way = Callable[[float], Point]
+"""The point at a distance along some direction."""
+
+
+def start(near: Sequence[str] = (), **fields: np.ndarray) -> State:
+    """State of one environment.
+
+    Args:
+        near: Manipulators at the block; the others are out of its way.
+        **fields: ``x``, ``v``, ``C`` or ``F`` where they are not those of the block at rest.
+    """
+    rows = []
+    for kind, m in zip(KINDS, SCENE.manipulators, strict=True):
+        q = np.array(m.rotation) / np.linalg.norm(m.rotation)
+        rows.append([*(NEAR if kind in near else FAR)[kind], *q, m.gap])
+    zeros = np.zeros((COUNT, 3, 3))
+    return replace(State(X, np.zeros_like(X), zeros, zeros + np.eye(3), np.array(rows)), **fields)
+
+
+def components(kind: str) -> list[int]:
+    """Where a manipulator's degrees of freedom are in the action vector."""
+    before = sum(m.action_dim for m in SCENE.manipulators[: KINDS.index(kind)])
+    return list(range(before, before + SCENE.manipulators[KINDS.index(kind)].action_dim))
+
+
+def put(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
+    """Set initial states and materials, those of the last point in what is left of the batch.
+
+    Returns:
+        The actions, shape [batch, STEPS, A].
+    """
+    full = [*points, *([points[-1]] * (BATCH - len(points)))]
+    sim.set_material(*np.array([p.material for p in full]).T)
+    names = ("x", "v", "C", "F", "poses")
+    sim.set_initial_state(State(*(np.stack([getattr(p.state, name) for p in full]) for name in names)))
+    return np.stack([p.actions for p in full])
+
+
+def losses(sim: Simulator, points: Sequence[Point]) -> np.ndarray:
+    """Trajectory losses of any number of points, simulated a batch at a time."""
+    out = []
+    for at in range(0, len(points), BATCH):
+        part = points[at : at + BATCH]
+        terms = sim.rollout(put(sim, part), gradient=False).step_terms
+        out.append((terms @ WEIGHTS).sum(axis=1)[: len(part)])
+    return np.concatenate(out)
+
+
+def check_slopes(sim: Simulator, ways: Mapping[str, tuple[Way, float]]) -> None:
+    """Compare slopes from the gradient with central differences of the best width.
+
+    Directions in which the loss hardly changes, less than a hundredth of the largest change, are judged
+    relative to that.
+    """
+    points = [way(s * h) for way, _ in ways.values() for h in SIZES for s in (1.0, -1.0)]
+    values = losses(sim, points).reshape(len(ways), len(SIZES), 2)
+    exact = np.array([slope for _, slope in ways.values()])[:, None]
+    scale = np.maximum(np.abs(exact), 0.01 * np.abs(exact).max())
+    errors = (np.abs((values[..., 0] - values[..., 1]) / (2.0 * SIZES) - exact) / scale).min(axis=1)
+    bad = [f"{name}: {error:.1e}" for name, error in zip(ways, errors, strict=True) if not error <= BOTTOM]
+    assert not bad, "; ".join(bad)
+
+
+def action_way(point: Point, direction: np.ndarray) -> Way:
+    return lambda h: point._replace(actions=point.actions + h * direction)
+
+
+def state_way(point: Point, name: str, direction: np.ndarray) -> Way:
+    value = getattr(point.state, name)
+    return lambda h: point._replace(state=replace(point.state, **{name: value + h * direction}))
+
+
+def pose_way(point: Point, direction: np.ndarray) -> Way:
+    """Moves along a direction, and back to quaternions of unit length."""
+
+    def at(h: float) -> Point:
+        poses = point.state.poses + h * direction
+        poses[:, 3:7] /= np.linalg.norm(poses[:, 3:7], axis=1, keepdims=True)
+        return point._replace(state=replace(point.state, poses=poses))
+
+    return at
+
+
+@pytest.mark.parametrize("contact", ["soft", "hard"])
+def test_gradients_by_every_degree_of_freedom_of_every_manipulator(touched: Simulator, contact: str) -> None:
+    touched.set_contact(contact)
+    points = [Point(start(near)) for near in TOUCHING.values()]
+    gradient = touched.rollout(put(touched, points)).gradient
+    for e, near in enumerate(TOUCHING.values()):
+        ways = {}
+        for component in (c for kind in near for c in components(kind)):
+            direction = np.zeros_like(ACTIONS)
+            direction[:, component] = (1.0, 0.5)
+            slope = (gradient[e] * direction).sum()
+            ways[f"{near}, component {component}"] = action_way(points[e], direction), slope
+        check_slopes(touched, ways)
+
+
+def test_gradients_by_initial_poses(touched: Simulator) -> None:
+    """Positions, rotations (along the unit quaternions) and the chopsticks' gap."""
+    kinds = [kind for kind in KINDS if kind != "Cylinder"]
+    points = [Point(start((kind,))) for kind in kinds]
+    touched.rollout(put(touched, points))
+    bar = touched.state_gradient().poses
+    for e, kind in enumerate(kinds):
+        m = KINDS.index(kind)
+        moves = list(np.eye(8)[[0, 1, 2, *([7] if kind == "Chopsticks" else [])]])
+        if kind in ("RollingPin", "Chopsticks", "Box"):
+            tangents = np.linalg.svd(points[e].state.poses[m, None, 3:7])[2][1:]
+            moves += [np.concatenate([np.zeros(3), t, [0.0]]) for t in tangents]
+        ways = {}
+        for move in moves:
+            direction = np.zeros_like(points[e].state.poses)
+            direction[m] = 0.1 * move
+            ways[f"{kind} along {move.round(2)}"] = (
+                pose_way(points[e], direction),
+                (bar[e] * direction).sum(),
+            )
+        check_slopes(touched, ways)
+
+
+def normal(*shape: int, scale: float = 1.0) -> np.ndarray:
+    """Normal random numbers, the same ones at every call."""
+    return np.random.default_rng(3).normal(scale=scale, size=shape)
+
+
+def turned(*stretch: float) -> np.ndarray:
+    """Deformations with given principal stretches in random directions, shape [particle, 3, 3]."""
+    u, v = np.linalg.qr(normal(2, COUNT, 3, 3))[0]
+    for q in (u, v):
+        q[:, :, 0] *= np.linalg.det(q)[:, None]
+    return u * np.array(stretch) @ v.transpose(0, 2, 1)
+
+
+def at_yield() -> np.ndarray:
+    """Deformations exactly on the yield surface, up to rounding."""
+    strain = MATERIAL[2] * (1.0 + MATERIAL[1]) / MATERIAL[0]
+    length = math.sqrt(strain**2 - 1e-8)
+    return turned(*np.exp(length * np.array([1.0, -0.5, -0.5]) / math.sqrt(1.5)))
+
+
+FLOWING = {"F": turned(1.06, 1.0, 0.95), "C": normal(COUNT, 3, 3, scale=200.0)}
+REGIMES: dict[str, tuple[str, dict[str, np.ndarray], tuple[float, float, float]]] = {
+    "at rest, F = I": ("soft", {}, MATERIAL),
+    "two equal stretches": ("hard", {"F": turned(1.006, 1.006, 0.994)}, MATERIAL),
+    "three equal stretches": ("soft", {"F": turned(0.98, 0.98, 0.98)}, MATERIAL),
+    "two equal stretches, large": ("hard", {"F": turned(1.3, 1.3, 0.8)}, ELASTIC),
+    "three equal stretches, large": ("soft", {"F": turned(1.3, 1.3, 1.3)}, ELASTIC),
+    "on the yield surface": ("hard", {"F": at_yield()}, MATERIAL),
+    "deep plastic flow": ("soft", FLOWING, MATERIAL),
+    "no shear strength": ("hard", FLOWING, (*MATERIAL[:2], 0.0)),
+    "inverted, flowing": ("soft", {"F": turned(1.1, 1.05, -0.9)}, MATERIAL),
+    "inverted, elastic": ("hard", {"F": turned(1.1, 1.05, -0.9)}, ELASTIC),
+    "nearly singular, flowing": ("hard", {"F": turned(1.1, 0.95, 1e-4)}, MATERIAL),
+    "nearly singular, elastic": ("soft", {"F": turned(1.1, 0.95, 1e-4)}, ELASTIC),
+}
+"""Contact models, initial deformations and materials."""
+
+SCALE = {"x": 0.01, "v": 1.0, "C": 30.0, "F": 0.02}
+"""Size of a step of 1 in each part of the state."""
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_gradients_by_actions_state_and_material_in_every_regime(touched: Simulator, regime: str) -> None:
+    contact, fields, material = REGIMES[regime]
+    touched.set_contact(contact)
+    points = [Point(start(near, **fields), material=material) for near in TOUCHING.values()]
+    last, e = Point(start(("Sphere", "Torus"), **fields), material=material), len(points)
+    gradient = touched.rollout(put(touched, [*points, last])).gradient
+    state_bar, material_bar = touched.state_gradient(), touched.material_gradient()[e]
+    ways = {}
+    for point, bar, (case, near) in zip(points, gradient, TOUCHING.items(), strict=False):
+        own = [c for kind in near for c in components(kind)]
+        direction = np.zeros_like(ACTIONS)
+        direction[:, own] = normal(STEPS, len(own))
+        ways[case] = action_way(point, direction), (bar * direction).sum()
+    check_slopes(touched, ways)
+    if regime == "on the yield surface":
+        return
+    ways = {}
+    for name, size in SCALE.items():
+        direction = size * normal(*getattr(last.state, name).shape)
+        ways[name] = state_way(last, name, direction), (getattr(state_bar, name)[e] * direction).sum()
+    check_slopes(touched, ways)
+    ways = {}
+    for k, name in enumerate(("E", "nu", "yield stress")):
+        if math.isfinite(material[k]) and material[k] > 0.0:
+            step = np.eye(3)[k] * np.nan_to_num(material, posinf=0.0)
+            ways[name] = (
+                lambda h, step=step: last._replace(material=tuple(np.array(material) + h * step)),
+                material_bar @ step,
+            )
+    check_slopes(touched, ways)
+    assert material[2] < math.inf or material_bar[2] == 0.0
+
+
+def check_corner(sim: Simulator, way: Way, exact: float) -> None:
+    """At a corner the slopes to both sides differ, and the gradient is between them or one of them."""
+    h = 1e-6
+    ahead, here, behind = losses(sim, [way(h), way(0.0), way(-h)])
+    low, high = sorted(((ahead - here) / h, (here - behind) / h))
+    margin = 1e-4 * max(abs(low), abs(high))
+    assert high - low > 10 * margin, f"no corner: {low:.6g} and {high:.6g}"
+    assert low - margin <= exact <= high + margin, f"{exact:.6g} is outside {low:.6g} .. {high:.6g}"
+
+
+def test_one_sided_slopes_bracket_the_gradient_at_corners(touched: Simulator) -> None:
+    """On the yield surface, where return mapping flows outwards only, and at the onset of hard contact."""
+    point = Point(start(("Sphere",), F=at_yield()))
+    touched.rollout(put(touched, [point]))
+    b = point.state.F @ point.state.F.transpose(0, 2, 1)
+    outwards = (b - np.trace(b, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)) @ point.state.F
+    exact = (touched.state_gradient().F[0] * outwards).sum()
+    check_corner(touched, state_way(point, "F", outwards), exact)
+
+    # A capsule at rest in a block at rest: towards the block it pushes, away from it nothing holds it.
+    touched.set_contact("hard")
+    point = Point(start(("Capsule",)), actions=np.zeros_like(ACTIONS))
+    gradient = touched.rollout(put(touched, [point])).gradient[0]
+    direction = np.zeros_like(ACTIONS)
+    direction[0, components("Capsule")[0]] = 1.0
+    check_corner(touched, action_way(point, direction), (gradient * direction).sum())
+
+
+# -------------------------------------------------------------------------------------------------- contact
+
+TOWARDS = {
+    "Sphere": (1.0, 0.0, 0.0),
+    "Capsule": (1.0, 0.0, 0.0),
+    "RollingPin": (0.3, 0.0, -1.0),
+    "Chopsticks": (0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    "Torus": (0.0, -1.0, 0.0),
+    "Box": (-1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+}
+"""Actions that press a manipulator into the block."""
+
+
+@pytest.mark.parametrize("contact", ["soft", "hard"])
+def test_no_particle_gets_deep_into_a_manipulator_that_presses(touched: Simulator, contact: str) -> None:
+    """By 0.75 cells at most: velocities are stopped at the nodes. Without contact the body falls freely."""
+    touched.set_contact(contact)
+    put(touched, [*(Point(start(near)) for near in TOUCHING.values()), Point(start())])
+    touched.reset()
+    actions = np.zeros((BATCH, SCENE.action_dim))
+    for e, case in enumerate(TOUCHING):
+        kind = case if case in TOWARDS else "Sphere"
+        actions[e, components(kind)] = TOWARDS[kind]
+    for step in range(1, 13):
+        touched.step(actions)
+        state = touched.state()
+        for e, case in enumerate(TOUCHING):
+            m, now = KINDS.index(case), reference_state(state, e)
+            d, _ = reference.signed_distance(SCENE.manipulators[m], now.poses[m], now.x)
+            assert -float(d.min()) < 0.75 * SCENE.dx, f"{case} at step {step}"
+        if step <= 2:
+            fall = np.array(SCENE.gravity) * SCENE.dt * SCENE.substeps * step
+            np.testing.assert_allclose(state.v[len(TOUCHING) :].mean(axis=1), [fall] * 4, atol=1e-14)
+    moved = np.abs(state.x - X).max(axis=(1, 2))[: len(TOUCHING)]
+    assert (moved > 0.02).all(), f"not every manipulator pressed: {moved}"
