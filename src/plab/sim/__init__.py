@@ -3,7 +3,6 @@
 from plab.sim.recording import Recording
 from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
-from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State
 
 __all__ = [
@@ -13,6 +12,5 @@ __all__ = [
     "Rollout",
     "SimulationError",
     "Simulator",
-    "Skips",
     "State",
 ]

@@ -49,7 +49,7 @@ class MaterialTiles(ParticlePhases):
             affine = self.lane_in(self.affine, entry9, 0)
             yields = stress(self.real, first, x, affine, self.stress_scale, self.mass)
             if ti.static(update):
-                if yields or ti.static(not self.skips.flow):
+                if yields:
                     flow(self.real, first, self.lane_of(state_at, target, 0))
                 else:
                     copy(self.real, first, self.lane_of(state_at, target + AT_F, 0))
@@ -68,7 +68,7 @@ class MaterialTiles(ParticlePhases):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
             yields = stress_adjoint(self.real, first, affine, self.stress_scale)
-            if yields or ti.static(not self.skips.flow):
+            if yields:
                 flow_adjoint(self.real, first, bars)
             else:
                 g_bar = self.lane_in(self.strains, at + STRAIN_G_BAR, 0)

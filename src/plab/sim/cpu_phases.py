@@ -49,11 +49,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     def first_entry(self, e, c):
         """First entry of a chunk's share of the environment's block list: the blocks that no earlier chunk
         holds."""
-        first = self.block_first[e, c]
-        if ti.static(not self.skips.empty_blocks):
-            # Blocks that nobody holds are shared evenly.
-            first = c * self.block_count[e] // self.chunks
-        return e * self.blocks + first
+        return e * self.blocks + self.block_first[e, c]
 
     # -- phases of one chunk ------------------------------------------------------------------------
 
@@ -107,7 +103,7 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
         """Sum a node over the private grids of the chunks that hold it, and clear it there."""
         total = ti.Vector.zero(self.real, 4)
         for c in range(self.chunks):
-            if holders & (1 << c) != 0 or ti.static(not self.skips.empty_grids):
+            if holders & (1 << c) != 0:
                 at = (e * self.chunks + c) * self.nodes + node
                 total += grid[at]
                 grid[at] = ti.Vector.zero(self.real, 4)

@@ -206,11 +206,5 @@ class TransferTiles(ParticlePhases):
                             count += 1
                         self.block_chunks[entry] = self.block_chunks[entry] | (1 << c)
             self.mark_count[grid_index] = 0
-        if ti.static(not self.skips.empty_blocks):
-            for block in range(self.blocks):
-                if self.block_stamp[e * self.blocks + block] != stamp:
-                    self.block_chunks[e * self.blocks + block] = 0
-                    self.block_list[e * self.blocks + count] = block
-                    count += 1
         self.block_first[e, self.chunks] = count
         self.block_count[e] = count

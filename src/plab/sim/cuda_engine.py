@@ -93,7 +93,7 @@ class CudaEngine(ThreadPhases):
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
         # Blocks that move poses are among the resident ones.
         fits = few and self.frame_threads <= self.resident_threads
-        return fits and self.skips.launches and not self.deterministic
+        return fits and not self.deterministic
 
     @property
     def sorts(self) -> bool:

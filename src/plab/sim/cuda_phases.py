@@ -160,10 +160,9 @@ class CudaPhases(OrderPhases, PosePhases):
     @ti.func
     def material_numbers(self, p: ti.template()):
         """What bitcode takes of the material with a particle's parameters."""
-        # Return mapping's factor is 1 at most.
-        bound = ti.static(1.0 if self.skips.flow else 2.0)
         most, low, high = self.series.z_squared_max, self.series.j_min, self.series.j_max
-        return [p[0], p[1], p[2], self.dt, self.stress_scale, self.mass, most, low, high, bound]
+        # Last: a particle whose factor of return mapping is less than 1 flows.
+        return [p[0], p[1], p[2], self.dt, self.stress_scale, self.mass, most, low, high, 1.0]
 
     @ti.func
     def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
@@ -217,8 +216,6 @@ class CudaPhases(OrderPhases, PosePhases):
     def touching(self, e, s, x):
         """Bit mask of the manipulators whose contact is not zero at a point in substep s."""
         mask = 0
-        if ti.static(not self.skips.far_manipulators):
-            mask = (1 << self.manipulators) - 1
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
                 p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])

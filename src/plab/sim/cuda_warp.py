@@ -128,17 +128,12 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
     @ti.func
     def nodes_in(self, counter: ti.template()):
         """Nodes of the blocks of all environments that ``counter`` has counted."""
-        count = counter[0]
-        if ti.static(not self.skips.empty_blocks):
-            count = self.batch * self.blocks
-        return count << NODE_BITS
+        return counter[0] << NODE_BITS
 
     @ti.func
     def node_of(self, q):
         """Environment, block and number in the block of node q of the active blocks."""
-        entry = q >> NODE_BITS
-        if ti.static(self.skips.empty_blocks):
-            entry = self.block_list[entry]
+        entry = self.block_list[q >> NODE_BITS]
         e = entry // self.blocks
         return e, entry - e * self.blocks, q & NODE_MASK
 

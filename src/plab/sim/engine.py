@@ -38,8 +38,7 @@ class CpuEngine(CpuPhases):
     def __init__(self, *args: object) -> None:
         """Allocate; arguments as for :class:`plab.sim.storage.Storage`."""
         super().__init__(*args)
-        sizes = (self.team_size, 1) if self.skips.waiting else (self.team_size,)
-        self._teams = {name: TeamChoice(sizes) for name in ("step", "losses", "step_adjoint")}
+        self._teams = {name: TeamChoice((self.team_size, 1)) for name in ("step", "losses", "step_adjoint")}
 
     def step(self, state: ti.Ndarray, *args: object) -> None:
         """One environment step; arguments as for :meth:`step_kernel`, without size and address."""

@@ -18,7 +18,6 @@ from plab.sim.failures import broken_states, require_none
 from plab.sim.memory import held_bytes
 from plab.sim.particles import Particles
 from plab.sim.runtime import is_current, register_user, start_runtime
-from plab.sim.skips import Skips
 from plab.sim.state import Measures, State, rest_state
 from plab.sim.tape import Tape
 from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, step_actions
@@ -46,7 +45,7 @@ class ForwardSimulator:
         particles: Sequence[np.ndarray] | None = None,
         full_gradient: bool = False,
         deterministic: bool = False,
-        skips: Skips = Skips(),  # noqa: B008 - frozen
+        _singular_values: bool = False,
     ) -> None:
         """Build the simulator and put all environments into their initial states.
 
@@ -64,7 +63,8 @@ class ForwardSimulator:
                 (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
             deterministic: Whether CUDA gives the same bits in every run and batch, see
                 :mod:`plab.sim.cuda_sums`; the CPU does in any case.
-            skips: What is not computed where it is not needed; for measuring what that saves.
+            _singular_values: Whether to decompose every strain into singular values, also where series
+                serve; for measurements of accuracy.
 
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
@@ -75,8 +75,9 @@ class ForwardSimulator:
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
-        self._skips = skips
-        self._engine = _engine_class(device)(self.scenes, self._runtime, skips, full_gradient, deterministic)
+        self._engine = _engine_class(device)(
+            self.scenes, self._runtime, full_gradient, deterministic, _singular_values
+        )
         self._engine.attach(terms)
         self._engine.fill_parameters(self.scenes)
         register_user(self)

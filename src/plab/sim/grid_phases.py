@@ -72,8 +72,6 @@ class GridPhases(Storage):
         Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
         """
         mask = 0
-        if ti.static(not self.skips.far_manipulators):
-            mask = (1 << self.manipulators) - 1
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
@@ -136,9 +134,8 @@ class GridPhases(Storage):
     @ti.func
     def note_contact(self, e):
         """Note that a moving manipulator touches an environment's body."""
-        if ti.static(self.skips.adjoints):
-            if self.touched[e] == 0:
-                self.touched[e] = 1
+        if self.touched[e] == 0:
+            self.touched[e] = 1
 
     @ti.func
     def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):

@@ -59,9 +59,8 @@ class PosePhases(Storage):
     @ti.func
     def note_step(self, e, t):
         """Note that environment step t starts before the first contact, if it does."""
-        if ti.static(self.skips.adjoints):
-            if self.touched[e] == 0:
-                self.untouched_step[e] = t
+        if self.touched[e] == 0:
+            self.untouched_step[e] = t
 
     @ti.func
     def given_pose(self, poses: ti.template(), slot, e, m):

@@ -56,8 +56,7 @@ class Simulator(ForwardSimulator):
         if gradient and not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
-        kept = gradient or not self._skips.history
-        plan = self._tape.plan(steps, self.memory_mb) if kept else None
+        plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         poses = self._pose_history(steps, self._initial_poses)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
@@ -248,7 +247,7 @@ class Simulator(ForwardSimulator):
     def steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done, of ``steps``, before a manipulator that moves touches
         any environment's body; 0 where the whole gradient is asked for."""
-        if self._engine.full_gradient or not self._skips.adjoints:
+        if self._engine.full_gradient:
             return 0
         engine = self._engine
         touched, untouched = engine.read(engine.touched), engine.read(engine.untouched_step)

@@ -25,7 +25,6 @@ from plab.sim.parameters import material_parameters
 from plab.sim.runtime import Runtime
 from plab.sim.series import Series
 from plab.sim.shapes import SURFACES, require_surfaces
-from plab.sim.skips import Skips
 from plab.sim.tensors import Array
 
 __all__ = [
@@ -122,20 +121,20 @@ class Storage(Exchange):
         self,
         scenes: Sequence[Scene],
         runtime: Runtime,
-        skips: Skips,
         full_gradient: bool = False,
         deterministic: bool = False,
+        singular_values: bool = False,
     ) -> None:
         """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
         data, for :meth:`fill_parameters`; gradients include those by initial state and material if
-        ``full_gradient``. The CPU is ``deterministic`` in any case."""
+        ``full_gradient``. The CPU is ``deterministic`` in any case. With ``singular_values`` the series of
+        :mod:`plab.sim.material` serve no particle."""
         super().__init__()
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
         self.adjoint_sums: list[tuple[ti.Field, int]] = []
         self.full_gradient = full_gradient
         self.deterministic = deterministic
         first = scenes[0]
-        self.skips = skips
         self.device = runtime.device
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
@@ -152,7 +151,7 @@ class Storage(Exchange):
         self.materials = first.material_count
         self.mixed = self.materials > 1
         self.series = Series.for_precision(runtime.precision)
-        if not skips.singular_values:
+        if singular_values:
             self.series = replace(self.series, z_squared_max=-1.0)
         self._set_grid(first)
         self._set_manipulators(first)
@@ -189,11 +188,11 @@ class Storage(Exchange):
 
     def moves(self, shape: str) -> bool:
         """Whether manipulators of this shape can move; decided while compiling, as what follows."""
-        return MANIPULATOR_SHAPES[shape].moves or not self.skips.still_manipulators
+        return MANIPULATOR_SHAPES[shape].moves
 
     def turns(self, shape: str) -> bool:
         """Whether manipulators of this shape rotate."""
-        return MANIPULATOR_SHAPES[shape].turns or not self.skips.rotations
+        return MANIPULATOR_SHAPES[shape].turns
 
     def rotated(self, shape: str) -> bool:
         """Whether the rotation of a shape's frame matters: what is round has a spin only."""
