@@ -1,6 +1,5 @@
 """plab: PlasticineLab rebuilt as an experiment harness, from one command line to the result file."""
 
-import inspect
 import os
 
 # Before Taichi is imported, by whichever part of plab: it would print a banner on standard output, and send
@@ -11,9 +10,5 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 from plab.envs import register_suite
 
 __version__ = "0.1.0"
-
-# Taichi's decorators ask for the source of the importer: inspect looks through all modules, each time, for a
-# file that it does not know.
-vars(inspect).setdefault("modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 
 register_suite()

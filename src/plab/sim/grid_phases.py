@@ -1,12 +1,10 @@
-"""Phases of a substep that run over grid nodes: gravity, contact with the manipulators, walls; and their
-adjoints."""
+"""Grid phases of a substep: gravity, contact with the manipulators, Coulomb friction, walls; adjoints."""
 
 import math
 
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.friction import slid, slid_adjoint
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import (
     AT_FRAME_GAP,
@@ -17,7 +15,7 @@ from plab.sim.storage import (
     Storage,
 )
 
-__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases"]
+__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases", "slid", "slid_adjoint"]
 
 MASS_MIN = 1e-12
 """Nodes with less mass are skipped."""
@@ -30,6 +28,31 @@ WALL = 3
 
 STICKING = 10.0
 """From this floor friction on, the floor sticks."""
+
+
+@ti.func
+def slid(t, rn, friction):
+    """Tangential velocity t, a 3-vector or 2-vector in the surface's own axes, after full contact: shortened
+    by friction times the normal velocity rn that is lost, which is negative, towards the surface."""
+    length = t.norm()
+    factor = 0.0 * friction
+    if length + rn * friction > 0.0 and length > 0.0:
+        factor = 1.0 + rn * friction / length
+    return factor * t
+
+
+@ti.func
+def slid_adjoint(t, rn, friction, bar):
+    """Adjoints of t and rn under :func:`slid`, given the adjoint of its result."""
+    length = t.norm()
+    t_bar = t * 0.0
+    rn_bar = 0.0 * rn
+    if length + rn * friction > 0.0 and length > 0.0:
+        factor = 1.0 + rn * friction / length
+        along = t.dot(bar) / length
+        t_bar = factor * bar - (friction * rn * along / (length * length)) * t
+        rn_bar = friction * along
+    return t_bar, rn_bar
 
 
 class GridPhases(Storage):
