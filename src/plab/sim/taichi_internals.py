@@ -1,7 +1,7 @@
 """Reaches into Taichi's internals: everything that its documented interface does not promise.
 
-Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. A patch is left out where another
-version lacks what it changes.
+Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. A patch is left out where
+another version lacks what it changes.
 
 Patches, with what they change and why:
     :func:`tell_classes_quickly`: ``kernel_impl._inside_class``. The import of the simulator would take a
