@@ -41,7 +41,7 @@ PYTHON = {
     "simulator": (
         "Simulator",
         "Usable alone.",
-        ("plab.sim.simulator", "plab.sim.forward", "plab.sim.recording", "plab.sim.state", "plab.sim.skips"),
+        ("plab.sim.simulator", "plab.sim.callbacks.Recording", "plab.sim.state"),
     ),
     "methods": (
         "Methods",

@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir
 from stencils import LANE, Code
 
-from plab.sim import linalg, material, series
+from plab.sim import linalg, material
 from plab.sim.storage import (
     AT_C,
     AT_F,
@@ -89,9 +89,9 @@ def _is(other: Lanes | float, number: float) -> bool:
     return not isinstance(other, Lanes) and other == number
 
 
-def series_of(real: ir.Type) -> series.Series:
+def series_of(real: ir.Type) -> linalg.Series:
     """The series of a precision."""
-    return series.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
+    return linalg.Series.for_precision("float32" if isinstance(real, ir.FloatType) else "float64")
 
 
 def served(one: Any, j: Lanes, z_squared: Lanes) -> ir.Value:

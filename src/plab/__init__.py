@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -46,10 +45,6 @@ _PLACES = {
     "load_results": ("plab.results", "load"),
 }
 """Module and name of each part that is imported on first use: Taichi and pandas take seconds."""
-
-# Taichi's decorators ask for the source of the importer: inspect looks through all modules, each time, for a
-# file that it does not know.
-vars(inspect).setdefault("modulesbyfile", {})["<frozen importlib._bootstrap>"] = "importlib._bootstrap"
 
 register_suite()
 

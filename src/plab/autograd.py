@@ -16,7 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch
-from plab.sim.failures import require_none
+from plab.sim.state import require_none
 
 if TYPE_CHECKING:
     from plab.problem import Problem

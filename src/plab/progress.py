@@ -30,7 +30,7 @@ Report = Callable[[int, str], None]
 
 Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
 """Takes what is to be called with the name of what is waited for, or nothing, while its block lasts; such as
-:func:`plab.sim.compiling.watch_compiling`."""
+:func:`plab.sim.taichi_internals.watch_compiling`."""
 
 Forward = Callable[..., None]
 """Takes ``"progress"`` with title, first step, steps to do, steps between two plain lines, steps done and

@@ -39,7 +39,7 @@ from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
 from plab.scene import CONTACTS, PRECISIONS, Body, Scene, sample_particles
-from plab.sim import Simulator, Skips
+from plab.sim import Simulator
 
 __all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Resolution", "attempts_at", "lattice", "rows"]
 
@@ -238,7 +238,6 @@ def simulate(setting: Resolution, attempts: Sequence[Attempt], repeats: int, dev
     Yields:
         Task, contact model and :class:`Result`.
     """
-    skips = Skips(singular_values=setting.material == "series")
     simulator = None
     for attempt in attempts:
         scene, x = attempt.start(setting)
@@ -251,7 +250,7 @@ def simulate(setting: Resolution, attempts: Sequence[Attempt], repeats: int, dev
                 precision=setting.precision,
                 device=device,
                 particles=[x],
-                skips=skips,
+                _singular_values=setting.material != "series",
             )
         simulator.set_scenes([scene], particles=[x])
         if setting.axis not in attempt.targets:

@@ -12,7 +12,7 @@ import numpy as np
 import taichi as ti
 
 from plab.bench.workload import Workload
-from plab.sim.engine import SPLIT
+from plab.sim.cpu_engine import SPLIT
 from plab.sim.runtime import Runtime, start_runtime
 from plab.sim.storage import STATE
 

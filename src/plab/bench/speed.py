@@ -4,7 +4,6 @@
     python -m plab.bench.speed --quick                               the same in less than a minute
     python -m plab.bench.speed task=Rope sim.device=cuda --batch 1 64
     python -m plab.bench.speed --task Move,Torus --precision float32 float64
-    python -m plab.bench.speed --skips                               what each skip saves
     python -m plab.bench.speed --scaling                             from 1,000 to 1,000,000 particles
     python -m plab.bench.speed --paper                               the paper's table of ten tasks
     python -m plab.bench.speed --limits                              how fast the machine copies memory

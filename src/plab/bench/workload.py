@@ -17,7 +17,7 @@ from plab.config import Config, build_scene
 from plab.demonstrations import known_actions
 from plab.losses import make_terms
 from plab.objective import OBSERVED_PARTICLES, target_sdf
-from plab.sim import Simulator, Skips
+from plab.sim import Simulator
 
 if TYPE_CHECKING:
     import torch
@@ -98,8 +98,6 @@ def build(
     steps: int,
     *,
     from_start: bool = False,
-    like: Workload | None = None,
-    skips: Skips | None = None,
 ) -> Workload:
     """Build a simulator and put it where the plasticine is being worked on.
 
@@ -111,8 +109,6 @@ def build(
         steps: Environment steps of a rollout.
         from_start: Start at the scene's own initial state, instead of in the middle of the best actions
             known.
-        like: Whose initial state and actions are taken, if there are some.
-        skips: What is not computed where it is not needed; everything that need not be by default.
 
     Raises:
         plab.scene.SceneError: If the scene cannot be simulated.
@@ -127,7 +123,6 @@ def build(
         device=cfg.sim.device,
         memory_mb=cfg.sim.memory_mb,
         deterministic=cfg.sim.deterministic,
-        skips=skips or Skips(),
     )
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
@@ -135,14 +130,12 @@ def build(
     distance = target_sdf(mass, threshold=SOLID * mass.max())
     shape = (batch, *mass.shape)
     simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(distance, shape))
-    actions = _actions(cfg, batch, scene.action_dim) if like is None else like.actions
+    actions = _actions(cfg, batch, scene.action_dim)
     begin = time.perf_counter()
     simulator.step(actions[:, 0])
     first_step_s = time.perf_counter() - begin
     first = 0
-    if not from_start and like is not None:
-        simulator.set_initial_state(like.simulator.state())
-    elif not from_start:
+    if not from_start:
         first = max(0, actions.shape[1] // 2 - steps // 2)
         _run(simulator, actions[:, :first])
         idle = _before_contact(simulator, actions[:, first:])

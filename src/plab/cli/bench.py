@@ -19,7 +19,7 @@ import numpy as np
 from plab.cli.arguments import Parser, folder, positive, sources_and_words, task_list, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import measure_table, print_table, write_csv, write_markdown
-from plab.config import ConfigError, load_config
+from plab.config import ConfigError
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import ArgumentError, pick, tell
 from plab.scene import DEVICES, PRECISIONS
@@ -155,7 +155,6 @@ def _speed_options(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--markdown", type=to_write, help="file to write the paper's table to")
     parser.add_argument("--quick", action="store_true", help="fewer rows, steps and repeats")
     modes = parser.add_mutually_exclusive_group()
-    modes.add_argument("--skips", nargs="*", metavar="SKIP", help="rows with one skip off; all, or these")
     modes.add_argument("--scaling", action="store_true", help="rows for numbers of particles and grids")
     modes.add_argument("--paper", action="store_true", help="the paper's table beside ours")
     modes.add_argument("--limits", action="store_true", help="how fast the machine copies memory")
@@ -181,11 +180,11 @@ def _speed_rows(
 ) -> tuple[Sequence[str], Iterable[Mapping[str, object]], Mapping[str, int] | None]:
     """Return names of columns, the rows, which are measured when they are asked for, and widths of columns.
     For what needs more memory than there may be a line is added to ``refused``."""
-    from plab.bench import skips, workload
     from plab.bench import speed as bench
+    from plab.bench import workload
 
     # Columns whose entries are not as long as most.
-    wide = {"what": max(map(len, workload.KINDS)), "skip": 18, "device": 6, "batch": 5}
+    wide = {"what": max(map(len, workload.KINDS)), "device": 6, "batch": 5}
     steps, repeats, quick = options.steps, options.repeats, options.quick
     tasks = [[f"task={name}"] for name in options.task or ()] or [[]]
     precisions = [[f"sim.precision={name}"] for name in options.precision or ()] or [[]]
@@ -193,10 +192,6 @@ def _speed_rows(
     first = chosen[0]
     if options.limits:
         return bench.LIMIT_COLUMNS, bench.limit_rows(options.overrides), None
-    if options.skips is not None:
-        cases = skips.cases_for(load_config(first).sim.device, options.skips)
-        each = (skips.rows(cases, first, batch, steps, repeats, quick, refused) for batch in options.batch)
-        return skips.COLUMNS, itertools.chain.from_iterable(each), wide
     if options.scaling:
         kinds = bench.QUICK_KINDS[:1] if quick else bench.QUICK_KINDS
         sizes = itertools.product(options.grids, options.particles)

@@ -26,7 +26,7 @@ from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
 from plab.runners.loggers import RunLog
 from plab.sim import DeviceError, SimulationError
-from plab.sim.compiling import watch_compiling
+from plab.sim.taichi_internals import watch_compiling
 
 __all__ = ["Runner", "Step", "Track"]
 

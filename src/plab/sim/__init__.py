@@ -1,9 +1,10 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
-from plab.sim.recording import Recording
+# First: it changes the decorators of the kernels that the others define.
+import plab.sim.taichi_internals  # noqa: F401
+from plab.sim.callbacks import Recording
 from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
-from plab.sim.skips import Skips
 from plab.sim.state import Measures, Rollout, State
 
 __all__ = [
@@ -13,6 +14,5 @@ __all__ = [
     "Rollout",
     "SimulationError",
     "Simulator",
-    "Skips",
     "State",
 ]

@@ -9,12 +9,10 @@ import platform
 import sys
 
 import taichi as ti
-from taichi.lang.impl import get_runtime
 
-from plab.sim.bitcode import Bitcode
+from plab.sim.taichi_internals import Bitcode
 
 __all__ = [
-    "address_of",
     "copy",
     "flow",
     "flow_adjoint",
@@ -30,11 +28,6 @@ __all__ = [
 
 
 _function = Bitcode(f"{sys.platform}-{platform.machine().lower()}")
-
-
-def address_of(array: ti.Ndarray) -> int:
-    """Return where an array's numbers begin in memory."""
-    return int(get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr))
 
 
 @ti.func

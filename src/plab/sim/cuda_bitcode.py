@@ -7,9 +7,8 @@ them.
 """
 
 import taichi as ti
-from taichi.lang.impl import expr_init
 
-from plab.sim.bitcode import Bitcode
+from plab.sim.taichi_internals import Bitcode, local_variable
 
 __all__ = ["add", "gather_sums", "look", "particle", "particle_adjoint"]
 
@@ -34,7 +33,7 @@ def look(address):
 @ti.func
 def variables(real: ti.template(), values: ti.template()):
     """Local variables that hold some numbers: what bitcode takes."""
-    return [expr_init(ti.cast(value, real)) for value in values]
+    return [local_variable(ti.cast(value, real)) for value in values]
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""Kernels for CUDA: one thread per particle, per node of an active block, per pose.
+"""Engine of CUDA, its kernels: one thread per particle, per node of an active block, per pose.
 
 A substep is one launch from Python of a kernel with several parallel loops, because a launch costs 13 to 17
 microseconds there whatever it does; the loops inside cost a few each. The host never waits for the device:
@@ -14,8 +14,7 @@ import sys
 
 import taichi as ti
 
-from plab.sim.cuda_phases import DISTANCE_GROUPS
-from plab.sim.cuda_threads import POSE_SHARE, RESIDENT_BLOCK, ThreadPhases
+from plab.sim.cuda_phases import DISTANCE_GROUPS, POSE_SHARE, RESIDENT_BLOCK, CudaPhases
 from plab.sim.cuda_warp import BLOCK_WARPS, NODE_BITS, NODE_STRIDE, WARP_BLOCK, WARP_NUMBERS
 from plab.sim.particle_phases import SIZES
 from plab.sim.storage import STATE
@@ -57,8 +56,8 @@ def resident_blocks(number_bytes: int) -> int:
 
 
 @ti.data_oriented
-class CudaEngine(ThreadPhases):
-    """Kernels for CUDA; public methods as those of :class:`plab.sim.engine.CpuEngine`.
+class CudaEngine(CudaPhases):
+    """Kernels for CUDA; public methods as those of :class:`plab.sim.cpu_engine.CpuEngine`.
 
     ``block_list`` is one list of ``environment * blocks + block`` for all environments and ``block_count[0]``
     its length. It is empty before each environment step and each loss, and grows in them: a block that the
@@ -93,7 +92,7 @@ class CudaEngine(ThreadPhases):
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
         # Blocks that move poses are among the resident ones.
         fits = few and self.frame_threads <= self.resident_threads
-        return fits and self.skips.launches and not self.deterministic
+        return fits and not self.deterministic
 
     @property
     def sorts(self) -> bool:

@@ -146,7 +146,7 @@ class SumPhases(Storage):
     @ti.func
     def largest_share(self, field: ti.template()):
         """What no share of an affine field's first three components exceeds; the field is that of
-        :func:`plab.sim.transfer.affine_field`. Not finite where one of these is not."""
+        :func:`plab.sim.particle_phases.affine_field`. Not finite where one of these is not."""
         total = ti.abs(field[0]) + 2.0 * (ti.abs(field[1]) + ti.abs(field[2]) + ti.abs(field[3]))
         return total[0] + total[1] + total[2]
 

@@ -1,12 +1,10 @@
-"""Phases of a substep that run over grid nodes: gravity, contact with the manipulators, walls; and their
-adjoints."""
+"""Grid phases of a substep: gravity, contact with the manipulators, Coulomb friction, walls; adjoints."""
 
 import math
 
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.friction import slid, slid_adjoint
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import (
     AT_FRAME_GAP,
@@ -17,7 +15,7 @@ from plab.sim.storage import (
     Storage,
 )
 
-__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases"]
+__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases", "slid", "slid_adjoint"]
 
 MASS_MIN = 1e-12
 """Nodes with less mass are skipped."""
@@ -30,6 +28,31 @@ WALL = 3
 
 STICKING = 10.0
 """From this floor friction on, the floor sticks."""
+
+
+@ti.func
+def slid(t, rn, friction):
+    """Tangential velocity t, a 3-vector or 2-vector in the surface's own axes, after full contact: shortened
+    by friction times the normal velocity rn that is lost, which is negative, towards the surface."""
+    length = t.norm()
+    factor = 0.0 * friction
+    if length + rn * friction > 0.0 and length > 0.0:
+        factor = 1.0 + rn * friction / length
+    return factor * t
+
+
+@ti.func
+def slid_adjoint(t, rn, friction, bar):
+    """Adjoints of t and rn under :func:`slid`, given the adjoint of its result."""
+    length = t.norm()
+    t_bar = t * 0.0
+    rn_bar = 0.0 * rn
+    if length + rn * friction > 0.0 and length > 0.0:
+        factor = 1.0 + rn * friction / length
+        along = t.dot(bar) / length
+        t_bar = factor * bar - (friction * rn * along / (length * length)) * t
+        rn_bar = friction * along
+    return t_bar, rn_bar
 
 
 class GridPhases(Storage):
@@ -72,8 +95,6 @@ class GridPhases(Storage):
         Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
         """
         mask = 0
-        if ti.static(not self.skips.far_manipulators):
-            mask = (1 << self.manipulators) - 1
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
@@ -136,9 +157,8 @@ class GridPhases(Storage):
     @ti.func
     def note_contact(self, e):
         """Note that a moving manipulator touches an environment's body."""
-        if ti.static(self.skips.adjoints):
-            if self.touched[e] == 0:
-                self.touched[e] = 1
+        if self.touched[e] == 0:
+            self.touched[e] = 1
 
     @ti.func
     def contact_adjoint(self, shape: ti.template(), grid_index, e, s, m, x, v, bar):

@@ -8,12 +8,12 @@ the fixed-corotated model is ``tau = 2 mu (V^2 - V) + lambda J (J - 1) I`` with 
 That is what an SVD of G would give.
 
 Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
-rounding: :mod:`plab.sim.series` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
+rounding: :mod:`plab.sim.linalg` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
 ``d = atanh(Z)``, and in d. Where ``|Z|`` or J leave the range in which the series are exact to rounding,
 :mod:`plab.sim.spectral` takes over with an SVD.
 
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
-parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.series.Series`.
+parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.linalg.Series`.
 
 The update and its adjoint come in parts, so that what a scene or a tile does not need is not computed.
 Components are numbers of any kind: NumPy's arrays, say. What the simulator runs is bitcode, which ``make
@@ -27,7 +27,12 @@ from plab.sim.linalg import (
     cofactor_sym,
     det_sym,
     dot_sym,
+    exp_coefficients,
+    exp_coefficients_adjoint,
+    inverse_cbrt,
     inverse_sym,
+    log_coefficients,
+    log_coefficients_adjoint,
     mul,
     mul_nt,
     mul_sym_mat,
@@ -37,13 +42,6 @@ from plab.sim.linalg import (
     square_sym,
     sym_of_product,
     sym_product_twice,
-)
-from plab.sim.series import (
-    exp_coefficients,
-    exp_coefficients_adjoint,
-    inverse_cbrt,
-    log_coefficients,
-    log_coefficients_adjoint,
 )
 
 __all__ = [

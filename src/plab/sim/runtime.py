@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import functools
 import gc
-import inspect
 import io
-import linecache
 import os
-import textwrap
 import time
-import types
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import taichi as ti
-from taichi.lang import _ndarray, impl
 
 from plab.errors import ArgumentError, PlabError
 from plab.scene import DEVICES, PRECISIONS
+from plab.sim.taichi_internals import (
+    cache_folder,
+    cuda_available,
+    forget_arguments,
+    free_own_arrays_only,
+    hasten_tracing,
+)
 
 __all__ = ["DeviceError", "Runtime", "SimulationError", "start_runtime"]
 
@@ -128,8 +126,8 @@ def start_runtime(device: str, precision: str, threads: int | None = None) -> Ru
     with contextlib.redirect_stdout(io.StringIO()):
         free_abandoned_cache()
         _start_taichi(device, precision, wanted)
-    _forget_arguments()
-    _free_own_arrays_only()
+    forget_arguments()
+    free_own_arrays_only()
     hasten_tracing()
     _current = Runtime(device, precision, wanted, _current.generation + 1 if _current else 1)
     return _current
@@ -151,8 +149,7 @@ def free_abandoned_cache() -> None:
 
     Taichi waits for it a fifth of a second, and would then compile every kernel anew in every later process.
     """
-    folder = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
-    lock = Path(folder) / "ticache.lock"
+    lock = cache_folder() / "ticache.lock"
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > ABANDONED_SECONDS:
             lock.unlink()
@@ -174,111 +171,6 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         # Its warnings are of a cache that another process is writing; these kernels are then not kept.
         log_level=ti.ERROR,
     )
-
-
-def _forget_arguments() -> None:
-    """Let kernels forget what they were called with before Taichi started anew, as they forget their code.
-
-    Else Taichi's own kernels hold all fields that they have ever filled or read, some 100 kB of a simulator.
-    """
-    for kernel in getattr(impl.get_runtime(), "kernels", ()):
-        if hasattr(kernel, "mapper"):
-            kernel.mapper.mapping.clear()
-
-
-def _free_own_arrays_only() -> None:
-    """Let arrays of before Taichi started anew, which are gone, free nothing when Python forgets them: Taichi
-    would free what is at their addresses by now, an array that is in use, perhaps."""
-    kind, current = _ndarray.ScalarNdarray, impl.get_runtime
-    make, free = kind.__init__, getattr(kind, "__del__", None)
-    if free is None or hasattr(free, "__wrapped__"):
-        return
-
-    @functools.wraps(make)
-    def made(self: Any, *args: Any, **words: Any) -> None:
-        self.start = weakref.ref(current())
-        make(self, *args, **words)
-
-    @functools.wraps(free)
-    def freed(self: Any) -> None:
-        # There is none when Python has taken Taichi apart, at its own end.
-        runtime = current()
-        if runtime is not None and self.start() is runtime:
-            free(self)
-
-    kind.__init__, kind.__del__ = made, freed
-
-
-def cuda_available() -> bool:
-    """Whether Taichi can open a CUDA device."""
-    return bool(ti._lib.core.with_cuda())
-
-
-def hasten_tracing() -> None:
-    """Let Taichi find a function's source and tell an AST node's place quickly: both only serve messages.
-
-    Taichi looks the source up, among all modules of the process, and lays it out at each inlining, and wraps
-    an excerpt of it for each node: half of what compiling from a warm cache takes. What a future Taichi no
-    longer has is left as it is.
-    """
-    from taichi.lang import kernel_impl
-    from taichi.lang.ast import ast_transformer_utils
-
-    find = getattr(kernel_impl, "getsourcelines", None)
-    if find is not None and not hasattr(find, "__wrapped__"):
-        kernel_impl.getsourcelines = _quick_sources(find)
-    if getattr(kernel_impl, "textwrap", None) is textwrap:
-        fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
-        kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
-    context = ast_transformer_utils.ASTTransformerContext
-    if hasattr(context, "get_pos_info"):
-        context.get_pos_info = _position
-
-
-def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Read the source of functions of files where the code says that it is, and of others as before."""
-
-    @functools.cache
-    def block(file: str, first: int) -> list[str]:
-        lines = linecache.getlines(file)[first - 1 :]
-        last = _last_lines(file).get(first)
-        return inspect.getblock(lines) if last is None else lines[: last - first + 1]
-
-    @functools.wraps(find)
-    def quick(function: Any) -> Any:
-        code = function.__code__
-        lines = block(code.co_filename, code.co_firstlineno)
-        return (list(lines), code.co_firstlineno) if lines else find(function)
-
-    return quick
-
-
-@functools.cache
-def _last_lines(file: str) -> dict[int, int]:
-    """Where the functions and methods of a file end, by where they, or their first decorators, begin: sooner
-    found by parsing the file than by going through each function's tokens, as ``inspect`` does. Functions
-    within functions are left out."""
-    found = {}
-    with contextlib.suppress(SyntaxError):
-        outer = ast.parse("".join(linecache.getlines(file))).body
-        inner = [node for kind in outer if isinstance(kind, ast.ClassDef) for node in kind.body]
-        for node in (*outer, *inner):
-            if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
-                first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
-                found[first] = node.end_lineno
-    return found
-
-
-def _position(context: Any, node: Any) -> str:
-    """Return place and first line of an AST node, marked, for a message; nothing before there is one."""
-    if not context.raised:
-        return ""
-    line = context.src[node.lineno - 1]
-    begins = context.indent + node.col_offset
-    ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
-    number, name = node.lineno + context.lineno_offset, context.func.func.__name__
-    mark = " " * begins + "^" * (ends - begins)
-    return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
 
 
 def in_use() -> Runtime | None:

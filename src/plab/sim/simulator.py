@@ -1,23 +1,38 @@
-"""The simulator: rollouts of a batch of environments, and their gradients."""
+"""Simulator of a batch of environments of one kind: settings, steps, rollouts and their gradients."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
-from plab.sim.closed_loop import ClosedLoop
-from plab.sim.failures import broken_gradients, broken_states, broken_terms, require_none
-from plab.sim.forward import ForwardSimulator
-from plab.sim.parameters import parameter_gradient
-from plab.sim.recording import Recording, StateRecorder
-from plab.sim.state import Rollout, State
-from plab.sim.tensors import action_array, copy_numbers, numbers_of
+from plab.scene import CONTACTS, Scene, SceneError, sample_particles
+from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
+from plab.sim.callbacks import ClosedLoop, Recording, StateRecorder
+from plab.sim.cpu_engine import CpuEngine
+from plab.sim.memory import held_bytes
+from plab.sim.particles import Particles
+from plab.sim.runtime import is_current, register_user, start_runtime
+from plab.sim.state import (
+    Measures,
+    Rollout,
+    State,
+    broken_gradients,
+    broken_states,
+    broken_terms,
+    require_none,
+    rest_state,
+)
+from plab.sim.tape import Tape
+from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
+from plab.sim.term_phases import LossTerm
+from plab.sizes import require_memory
 
 if TYPE_CHECKING:
     import torch
@@ -25,13 +40,376 @@ if TYPE_CHECKING:
 __all__ = ["Simulator"]
 
 
-class Simulator(ForwardSimulator):
+class Simulator:
     """Differentiable elastoplastic MLS-MPM for a batch of environments.
 
     All environments share the numbers of particles and manipulators, the manipulators' shapes, grid and time
     step; positions, sizes, material and targets may differ. One process has one device and precision at a
     time.
     """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        *,
+        terms: Sequence[LossTerm] = (),
+        precision: str = "float32",
+        device: str = "cpu",
+        memory_mb: float = 4000.0,
+        threads: int | None = None,
+        particles: Sequence[np.ndarray] | None = None,
+        full_gradient: bool = False,
+        deterministic: bool = False,
+        _singular_values: bool = False,
+    ) -> None:
+        """Build the simulator and put all environments into their initial states.
+
+        Args:
+            scenes: One scene per environment.
+            terms: Terms of the loss, as :func:`plab.losses.make_terms` makes them; those of weight 0 are left
+                out.
+            precision: ``float32`` or ``float64``.
+            device: ``cpu`` or ``cuda``.
+            memory_mb: Budget for all fields and arrays with a gradient [MB]; fewer states are kept and more
+                recomputed to stay in it.
+            threads: CPU threads; all that the process may use if None. Results do not depend on it.
+            particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+            full_gradient: Whether a rollout's gradient includes those with respect to the initial state
+                (:meth:`state_gradient`) and the material (:meth:`material_gradient`).
+            deterministic: Whether CUDA gives the same bits in every run and batch, see
+                :mod:`plab.sim.cuda_sums`; the CPU does in any case.
+            _singular_values: Whether to decompose every strain into singular values, also where series
+                serve; for measurements of accuracy.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or the scenes do not fit together.
+            DeviceError: If CUDA was asked for and is not there.
+        """
+        require_alike(scenes)
+        require_memory(len(scenes), scenes[0], precision, device)
+        self.scenes = tuple(scenes)
+        self.memory_mb = memory_mb
+        self._runtime = start_runtime(device, precision, threads)
+        self._engine = _engine_class(device)(
+            self.scenes, self._runtime, full_gradient, deterministic, _singular_values
+        )
+        self._engine.attach(terms)
+        self._engine.fill_parameters(self.scenes)
+        register_user(self)
+        self._numpy_real = np.float32 if precision == "float32" else np.float64
+        self._scratch_terms = ti.ndarray(ti.f64, shape=self._engine.measures * self.batch)
+        self._observed: dict[int, ti.Ndarray] = {}
+        self._pose = ti.ndarray(ti.f64, shape=max(1, self.batch * self.manipulator_count * 8))
+        self._particles = Particles(self._engine, self._numpy_real)
+        self._tape = Tape(self._particles)
+        self._initial = self._particles.array(1)
+        self._start_from(particles)
+        # Changes with all that a rollout's gradient depends on.
+        self._version = 0
+        self.set_contact("soft")
+        self.set_weights({term.name: term.weight for term in self.terms})
+        self.reset()
+
+    # -- sizes --------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> str:
+        """``cpu`` or ``cuda``."""
+        return self._runtime.device
+
+    @property
+    def precision(self) -> str:
+        """``float32`` or ``float64``."""
+        return self._runtime.precision
+
+    @property
+    def batch(self) -> int:
+        """Number of environments."""
+        return len(self.scenes)
+
+    @property
+    def particle_count(self) -> int:
+        """Particles per environment."""
+        return self.scenes[0].particle_count
+
+    @property
+    def manipulator_count(self) -> int:
+        """Manipulators per environment, static ones included."""
+        return len(self.scenes[0].manipulators)
+
+    @property
+    def action_dim(self) -> int:
+        """Action components per environment step."""
+        return self.scenes[0].action_dim
+
+    @property
+    def terms(self) -> tuple[LossTerm, ...]:
+        """Terms of the loss, in the order of :attr:`Measures.terms`."""
+        return tuple(term for term in self._engine.terms if term.weighted)
+
+    @property
+    def grid_size(self) -> int:
+        """Grid nodes per axis."""
+        return self.scenes[0].grid_size
+
+    @property
+    def substeps(self) -> int:
+        """Substeps per environment step."""
+        return self.scenes[0].substeps
+
+    def memory_bytes(self) -> int:
+        """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
+        its compiled kernels and what is on the way to or from the host."""
+        engine = self._engine
+        return held_bytes(self, engine, *engine.terms, self._particles, self._particles.order, self._tape)
+
+    # -- settings -----------------------------------------------------------------------------------
+
+    def set_contact(self, model: str | Sequence[str], softness: float | Sequence[float] = 666.0) -> None:
+        """Choose the contact model; nothing is compiled anew.
+
+        Args:
+            model: ``soft`` (strength exp(-softness d) outside the surface) or ``hard``; one for all
+                environments, or one for each.
+            softness: Decay rate of the soft model [1 / domain unit]; one for all, or one for each.
+        """
+        models = np.broadcast_to(model, self.batch)
+        decay = np.broadcast_to(np.asarray(softness, float), self.batch)
+        for name, rate in zip(models, decay, strict=True):
+            if name not in CONTACTS:
+                raise ArgumentError(f"contact '{name}' is not one of {', '.join(CONTACTS)}")
+            if name == "soft" and not rate > 0:
+                raise ArgumentError(f"softness {rate:g} must be positive")
+        self._version += 1
+        self._engine.write(self._engine.alpha, np.where(models == "soft", decay, 0.0))
+
+    def set_weights(self, weights: Mapping[str, float]) -> None:
+        """Set weights of terms in the trajectory loss and its gradient; nothing is compiled anew.
+
+        Args:
+            weights: By the terms' names.
+
+        Raises:
+            ValueError: If the simulator was built without a term.
+        """
+        columns = {term.name: column for column, term in enumerate(self._engine.terms) if term.weighted}
+        held = self._engine.read(self._engine.term_weights)
+        for name, weight in weights.items():
+            if name not in columns:
+                known = ", ".join(columns) or "none"
+                raise ArgumentError(f"this simulator was built without a term '{name}'; it has: {known}")
+            held[columns[name]] = weight
+        self._engine.write(self._engine.term_weights, held)
+
+    def set_scenes(self, scenes: Sequence[Scene], *, particles: Sequence[np.ndarray] | None = None) -> None:
+        """Replace all scenes by others of the same kind and reset; nothing is compiled anew.
+
+        Contact model, weights and targets stay.
+
+        Args:
+            scenes: One scene per environment.
+            particles: Initial positions per environment, each [particle, 3]; sampled from the scene if None.
+
+        Raises:
+            SceneError: If a scene cannot be simulated or is of another kind; nothing is changed then.
+        """
+        self._require_runtime()
+        if len(scenes) != self.batch:
+            raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
+        require_alike(scenes, self.scenes[0])
+        self.scenes = tuple(scenes)
+        self._engine.fill_parameters(scenes)
+        self._start_from(particles)
+        self.reset()
+
+    def set_material(
+        self,
+        youngs_modulus: ArrayLike | None = None,
+        poisson_ratio: ArrayLike | None = None,
+        yield_stress: ArrayLike | None = None,
+    ) -> None:
+        """Change the material; nothing is compiled anew.
+
+        Args:
+            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None. It
+                is that of all bodies; with shape [batch, body], where bodies have materials of their own, of
+                each.
+            poisson_ratio: Poisson ratio, likewise.
+            yield_stress: von Mises yield stress, likewise.
+
+        Raises:
+            SceneError: If a scene could not be simulated with it, or a simulator of one material is given
+                one for each body; nothing is changed then.
+        """
+        self._require_runtime()
+        scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
+        for scene in scenes:
+            scene.validate()
+        self.scenes = scenes
+        self._version += 1
+        self._engine.fill_material(scenes)
+
+    def set_target(self, mass: np.ndarray, sdf: np.ndarray) -> None:
+        """Set the targets of all environments.
+
+        Args:
+            mass: Target mass tensors, shape [batch, n, n, n].
+            sdf: Distance of each node to the target [domain units], same shape.
+
+        Raises:
+            ValueError: If a shape is wrong.
+        """
+        self._require_runtime()
+        expected = (self.batch, self.grid_size, self.grid_size, self.grid_size)
+        for name, value in (("mass", mass), ("sdf", sdf)):
+            if np.shape(value) != expected:
+                raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
+        held = {"mass": np.asarray(mass, self._numpy_real), "sdf": np.asarray(sdf, self._numpy_real)}
+        for name, field in self._engine.references.items():
+            self._engine.write(field, held[name])
+        for term in self._engine.terms:
+            term.set_target(held["mass"].astype(np.float64), held["sdf"])
+
+    # -- forward ------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Put all environments into their initial states."""
+        self._require_runtime()
+        self._version += 1
+        self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
+        self._particles.order.reset()
+        self._place(self._initial_poses)
+        self._checked = True
+
+    def step(self, actions: np.ndarray | torch.Tensor, *, check: bool = True) -> None:
+        """Advance all environments by one environment step, without keeping history.
+
+        Args:
+            actions: Actions, shape [batch, action]; clipped to [-1, 1]. A CUDA tensor is taken as it is.
+            check: Whether to wait for the step and look for faults. If not, the next :meth:`measure` does.
+
+        Raises:
+            ValueError: If the shape is wrong or an action is not finite.
+            SimulationError: If the state stops being finite and ``check`` is set.
+        """
+        self._require_runtime()
+        self._version += 1
+        array = step_actions(actions, self.batch, self.action_dim, self.device)
+        self._particles.step(self._pose, array)
+        self._taken += 1
+        self._checked = check
+        if check:
+            faults = self._engine.read(self._engine.fault)
+            require_none(broken_states(faults, self.substeps, self._taken))
+
+    def measure(self, like: torch.Tensor | None = None) -> Measures:
+        """Loss terms and soft IoU of the current state; CUDA tensors if ``like`` is one, of its type.
+
+        Raises:
+            SimulationError: If the last step, which was not to look for faults, broke the state.
+        """
+        self._require_runtime()
+        if on_device(like):
+            size = self.batch * self._engine.measures
+            values = output_for(lambda out: self._particles.losses(out, 0), size, True, like)
+            values = values.reshape(self.batch, -1)
+        else:
+            self._particles.losses(self._scratch_terms, 0)
+            values = numbers_of(self._scratch_terms, (self.batch, self._engine.measures), None)
+        checked, self._checked = self._checked, True
+        if not checked:
+            require_none(broken_states(values[:, -1], self.substeps, self._taken))
+        return self._judged(values)
+
+    def losses(self) -> np.ndarray:
+        """Unweighted loss terms of the current state, shape [batch, term]."""
+        return self.measure().terms
+
+    def mass_tensor(self) -> np.ndarray:
+        """Mass at the grid nodes in the current state, shape [batch, n, n, n], float64."""
+        self._require_runtime()
+        self._particles.losses(self._scratch_terms, 0)
+        n = self.grid_size
+        out = np.zeros(self.batch * n**3, self._numpy_real)
+        self._engine.export_mass(out)
+        return out.reshape(self.batch, n, n, n).astype(np.float64)
+
+    # -- state --------------------------------------------------------------------------------------
+
+    def state(self) -> State:
+        """The current state, particles in the order in which they were given."""
+        poses = cast(np.ndarray, self.poses())
+        return self._particles.unpack(self._particles.current.to_numpy(), poses)
+
+    def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
+        """Position and velocity of every ``stride``-th particle, in the order in which they were given.
+
+        Only these are copied from the device.
+
+        Args:
+            stride: Distance of the observed particles' numbers, at least 1.
+            like: Given a CUDA tensor, the result is one too, of its type, and nothing is copied to the host.
+
+        Returns:
+            Position (3) and velocity (3), shape [batch, observed, 6], float32 or float64 like the simulation.
+        """
+        self._require_runtime()
+        return self._observe(self._particles.current, 0, stride, like)
+
+    def _observe(
+        self, state: ti.Ndarray, slot: int, stride: int, like: torch.Tensor | None
+    ) -> np.ndarray | torch.Tensor:
+        """:meth:`observe` for a time slot of an array, whose particles are in the present order."""
+        count = -(-self.particle_count // stride)
+        size = self.batch * count * 6
+
+        def fill(out: ti.Ndarray | torch.Tensor) -> None:
+            self._engine.observe(state, slot, self._particles.order.numbers, stride, out)
+
+        if on_device(like):
+            return output_for(fill, size, self.precision == "float64", like).reshape(self.batch, count, 6)
+        if stride not in self._observed:
+            self._observed[stride] = ti.ndarray(self._runtime.real, shape=size)
+        fill(self._observed[stride])
+        return self._observed[stride].to_numpy().reshape(self.batch, count, 6)
+
+    def poses(self, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
+        """Poses of the manipulators, float64, shape [batch, manipulator, 8]; see :class:`State`. A CUDA
+        tensor if ``like`` is one, of its type."""
+        self._require_runtime()
+        return numbers_of(self._pose, self._initial_poses.shape, like)
+
+    def set_state(self, state: State) -> None:
+        """Replace the current state.
+
+        Args:
+            state: Shapes as in :class:`State`.
+
+        Raises:
+            ValueError: If a shape is wrong.
+        """
+        self._require_runtime()
+        expected = (self.batch, self.particle_count)
+        for name, tail in (("x", (3,)), ("v", (3,)), ("C", (3, 3)), ("F", (3, 3))):
+            if np.shape(getattr(state, name)) != (*expected, *tail):
+                raise ArgumentError(
+                    f"{name} has shape {np.shape(getattr(state, name))}, not {(*expected, *tail)}"
+                )
+        if np.shape(state.poses) != self._initial_poses.shape:
+            raise ArgumentError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
+        self._version += 1
+        self._particles.current.from_numpy(self._particles.pack(state))
+        self._particles.order.reset()
+        self._place(np.asarray(state.poses, np.float64))
+
+    def set_initial_state(self, state: State) -> None:
+        """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
+        :class:`State`."""
+        self.set_state(state)
+        self._initial_poses = np.array(state.poses, np.float64)
+        self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
+
+    # -- rollouts and gradients -----------------------------------------------------------------------
 
     def rollout(
         self, actions: np.ndarray | torch.Tensor, gradient: bool = True, *, strict: bool = True
@@ -56,8 +434,7 @@ class Simulator(ForwardSimulator):
         if gradient and not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
         array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
-        kept = gradient or not self._skips.history
-        plan = self._tape.plan(steps, self.memory_mb) if kept else None
+        plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         poses = self._pose_history(steps, self._initial_poses)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
@@ -248,13 +625,47 @@ class Simulator(ForwardSimulator):
     def steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done, of ``steps``, before a manipulator that moves touches
         any environment's body; 0 where the whole gradient is asked for."""
-        if self._engine.full_gradient or not self._skips.adjoints:
+        if self._engine.full_gradient:
             return 0
         engine = self._engine
         touched, untouched = engine.read(engine.touched), engine.read(engine.untouched_step)
         return int(np.where(touched != 0, untouched, steps).min())
 
-    # -- internals ----------------------------------------------------------------------------------
+    # -- internals ------------------------------------------------------------------------------------
+
+    def _judged(self, values: np.ndarray | torch.Tensor) -> Measures:
+        """Loss terms and soft IoU from measures of shape [..., batch, measure]; see
+        :class:`plab.sim.term_phases.TermPhases`."""
+        terms = self._engine.terms
+        peak = values[..., len(terms)]
+        judges = [term.iou(values[..., k], peak) for k, term in enumerate(terms) if not term.weighted]
+        iou = judges[0] if judges else peak * np.nan
+        # Those that are measured only come last.
+        return Measures(values[..., : len(self.terms)], iou)
+
+    def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
+        """Make the scenes' start the initial state."""
+        positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
+        self._particles.order.start_from(positions)
+        self._engine.fill_bodies(self.scenes, self._particles.order.initial)
+        self._initial_poses = initial_poses(self.scenes)
+        start = rest_state(np.stack(positions), self._initial_poses)
+        self._initial.from_numpy(self._particles.pack(start))
+
+    def _place(self, poses: np.ndarray) -> None:
+        """Place the manipulators for a start, at which nothing has gone wrong."""
+        if self.manipulator_count:
+            copy_numbers(self._pose, 0, np.array(poses).reshape(-1), poses.size, 1)
+        self._engine.place(self._pose, 0, self._pose, 1)
+        self._taken = 0
+
+    def _require_runtime(self) -> None:
+        if not is_current(self._runtime):
+            raise RuntimeError(
+                "this simulator's memory is gone: Taichi was started anew with another device, precision or "
+                "number of "
+                "threads; build the simulator again"
+            )
 
     @contextmanager
     def _kept_weights(self) -> Iterator[np.ndarray]:
@@ -278,3 +689,11 @@ class Simulator(ForwardSimulator):
             raise RuntimeError("build the simulator with full_gradient=True for this gradient")
         if self._tape.bar is None:
             raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
+
+
+def _engine_class(device: str) -> type:
+    if device == "cuda":
+        from plab.sim.cuda_engine import CudaEngine
+
+        return CudaEngine
+    return CpuEngine

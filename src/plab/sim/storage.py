@@ -12,20 +12,20 @@ consecutive particles with a private grid each, so that scattering needs no atom
 depend on the number of threads.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
 import taichi as ti
+from numpy.typing import ArrayLike
 
 from plab.scene import MANIPULATOR_SHAPES, Scene
-from plab.sim.exchange import Exchange
-from plab.sim.parameters import material_parameters
+from plab.sim.batch import material_parameters
+from plab.sim.linalg import Series
 from plab.sim.runtime import Runtime
-from plab.sim.series import Series
 from plab.sim.shapes import SURFACES, require_surfaces
-from plab.sim.skips import Skips
 from plab.sim.tensors import Array
 
 __all__ = [
@@ -113,29 +113,34 @@ STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BAR
 a2; bars those of k, c2, J; parameters mu, lambda and the yield strain, with adjoints of their own."""
 
 LANES = {"cpu": 8, "cuda": 32}
+"""Particles per tile."""
+
+PIECE = 1 << 21
+"""Entries of a field that are copied between host and device at a time."""
 
 
-class Storage(Exchange):
+class Storage:
     """Fields and constants that all phases of a substep share; see the module's docstring for the layout."""
 
     def __init__(
         self,
         scenes: Sequence[Scene],
         runtime: Runtime,
-        skips: Skips,
         full_gradient: bool = False,
         deterministic: bool = False,
+        singular_values: bool = False,
     ) -> None:
         """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
         data, for :meth:`fill_parameters`; gradients include those by initial state and material if
-        ``full_gradient``. The CPU is ``deterministic`` in any case."""
-        super().__init__()
+        ``full_gradient``. The CPU is ``deterministic`` in any case. With ``singular_values`` the series of
+        :mod:`plab.sim.material` serve no particle."""
+        # Fields that the host reads or writes: number, field, components.
+        self.shared: list[tuple[int, ti.Field, int]] = []
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
         self.adjoint_sums: list[tuple[ti.Field, int]] = []
         self.full_gradient = full_gradient
         self.deterministic = deterministic
         first = scenes[0]
-        self.skips = skips
         self.device = runtime.device
         self.cuda = runtime.device == "cuda"
         self.real = runtime.real
@@ -152,7 +157,7 @@ class Storage(Exchange):
         self.materials = first.material_count
         self.mixed = self.materials > 1
         self.series = Series.for_precision(runtime.precision)
-        if not skips.singular_values:
+        if singular_values:
             self.series = replace(self.series, z_squared_max=-1.0)
         self._set_grid(first)
         self._set_manipulators(first)
@@ -189,11 +194,11 @@ class Storage(Exchange):
 
     def moves(self, shape: str) -> bool:
         """Whether manipulators of this shape can move; decided while compiling, as what follows."""
-        return MANIPULATOR_SHAPES[shape].moves or not self.skips.still_manipulators
+        return MANIPULATOR_SHAPES[shape].moves
 
     def turns(self, shape: str) -> bool:
         """Whether manipulators of this shape rotate."""
-        return MANIPULATOR_SHAPES[shape].turns or not self.skips.rotations
+        return MANIPULATOR_SHAPES[shape].turns
 
     def rotated(self, shape: str) -> bool:
         """Whether the rotation of a shape's frame matters: what is round has a spin only."""
@@ -315,3 +320,58 @@ class Storage(Exchange):
         self.write(self.high, [tool.upper_bound for tool in tools])
         self.write(self.friction, [tool.friction for tool in tools])
         self.write(self.minimal_gap, [tool.minimal_gap for tool in tools])
+
+    # -- fields and the host ------------------------------------------------------------------------
+    #
+    # One kernel serves all fields: every kernel takes a tenth of a second to load on CUDA, and Taichi's own
+    # copies have one for each field.
+
+    def share(self, field: ti.Field) -> ti.Field:
+        """Register a field and return it, before the first kernel is compiled.
+
+        :meth:`write` takes fields of numbers or vectors with one or two dimensions, :meth:`read` those of
+        numbers with one dimension.
+        """
+        self.shared.append((len(self.shared), field, getattr(field, "n", 0)))
+        return field
+
+    def write(self, field: ti.Field, values: ArrayLike) -> None:
+        """Write all entries of a shared field, from numbers whose shape begins with the field's."""
+        self._copy_field(field, np.asarray(values).reshape(-1), 1)
+
+    def read(self, field: ti.Field) -> np.ndarray:
+        """Return all entries of a shared field of numbers and of one dimension."""
+        out = np.zeros(field.shape)
+        self._copy_field(field, out, 0)
+        return out
+
+    def _copy_field(self, field: ti.Field, numbers: np.ndarray, writes: int) -> None:
+        which = next(number for number, own, _ in self.shared if own is field)
+        entries = math.prod(field.shape)
+        size = numbers.size // entries
+        for first in range(0, entries, PIECE):
+            count = min(PIECE, entries - first)
+            piece = numbers[first * size : (first + count) * size]
+            # A copy: kernels take arrays as something that they might write to.
+            self.copy_entries(which, writes, piece.astype(np.float64) if writes else piece, first, count)
+
+    @ti.kernel
+    def copy_entries(self, which: ti.i32, writes: ti.i32, numbers: Array, first: ti.i32, count: ti.i32):
+        """Write an array to some entries of the shared field of this number, or read them into it."""
+        for i in range(count):
+            for number, field, size in ti.static(self.shared):
+                if which == number:
+                    at = first + i
+                    row, column = at // field.shape[-1], at % field.shape[-1]
+                    if ti.static(size == 0 and len(field.shape) == 1):
+                        if writes != 0:
+                            field[at] = ti.cast(numbers[i], field.dtype)
+                        else:
+                            numbers[i] = ti.cast(field[at], ti.f64)
+                    elif ti.static(size == 0):
+                        field[row, column] = ti.cast(numbers[i], field.dtype)
+                    for c in ti.static(range(size)):
+                        if ti.static(len(field.shape) == 1):
+                            field[at][c] = ti.cast(numbers[i * size + c], field.dtype)
+                        else:
+                            field[row, column][c] = ti.cast(numbers[i * size + c], field.dtype)

@@ -17,12 +17,11 @@ import numpy as np
 import taichi as ti
 
 from plab.scene import MANIPULATOR_SHAPES
-from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint
-from plab.sim.pose_phases import vec4, vec8
+from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint, vec4, vec8
+from plab.sim.particle_phases import spline, spline_slope
 from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
-from plab.sim.transfer import spline, spline_slope
 
 __all__ = ["EXTRA_MEASURES", "LossTerm", "TermPhases"]
 

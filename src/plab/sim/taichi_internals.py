@@ -1,0 +1,309 @@
+"""Reaches into Taichi's internals: everything that its documented interface does not promise.
+
+Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. A patch is left out where
+another version lacks what it changes.
+
+Patches, with what they change and why:
+    :func:`tell_classes_quickly`: ``kernel_impl._inside_class``. The import of the simulator would take a
+        quarter longer.
+    :func:`hasten_tracing`: ``kernel_impl.getsourcelines`` and ``textwrap``,
+        ``ASTTransformerContext.get_pos_info``. Half of compiling from a warm cache serves messages only.
+    :func:`forget_arguments`: ``Kernel.mapper.mapping``. It would hold 100 kB of each simulator for good.
+    :func:`free_own_arrays_only`: ``ScalarNdarray.__init__`` and ``__del__``. Arrays from before ``ti.init``
+        would free memory that is in use.
+    :func:`watch_compiling`: ``kernel_impl._get_tree_and_ctx``, ``Kernel.launch_kernel``. Nothing else says
+        when a kernel is compiled.
+
+Other uses, and why:
+    :class:`Bitcode`: ``SourceBuilder.bc`` and ``mode``. The public way to them compiles C++ with clang.
+    :func:`address_of`: ``Program.get_ndarray_data_ptr_as_int``. Bitcode takes addresses.
+    :data:`local_variable`: ``impl.expr_init``. Bitcode takes lists of local variables.
+    :func:`cache_folder`: ``impl.default_cfg().offline_cache_file_path``. Locks of killed processes are
+        removed there.
+    :func:`cuda_available`: ``core.with_cuda``. ``ti.init`` falls back to the CPU instead of raising.
+
+Nothing of the standard library is changed. :mod:`plab.sim` imports this module before any kernel is defined,
+which changes Taichi's decorators; :func:`plab.sim.runtime.start_runtime` applies the other patches.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import inspect
+import linecache
+import os
+import sys
+import textwrap
+import types
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import taichi as ti
+from taichi.lang import _ndarray, impl, kernel_impl
+from taichi.lang.source_builder import SourceBuilder
+
+from plab.cache import cache_dir
+
+__all__ = [
+    "BITCODE",
+    "Bitcode",
+    "address_of",
+    "cache_folder",
+    "cuda_available",
+    "forget_arguments",
+    "free_own_arrays_only",
+    "hasten_tracing",
+    "local_variable",
+    "tell_classes_quickly",
+    "watch_compiling",
+]
+
+BITCODE = Path(__file__).with_name("bitcode")
+"""Folder of the files that ``make bitcode`` writes."""
+
+
+# -- definitions of kernels ---------------------------------------------------------------------------------
+
+
+def tell_classes_quickly() -> None:
+    """Let Taichi's decorators tell functions from methods without a search for the source.
+
+    For each function of a module Taichi asks ``inspect`` for the source of the module's importer, which looks
+    through all modules, each time, for a file that it does not know. Methods are told as before.
+    """
+    tell = getattr(kernel_impl, "_inside_class", None)
+    if tell is None or hasattr(tell, "__wrapped__"):
+        return
+
+    @functools.wraps(tell)
+    def inside_class(level_of_class_stackframe: int) -> bool:
+        # The frame below the one that Taichi asks for is a class's body, or it is none.
+        if "__qualname__" not in sys._getframe(level_of_class_stackframe - 1).f_locals:
+            return False
+        return bool(tell(level_of_class_stackframe + 1))
+
+    kernel_impl._inside_class = inside_class
+
+
+tell_classes_quickly()
+
+
+# -- compiling ----------------------------------------------------------------------------------------------
+
+
+def hasten_tracing() -> None:
+    """Let Taichi find a function's source and tell an AST node's place quickly: both only serve messages.
+
+    Taichi looks the source up, among all modules of the process, and lays it out at each inlining, and wraps
+    an excerpt of it for each node: half of what compiling from a warm cache takes. What a future Taichi no
+    longer has is left as it is.
+    """
+    from taichi.lang.ast import ast_transformer_utils
+
+    find = getattr(kernel_impl, "getsourcelines", None)
+    if find is not None and not hasattr(find, "__wrapped__"):
+        kernel_impl.getsourcelines = _quick_sources(find)
+    if getattr(kernel_impl, "textwrap", None) is textwrap:
+        fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
+        kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
+    context = ast_transformer_utils.ASTTransformerContext
+    if hasattr(context, "get_pos_info"):
+        context.get_pos_info = _position
+
+
+def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Read the source of functions of files where the code says that it is, and of others as before."""
+
+    @functools.cache
+    def block(file: str, first: int) -> list[str]:
+        lines = linecache.getlines(file)[first - 1 :]
+        last = _last_lines(file).get(first)
+        return inspect.getblock(lines) if last is None else lines[: last - first + 1]
+
+    @functools.wraps(find)
+    def quick(function: Any) -> Any:
+        code = function.__code__
+        lines = block(code.co_filename, code.co_firstlineno)
+        return (list(lines), code.co_firstlineno) if lines else find(function)
+
+    return quick
+
+
+@functools.cache
+def _last_lines(file: str) -> dict[int, int]:
+    """Where the functions and methods of a file end, by where they, or their first decorators, begin: sooner
+    found by parsing the file than by going through each function's tokens, as ``inspect`` does. Functions
+    within functions are left out."""
+    found = {}
+    with contextlib.suppress(SyntaxError):
+        outer = ast.parse("".join(linecache.getlines(file))).body
+        inner = [node for kind in outer if isinstance(kind, ast.ClassDef) for node in kind.body]
+        for node in (*outer, *inner):
+            if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
+                first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+                found[first] = node.end_lineno
+    return found
+
+
+def _position(context: Any, node: Any) -> str:
+    """Return place and first line of an AST node, marked, for a message; nothing before there is one."""
+    if not context.raised:
+        return ""
+    line = context.src[node.lineno - 1]
+    begins = context.indent + node.col_offset
+    ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
+    number, name = node.lineno + context.lineno_offset, context.func.func.__name__
+    mark = " " * begins + "^" * (ends - begins)
+    return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
+
+
+_ENTRY = "_get_tree_and_ctx"
+"""What Taichi calls for each kernel and function that it compiles, and at no launch of one that it has."""
+
+
+@contextlib.contextmanager
+def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Tell which kernel is being compiled while the ``with`` block lasts.
+
+    Launches of kernels that are compiled already cost nothing more. A future Taichi that compiles in another
+    way is not watched.
+
+    Args:
+        tell: Takes the kernel's name when its compiling begins, and an empty name after its first launch.
+    """
+    original = getattr(kernel_impl, _ENTRY, None)
+    if original is None:
+        yield
+        return
+
+    @functools.wraps(original)
+    def entry(function: Any, *args: Any, **kwargs: Any) -> Any:
+        if isinstance(function, kernel_impl.Kernel):
+            tell(function.func.__name__)
+            _tell_after_launch(function, tell)
+        return original(function, *args, **kwargs)
+
+    setattr(kernel_impl, _ENTRY, entry)
+    try:
+        yield
+    finally:
+        setattr(kernel_impl, _ENTRY, original)
+
+
+def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
+    """Tell when the next launch of a kernel, which does the rest of the compiling, is over."""
+
+    def launch(*args: Any) -> Any:
+        # Only of this launch: the attribute hides the method.
+        del kernel.launch_kernel
+        try:
+            return kernel.launch_kernel(*args)
+        finally:
+            tell("")
+
+    kernel.launch_kernel = launch
+
+
+# -- memory -------------------------------------------------------------------------------------------------
+
+
+def forget_arguments() -> None:
+    """Let kernels forget what they were called with before Taichi started anew, as they forget their code.
+
+    Else Taichi's own kernels hold all fields that they have ever filled or read, some 100 kB of a simulator.
+    """
+    for kernel in getattr(impl.get_runtime(), "kernels", ()):
+        if hasattr(kernel, "mapper"):
+            kernel.mapper.mapping.clear()
+
+
+def free_own_arrays_only() -> None:
+    """Let arrays of before Taichi started anew, which are gone, free nothing when Python forgets them: Taichi
+    would free what is at their addresses by now, an array that is in use, perhaps."""
+    kind, current = _ndarray.ScalarNdarray, impl.get_runtime
+    make, free = kind.__init__, getattr(kind, "__del__", None)
+    if free is None or hasattr(free, "__wrapped__"):
+        return
+
+    @functools.wraps(make)
+    def made(self: Any, *args: Any, **words: Any) -> None:
+        self.start = weakref.ref(current())
+        make(self, *args, **words)
+
+    @functools.wraps(free)
+    def freed(self: Any) -> None:
+        # There is none when Python has taken Taichi apart, at its own end.
+        runtime = current()
+        if runtime is not None and self.start() is runtime:
+            free(self)
+
+    kind.__init__, kind.__del__ = made, freed
+
+
+def address_of(array: ti.Ndarray) -> int:
+    """Return the address of an array's first number."""
+    return int(impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr))
+
+
+# -- devices and cache --------------------------------------------------------------------------------------
+
+
+def cache_folder() -> Path:
+    """Return the folder of Taichi's cache of compiled kernels."""
+    return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
+
+
+def cuda_available() -> bool:
+    """Whether Taichi can open a CUDA device."""
+    return bool(ti._lib.core.with_cuda())
+
+
+# -- bitcode ------------------------------------------------------------------------------------------------
+
+local_variable = impl.expr_init
+"""Makes a local variable within a ``ti.func``, where a list of variables is wanted."""
+
+_ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
+
+
+class Bitcode:
+    """Functions of a file of LLVM bitcode, which Taichi links into its kernels.
+
+    Attributes:
+        path: Where it is: a copy in plab's cache folder, if that can be written to. Taichi knows compiled
+            kernels by that place, which is then the same for all environments and checkouts.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Take the file that begins with a name; ImportError if there is none."""
+        found = list(BITCODE.glob(f"{name}-*.bc"))
+        if not found:
+            raise ImportError(
+                f"plab's simulator has no code for {name}: `make bitcode` has to learn its data layout"
+            )
+        self.path = _shared(found[0])
+        self._source = SourceBuilder()
+        self._source.bc, self._source.mode = self.path, "bc"
+
+    def __call__(self, name: str, real: Any) -> Callable[..., None]:
+        """Return a function for numbers of a type; it takes local variables."""
+        found: Callable[..., None] = getattr(self._source, f"{name}_{_ENDINGS[real]}")
+        return found
+
+
+def _shared(path: Path) -> str:
+    code = path.read_bytes()
+    # RuntimeError: there is no home.
+    with contextlib.suppress(OSError, RuntimeError):
+        copied = cache_dir() / path.name
+        if not copied.exists() or copied.read_bytes() != code:
+            copied.parent.mkdir(parents=True, exist_ok=True)
+            own = copied.with_name(f"{path.name}.{os.getpid()}")
+            own.write_bytes(code)
+            own.replace(copied)
+        return str(copied)
+    return str(path)
