@@ -45,10 +45,10 @@ def _simulators_of_one_module(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _own_databases(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep databases of the tests' results out of the user's cache folder."""
+def _own_index(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the index of the tests' results out of the user's cache folder."""
     folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setattr("plab.results.store.cache_dir", lambda: folder)
+    monkeypatch.setattr("plab.results.index.cache_dir", lambda: folder)
 
 
 @pytest.fixture(autouse=True)

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from plab.bench.results import synthetic_run, template
 from plab.results import RunResult, result_path, write
+from synthetic_runs import synthetic_run, template
 
 ROWS = 4
 

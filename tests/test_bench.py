@@ -1,4 +1,4 @@
-"""Benchmarks: complete rows, the lower bound of a step, source trees in turns, skips and memory."""
+"""Benchmarks: complete rows, the lower bound of a step, source trees in turns."""
 
 from __future__ import annotations
 

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from plab.sim import bitcode
-from plab.sim.bitcode import Bitcode
 from plab.sim.cuda_bitcode import add
 from plab.sim.runtime import start_runtime
-
-FOLDER = Path(bitcode.__file__).parent
+from plab.sim.taichi_internals import BITCODE, Bitcode
 
 
 def test_bitcode_is_that_of_its_source(monkeypatch) -> None:
@@ -21,13 +18,13 @@ def test_bitcode_is_that_of_its_source(monkeypatch) -> None:
     monkeypatch.delitem(sys.modules, "bitcode", raising=False)
     import bitcode as tool
 
-    assert tool.files() == {path.name: path.read_bytes() for path in FOLDER.glob("*.bc")}
+    assert tool.files() == {path.name: path.read_bytes() for path in BITCODE.glob("*.bc")}
 
 
 def test_the_copy_in_the_cache_is_that_of_the_package(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "cache"))
     copied = Path(Bitcode("cuda").path)
-    original = FOLDER / copied.name
+    original = BITCODE / copied.name
     assert copied.parent == tmp_path / "cache" and copied.read_bytes() == original.read_bytes()
     copied.write_bytes(b"of somebody else")
     assert Path(Bitcode("cuda").path).read_bytes() == original.read_bytes()

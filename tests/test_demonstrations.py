@@ -9,12 +9,12 @@ import pytest
 
 import plab.demonstrations as demonstrations
 import synthetic
-from plab.bench.results import synthetic_run
 from plab.cli.demonstrations import main, replay
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, load_actions, recorded_scores, save_actions
 from plab.results import config_dict
 from plab.targets import demonstration
+from synthetic_runs import synthetic_run
 
 TASKS = (
     "Assembly", "Chopsticks", "Move", "Pinch", "RollingPin", "Rope", "Table", "Torus", "TripleMove", "Writer",

@@ -13,13 +13,12 @@ import taichi as ti
 
 import suite
 from plab.scene import Body
-from plab.sim.cpu_bitcode import address_of
-from plab.sim.cpu_phases import CpuPhases
-from plab.sim.cuda_threads import ThreadPhases
+from plab.sim.cpu_engine import CpuPhases
+from plab.sim.cuda_phases import CudaPhases
+from plab.sim.particle_phases import spline
 from plab.sim.runtime import start_runtime
-from plab.sim.skips import Skips
 from plab.sim.storage import FRAME_ADJOINT, STATE
-from plab.sim.transfer import spline
+from plab.sim.taichi_internals import address_of
 
 pytestmark = pytest.mark.skipif(suite.DEVICE != "cpu", reason="on CUDA the reference is compared with")
 
@@ -80,7 +79,7 @@ class Tiles(CpuPhases):
 
 
 @ti.data_oriented
-class Threads(ThreadPhases):
+class Threads(CudaPhases):
     """CUDA's phases, one at a time, and one particle after the other where warps would scatter together."""
 
     @ti.func
@@ -157,7 +156,7 @@ class Threads(ThreadPhases):
 @pytest.fixture(scope="module")
 def pair() -> tuple[Tiles, Threads]:
     runtime = start_runtime("cpu", "float64")
-    both = Tiles(SCENES, runtime, Skips(), True), Threads(SCENES, runtime, Skips(), True)
+    both = Tiles(SCENES, runtime, True), Threads(SCENES, runtime, True)
     order = np.stack([np.random.default_rng(9).permutation(s.particle_count) for s in SCENES])
     for phases in both:
         phases.fill_parameters(SCENES)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from plab.sim import linalg, material
-from plab.sim.series import Series
+from plab.sim.linalg import Series
 
 SERIES = Series.for_precision("float64")
 MU, LAM, YIELD, DT = 417.0, 278.0, 0.02, 1e-4

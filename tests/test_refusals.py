@@ -30,6 +30,7 @@ from plab.cli import (
     verify,
     view,
 )
+from plab.cli.main import main as plab_main
 from plab.cli.run import main
 from plab.config import load_config
 from plab.config.checks import check_sources
@@ -220,14 +221,11 @@ TOOLS = [
     (submit.main, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
     (verify.main, "nowhere", "nowhere"),
     (leaderboard.main, "nowhere", "nowhere"),
-    (bench.speed, "--skips everything", "'everything'"),
     (bench.speed, "--batch 0", "--batch"),
-    (bench.release, "--choice nothing", "nothing"),
-    (bench.results, "--runs 0", "--runs"),
-    (bench.everyday, "--against nowhere", "nowhere"),
-    (bench.rl, "--methods adam", "adam"),
     (bench.stability, "--quick --family nothing", "nothing"),
     (bench.accuracy, "--task Table", "Table"),
+    (bench.main, "sped", "did you mean speed?"),
+    (plab_main, "rnu", "choose from: run"),
     (bench.unseen, "nowhere.h5 --scenes 0", "--scenes"),
 ]
 """Command lines, their arguments, and what the answer names."""

@@ -12,7 +12,6 @@ import pytest
 
 import synthetic
 from browsing import browsing, press, until
-from plab.bench.results import synthetic_run, template
 from plab.cli.report import main
 from plab.config.selection import select
 from plab.render.graphics import missing_graphics
@@ -21,6 +20,7 @@ from plab.report.collect import NAMES, collect
 from plab.report.media import best_runs, present
 from plab.report.methods import method
 from plab.results import load
+from synthetic_runs import synthetic_run, template
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

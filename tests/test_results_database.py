@@ -63,7 +63,7 @@ def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list
     age(archive)
     keys, digests = ["task.yield_stress", "method.lr", "nothing.here"], set()
     for source in (folder, archive):
-        plain = load(source, keys, database=False)
+        plain = load(source, keys, index=False)
         pd.testing.assert_frame_equal(load(source, keys), plain)
         opened.clear()
         pd.testing.assert_frame_equal(load(source, keys), plain)
@@ -74,7 +74,7 @@ def test_second_call_opens_nothing_and_finds_the_same(folder: Path, opened: list
 
 
 def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
-    # Numbers and texts that a database has not, or has otherwise.
+    # Numbers and texts that a table has otherwise.
     for seed, message in enumerate(["", "a\nb", "\u00e9t\u00e9", 'in "quotes"']):
         made = synthetic.run(tmp_path, seed=seed)
         made.config["task"]["limit"], made.config["seed_scene"] = float("inf"), 2**70
@@ -84,13 +84,13 @@ def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
         path = tmp_path / f"seed{seed}{'.partial' if message else ''}.h5"
         write(made, path)
         age(path)
-    fresh, _ = rows(tmp_path, database=False)
+    fresh, _ = rows(tmp_path, index=False)
     for _ in range(2):
         kept, _ = rows(tmp_path)
         assert repr(kept) == repr(fresh)
     assert [row.config for row in kept] == [read(row.path).config for row in kept]
     assert ask(tmp_path, "SELECT DISTINCT value FROM config WHERE key = 'seed_scene'") == [(str(2**70),)]
-    assert ask(tmp_path, "SELECT DISTINCT value FROM config WHERE key = 'task.limit'") == [(float("inf"),)]
+    assert ask(tmp_path, "SELECT DISTINCT number FROM config WHERE key = 'task.limit'") == [(float("inf"),)]
 
 
 # ------------------------------------------------------------------------------------------------- staleness
@@ -98,7 +98,7 @@ def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
 
 def test_changed_new_and_removed_files_are_noticed(folder: Path, opened: list[str]) -> None:
     first = load(folder)
-    read_curves(folder, first["path"])
+    read_curves(first["path"])
     replaced, removed, kept = (Path(path) for path in first["path"])
     made = synthetic.run(folder, seed=0, score=0.25)
     made.columns["score"] = np.full(made.rows, 0.125)
@@ -111,7 +111,7 @@ def test_changed_new_and_removed_files_are_noticed(folder: Path, opened: list[st
     assert list(table.index) == [0, 2, 7]
     assert table.loc[0, "score"] == pytest.approx(0.25)
     assert ask(folder, "SELECT seed FROM runs ORDER BY seed") == [(0,), (2,), (7,)]
-    curves, unchanged = read_curves(folder, [replaced, kept])
+    curves, unchanged = read_curves([replaced, kept])
     assert np.unique(curves["score"]).tolist() == [0.125]
     pd.testing.assert_frame_equal(pd.DataFrame(unchanged), read(kept).iterations)
 
@@ -129,7 +129,7 @@ def test_unreadable_files_are_named_each_time(folder: Path) -> None:
         connect([folder, folder / "nowhere"])
 
 
-def test_a_damaged_database_is_rebuilt_silently(folder: Path, recwarn) -> None:
+def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:
     expected = load(folder)
     for path in (path for path in folder.iterdir() if path.is_file()):
         path.write_bytes(path.read_bytes()[:5000] + b"x" * 99)
@@ -145,23 +145,23 @@ def test_tables(folder: Path) -> None:
     run = read(path)
     row = dict(load(folder).iloc[0])
     with closing(connect(folder, iterations=True)) as connection:
-        table = pd.read_sql_query("SELECT * FROM runs WHERE seed = 0", connection)
+        table = connection.sql("SELECT * FROM runs WHERE seed = 0").df()
         (number,) = table["run"]
         for name in ("task", "variant", "method", "score", "iou", "config_hash", "status", "iterations"):
             assert table[name].tolist() == [row[name]], name
         assert (folder / table["path"][0]) == Path(path)
-        assert table[["protocol", "targets"]].values.tolist() == [["plab", None]]
+        assert table["protocol"].tolist() == ["plab"] and table["targets"].isna().all()
         of_run = f"WHERE run = {number}"
         evaluation = dict(connection.execute(f"SELECT name, value FROM evaluations {of_run}").fetchall())
         assert evaluation == run.evaluation
         times = dict(connection.execute(f"SELECT phase, seconds FROM times {of_run}").fetchall())
         assert times == run.wall_time
         settings = dict(connection.execute(f"SELECT key, value FROM config {of_run}").fetchall())
-        assert settings["method.lr"] == run.config["method"]["lr"]
+        assert float(settings["method.lr"]) == run.config["method"]["lr"]
         center = run.config["task"]["bodies"]["rope"]["center"]
         assert json.loads(settings["task.bodies.rope.center"]) == center
-        assert settings["seed"] == 0 and settings["targets.source"] is None
-        rows = pd.read_sql_query(f"SELECT * FROM iterations {of_run} ORDER BY iteration", connection)
+        assert settings["seed"] == "0" and settings["targets.source"] is None
+        rows = connection.sql(f"SELECT * FROM iterations {of_run} ORDER BY iteration").df()
         pd.testing.assert_frame_equal(rows.drop(columns="run"), run.iterations)
 
 
@@ -188,7 +188,7 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 def test_sql_refuses_in_a_line(folder: Path, told) -> None:
     load(folder)
     for sql, named in (
-        ("delete from runs", "reading"),
+        ("delete from runs", "select"),
         ("select lr from runs", "lr"),
         ("select * from scores", "evaluations"),
     ):

@@ -12,9 +12,9 @@ import torch
 import reference_mpm as reference
 from plab.losses import make_terms
 from plab.scene import Body, Manipulator, Scene, SceneError
-from plab.sim import SimulationError, Simulator, exchange
+from plab.sim import SimulationError, Simulator, storage
 from plab.sim.memory import ENTRIES_MAX, batch_limit
-from plab.sim.order import curve_order, hilbert_index
+from plab.sim.particles import curve_order, hilbert_index
 from plab.sim.storage import CHUNKS, INDEX_MASK
 from suite import DEVICE, make_not_finite, reference_state
 
@@ -258,7 +258,7 @@ def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
 def test_fields_are_written_entry_by_entry(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     """In several pieces; numbers differ, so that no entry can be taken for another."""
     engine = sim._engine
-    monkeypatch.setattr(exchange, "PIECE", 7)
+    monkeypatch.setattr(storage, "PIECE", 7)
     for _, field, size in engine.shared:
         kept = field.to_numpy()
         values = np.arange(1.0, 1.0 + kept.size).reshape(kept.shape)

@@ -20,7 +20,6 @@ import yaml
 import plab
 import synthetic
 from browsing import browsing, press
-from plab.bench.results import synthetic_run, template
 from plab.cli import leaderboard, submit, verify
 from plab.config import load_config
 from plab.config.suite import suite_tasks
@@ -48,6 +47,7 @@ from plab.submissions.verifying import (
     read_verification,
     write_verification,
 )
+from synthetic_runs import synthetic_run, template
 
 ROOT = Path(__file__).resolve().parents[1]
 CARD = Card("Mine", ("A. Author", "B. Author"), "https://example.org/mine", 10**9, "a laptop", False)

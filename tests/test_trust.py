@@ -107,7 +107,7 @@ def said(reading: Callable[[], Any]) -> str:
         ({"config": "[1, 2]"}, "config"),
         ({"config": "{}"}, "task"),
         ({"config": "{"}, "damaged"),
-        ({"status": 3}, "status"),
+        ({"summary": "{}"}, "config_hash"),
     ],
 )
 def test_result_files_with_odd_attributes(tmp_path: Path, capsys, changes: dict, named: str) -> None:

@@ -189,7 +189,7 @@ def test_simulators_stay_usable_beside_the_viewer(simulated, monkeypatch):
     simulator.reset()
     assert simulator.state().x.dtype == np.float64
     # Without that it would say so, also where memory that is gone would end the process.
-    monkeypatch.setattr("plab.sim.forward.is_current", lambda runtime: False)
+    monkeypatch.setattr("plab.sim.simulator.is_current", lambda runtime: False)
     mass = np.zeros((1, 16, 16, 16))
     with pytest.raises(RuntimeError, match="memory is gone"):
         simulator.set_material(yield_stress=50.0)

@@ -20,7 +20,7 @@ from plab.config import load_config
 from plab.results import RunFile
 from plab.results import read as read_result
 from plab.runners.jobs import Job
-from plab.sim.compiling import watch_compiling
+from plab.sim.taichi_internals import watch_compiling
 
 COARSE = ("sim.grid_size=16", "sim.horizon=2", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

@@ -15,7 +15,7 @@ import pytest
 from plab.bench.accuracy import UncheckedScene
 from plab.losses import make_terms
 from plab.scene import Body, Scene
-from plab.sim import Simulator, Skips, State
+from plab.sim import Simulator, State
 from suite import DEVICE
 
 GRID = 16
@@ -102,7 +102,7 @@ def free() -> Simulator:
     settings = {"precision": "float64", "device": DEVICE, "particles": list(START)}
     # On CUDA the backward pass keeps the stress: there has to be something to differentiate.
     terms = () if DEVICE == "cpu" else make_terms({"density": 1.0})
-    sim = Simulator(list(SCENES.values()), terms=terms, skips=Skips(adjoints=DEVICE == "cpu"), **settings)
+    sim = Simulator(list(SCENES.values()), terms=terms, full_gradient=DEVICE != "cpu", **settings)
     if terms:
         sim.set_target(*[np.zeros((sim.batch, GRID, GRID, GRID))] * 2)
     return sim

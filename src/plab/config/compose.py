@@ -80,8 +80,8 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
 
 
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Raise ConfigError for a folder of the user's that is missing, or that has a file with a name of plab's
-    own, which Hydra would ignore."""
+    """Raise ConfigError for a missing folder of the user's, a file in it that is no text, and one with a name
+    of plab's own, which Hydra would ignore."""
     if not isinstance(config_dir, str | Path):
         raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
     if not str(config_dir).strip():
@@ -92,6 +92,10 @@ def _check_config_dir(config_dir: str | Path) -> None:
         for path in (Path(config_dir) / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
+            try:
+                path.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError):
+                raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
 
 
 def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:

@@ -154,6 +154,8 @@ def _write(place: Path, entries: Iterator[tuple[File, str, str, list[Row | Resul
             with contextlib.suppress(TypeError, ValueError):
                 values = json.dumps(row.values | {"path": ""})
                 table.append((name, identity, member, values, json.dumps(row.config)))
+    if not table and not place.exists():
+        return
     temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

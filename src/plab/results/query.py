@@ -148,7 +148,7 @@ def _connected(
     if iterations:
         curves = read_curves(row.path for row in found)
         tables["iterations"] = pd.concat(
-            [pd.DataFrame(columns).assign(run=run) for run, columns in enumerate(curves)]
+            [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
             or [tables["times"][["run"]]]
         )
     connection = duckdb.connect()
@@ -172,13 +172,17 @@ def _tables(found: Sequence[tuple[int, Row]], sources: Sequence[Path]) -> dict[s
         rows["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
         for key, value in _leaves(row.config, ""):
             number = float(value) if isinstance(value, int | float) else None
-            rows["config"].append((run, key, value if isinstance(value, str) else json.dumps(value), number))
+            plain = value is None or isinstance(value, str)
+            rows["config"].append((run, key, value if plain else json.dumps(value), number))
         for name, value in row.values.items():
             if name.startswith(_PHASE):
                 rows["times"].append((run, name.removeprefix(_PHASE), value))
             elif value == value and name not in _NO_EVALUATION:
                 rows["evaluations"].append((run, "score" if name == "score_best" else name, value))
-    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in rows.items()}
+    tables = {
+        name: pd.DataFrame([tuple(map(_encodable, row)) for row in table], columns=_TABLES[name])
+        for name, table in rows.items()
+    }
     # Types do not depend on which runs there are.
     for name in ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets"):
         tables["runs"][name] = tables["runs"][name].astype("string")
@@ -190,6 +194,11 @@ def _tables(found: Sequence[tuple[int, Row]], sources: Sequence[Path]) -> dict[s
 
 _NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
 """Columns of a table of runs that are no scalars of the final evaluation."""
+
+
+def _encodable(value: Any) -> Any:
+    """Return a value that DuckDB takes: file names may hold bytes that are no UTF-8."""
+    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
