@@ -154,12 +154,6 @@ def test_the_variant_is_a_string_and_seed_scene_is_left_out():
     assert cfg == load_config(["variant='3'"])
 
 
-def test_a_variant_may_have_any_name():
-    pillar = "{manipulators: {pillar: {position: [0.4, 0.1, 0.5]}}}"
-    cfg = load_config([f"+task.variants.tall={pillar}", "variant=tall"])
-    assert cfg.variant == "tall" and cfg.task.manipulators["pillar"].position == [0.4, 0.1, 0.5]
-
-
 LEARNING_RATES = {
     "task=Move": 0.1,
     "task=Chopsticks": 0.01,

@@ -118,17 +118,3 @@ def test_mistakes_are_told_in_one_line(told):
         (["--record", "sim.grid_size=32"], "resolution"),
     ):
         assert named in told(["--task", "Rope", *arguments], main)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("task", TASKS)
-def test_demonstrations_reach_what_is_recorded(task, device):
-    """At full resolution; float32 differs from float64 by up to 0.005, CUDA runs from each other by less."""
-    cfgs = [config(task, variant, f"sim.device={device}") for variant in VARIANTS]
-    replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
-    expected = recorded_scores().set_index(["task", "variant"])["score"]
-    for item in replays:
-        recorded = expected[(task, item.cfg.variant)]
-        assert item.scores.score == pytest.approx(recorded, abs=0.02), item.cfg.variant
-        if task not in GEOMETRIC:
-            assert item.scores.score >= 0.95

@@ -63,3 +63,11 @@ def test_the_version_is_semantic_and_in_one_place():
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
     assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_every_public_name_of_plab_is_there() -> None:
+    assert dir(plab) == sorted(plab.__all__)
+    assert all(getattr(plab, name) for name in plab.__all__)
+    assert plab.make.__module__ == "plab.envs" and len(plab.TASKS) == 10
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = plab.nothing

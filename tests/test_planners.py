@@ -385,8 +385,10 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
     results = [read(result_path(cfg)) for cfg in cfgs]
     assert [result.iterations["score"].tolist() for result in results] == until(enough)
     assert [faults(result) for result in results] == [[], []]
-    monkeypatch.setattr(checking, "SOLVED", 1.0)
     shorter = min(results, key=lambda result: len(result.iterations))
+    monkeypatch.setattr(checking, "SOLVED", shorter.iterations["score"].max())
+    assert faults(shorter) == []
+    monkeypatch.setattr(checking, "SOLVED", 1.0)
     assert f"it is finished after {len(shorter.iterations)} of 4 iterations" in faults(shorter)
 
 

@@ -104,22 +104,6 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
     assert [found for _, found in check(folder)] == [None, None]
 
 
-@pytest.mark.parametrize("hook", [None, "build", "step", "iterate"])
-def test_a_runner_that_is_none_or_lacks_hooks_is_refused(hook: str | None, folder: Path) -> None:
-    """One hook is not enough: a runner needs build, and step or iterate."""
-    code = f"class Lacking(Runner):\n    def {hook}(self, *given): ...\n" if hook else "Lacking = dict\n"
-    code = f"from plab.families import *\nfrom plab.runners import Runner\n{code}"
-    (folder / f"zz_lacks_{hook}.py").write_text(
-        f"{code}FAMILY = Family('', 'plab.config:ApgConfig', Lacking)\n"
-    )
-    cfg = load_config(["method=apg", f"results_dir={folder}"])
-    cfg.method.family = f"zz_lacks_{hook}:FAMILY"
-    search_in(folder)
-    (ended,) = run_batch([cfg])
-    assert ended.status == "refused"
-    assert (f"'{cfg.method.family}'" if hook is None else "build") in ended.message
-
-
 def test_everything_that_a_record_names_is_there() -> None:
     for record in FAMILIES.values():
         assert isinstance(record, Family) and issubclass(record.runner_type(), Runner)

@@ -34,7 +34,6 @@ from plab.cli.main import main as plab_main
 from plab.cli.run import main
 from plab.config import load_config
 from plab.config.checks import check_sources
-from plab.config.words import quoted
 from plab.envs.sb3 import make_sb3
 from plab.errors import PlabError
 from plab.problem import Problem
@@ -171,20 +170,6 @@ def test_broken_task_files(refused, tmp_path, case):
     assert named in refused(["--config-dir", "mine", "task=Broken"])
     path.rename(path.with_name("Rope.yaml"))
     assert "Rope.yaml" in refused(["--config-dir", "mine", "task=Rope"])
-
-
-def test_folders_of_any_name(seen, tmp_path, monkeypatch):
-    monkeypatch.setenv("PLAB_TEST_FOLDER", "there")
-    names = ["#1", "{a: b}", "it's größe"]
-    for name in names:
-        assert main([f"results_dir={name}"]) == 0
-        (tmp_path / name).mkdir()
-        assert status.main([name]) == 0
-    assert main(["results_dir='a,b'"]) == main(["results_dir=${oc.env:PLAB_TEST_FOLDER}"]) == 0
-    assert main(["-m", "results_dir=c,d"]) == 0
-    assert [cfg.results_dir for cfg in seen] == [*names, "a,b", "there", "c", "d"]
-    for text in ("x\\", "xa'b\\'c\\\\'", 'x"', "x[y"):
-        assert load_config([f"results_dir={quoted(text)}"]).results_dir == text
 
 
 # ------------------------------------------------------------------------------------------------ the others

@@ -304,25 +304,6 @@ def told(told) -> Callable[..., str]:
     return lambda *argv: told(argv, main)
 
 
-@pytest.mark.parametrize(
-    ("argv", "named"),
-    [
-        ([], "task="),
-        (["task=Ropee"], "did you mean Rope?"),
-        (["task=Rope", "--output", "rope.jpg"], "rope.jpg"),
-        (["task=Rope", "--size", "481x360"], "481x360"),
-        (["task=Rope", "--every", "0"], "--every"),
-        (["a.h5", "task=Rope"], "a.h5"),
-        (["--contact-sheet", "sheet.gif"], "sheet.gif"),
-        (["--contact-sheet", "sheet.png", "task=Rope"], "task=Rope"),
-        (["--film-strip", "strip.png"], "strip.png"),
-    ],
-    ids=" ".join,
-)
-def test_mistakes_of_a_command_line(told, argv, named):
-    assert named in told(*argv)
-
-
 def test_missing_packages_and_drivers_are_named(monkeypatch, told):
     monkeypatch.delenv("VTK_DEFAULT_OPENGL_WINDOW", raising=False)
     monkeypatch.setattr("plab.render.pictures.find_spec", lambda wanted: None)

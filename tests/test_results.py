@@ -23,6 +23,7 @@ from plab.results import (
     result_path,
     write,
 )
+from plab.results.schema import last_score
 
 
 def make_config(folder: Path, **changes) -> dict:
@@ -272,3 +273,9 @@ def test_reading_needs_neither_torch_nor_taichi() -> None:
     slow = "{'torch', 'taichi', 'scipy', 'hydra'} & {*sys.modules}"
     code = f"import sys, plab.results, plab.cli.results, plab.cli.status; assert not {slow}, {slow}"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_last_score_is_of_the_last_training_episodes_or_of_the_last_iteration() -> None:
+    score = np.array([0.2, 0.9, 0.4])
+    assert last_score({"score": score}) == 0.4
+    assert last_score({"score": score, "train_score": np.array([np.nan, 0.1, 0.3])}) == 0.3

@@ -12,7 +12,6 @@ import pytest
 from plab.config import build_scene, load_config
 from plab.scene import Scene
 from plab.targets import EPISODE_STEPS, demonstration
-from plab.targets.scripted import _touch
 
 SCRIPTED = ("Torus", "Writer", "Pinch", "RollingPin", "Chopsticks", "Assembly", "Table")
 VARIANTS = ("1", "2", "3", "4", "5")
@@ -73,12 +72,3 @@ def test_dents_are_pushed_in_from_outside():
         for angles, name in ((np.arctan2(y, np.hypot(x, z)), "elevation"), (np.arctan2(z, x), "azimuth")):
             low, high = target[name]
             assert ((angles > low - 2e-2) & (angles < high + 2e-2)).all()
-
-
-def test_a_sphere_meets_a_face_an_edge_and_a_corner_of_a_box():
-    half = np.array([0.1, 0.2, 0.3])
-    corner = np.linalg.norm(half)
-    assert _touch(half, np.array([0.0, -1.0, 0.0]), 0.04) == pytest.approx(0.24, abs=1e-6)
-    assert _touch(half, half / corner, 0.04) == pytest.approx(corner + 0.04, abs=1e-6)
-    column, diagonal = np.array([0.1, 1.0, 0.1]), np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
-    assert _touch(column, diagonal, 0.04) == pytest.approx(0.1 * np.sqrt(2) + 0.04, abs=1e-6)

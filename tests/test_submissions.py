@@ -273,15 +273,6 @@ def test_configurations_have_their_names_and_compose_themselves() -> None:
     assert "protocol" in why(configuration_of, load_config(["task=Move", "protocol.floor=release"]))
 
 
-def test_digests_tell_scenes_and_targets_apart() -> None:
-    usual = Digests.of(load_config(["task=Move"]))
-    assert Digests.of(load_config(["task=Move", "seed=3", "method=gd", "sim.precision=float64"])) == usual
-    finer = Digests.of(load_config(["task=Move", "sim.substeps=20"]))
-    assert finer.scene != usual.scene and finer.target == usual.target
-    other = Digests.of(load_config(["task=Move", "variant=2"]))
-    assert other.target != usual.target
-
-
 # ------------------------------------------------------------------------------------------ command lines
 
 

@@ -28,7 +28,6 @@ from plab.render import graphics
 from plab.render.recording import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.scene import sample_particles
-from plab.sim import Simulator
 from plab.view import Viewer, show
 
 msgpack = pytest.importorskip("msgpack")
@@ -178,23 +177,6 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulat
         assert np.array_equal(given, expected)
     with pytest.raises(graphics.RenderError, match="own actions"):
         show("seed0.h5", ACTIONS)
-
-
-def test_simulators_stay_usable_beside_the_viewer(simulated, monkeypatch):
-    cfg = load_config(["task=Rope", *COARSE])
-    # Whatever was started by the other tests: nobody uses it but this.
-    simulator = Simulator([build_scene(cfg)], precision="float64")
-    show(cfg, ACTIONS)
-    assert simulated[0][0].sim.precision == "float64" and cfg.sim.precision == "float32"
-    simulator.reset()
-    assert simulator.state().x.dtype == np.float64
-    # Without that it would say so, also where memory that is gone would end the process.
-    monkeypatch.setattr("plab.sim.simulator.is_current", lambda runtime: False)
-    mass = np.zeros((1, 16, 16, 16))
-    with pytest.raises(RuntimeError, match="memory is gone"):
-        simulator.set_material(yield_stress=50.0)
-    with pytest.raises(RuntimeError, match="memory is gone"):
-        simulator.set_target(mass, mass)
 
 
 # ---------------------------------------------------------------------------------------- in the browser

@@ -4,7 +4,8 @@
     python tools/mutation.py --log build/mutation.csv --only 3,17
 
 A fault is found by a test that fails with it and passes without it. Test files run one process each, those
-first that mention the faulty module most. The log has a row per fault and file; a second call resumes from it.
+first that mention the faulty module most. The log has a row per fault and file; a second call resumes from
+it.
 """
 
 from __future__ import annotations
