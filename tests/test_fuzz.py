@@ -67,7 +67,7 @@ def read_results(path: Path) -> None:
     """Do with a result file or an archive all that is done with one."""
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
-        load(path, database=False)
+        load(path, index=False)
         assert status.main([str(path), "task=Rope", "variant=1"]) in (0, 2)
     for place, problem in check(path):
         assert problem is None or "\n" not in problem.reason + problem.advice

@@ -312,8 +312,8 @@ def test_hyperparameters_are_read_from_the_files() -> None:
 AGREEMENT = {
     "release": {
         "all gradient": ("150", "0.97", "93 %"),
-        "all RL": ("150", "0.70", "91 %"),
-        "PPO": ("50", "0.74", "88 %"),
+        "all RL": ("150", "0.78", "92 %"),
+        "PPO": ("50", "0.95", "90 %"),
         "TD3": ("50", "0.64", "94 %"),
         "SAC": ("50", "0.54", "92 %"),
     },
