@@ -11,15 +11,15 @@ import pytest
 SCRIPT = """
 import numpy as np
 import taichi as ti
-
+from plab.losses import make_terms
 from plab.scene import Body, Manipulator, Scene
 from plab.sim import Simulator
-
 n, rng = 16, np.random.default_rng(0)
 ball = Manipulator("Sphere", (0.1,), (0.36, 0.1, 0.5), scale=(0.03,) * 3)
 ring = Manipulator("Torus", (0.1, 0.05), (0.5, 0.3, 0.5), scale=(0.03,) * 3)
 body = Body("box", (0.5, 0.2, 0.5), (0.2,) * 3, 21)
-sim = Simulator([Scene("any", (body,), (ball, ring), grid_size=n, dt=4e-4, substeps=4)] * 3)
+terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": 1.0})
+sim = Simulator([Scene("any", (body,), (ball, ring), grid_size=n, dt=4e-4, substeps=4)] * 3, terms=terms)
 assert ti.lang.impl.current_cfg().debug
 sim.set_target(rng.random((3, n, n, n)), rng.random((3, n, n, n)))
 top = 1.0 - 3.0 / n
