@@ -16,6 +16,7 @@ from plab.sim import Simulator, shapes
 STEPS = 3
 
 
+@pytest.mark.nightly
 def test_a_new_rigid_shape_has_its_spin_and_its_gradient(
     monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
