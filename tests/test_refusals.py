@@ -175,7 +175,6 @@ def test_broken_task_files(refused, tmp_path, case):
 # ------------------------------------------------------------------------------------------------ the others
 
 ARCHIVE = "a.plab.zip.xz"
-
 TOOLS = [
     (results.main, f"pack nowhere --output {ARCHIVE}", "nowhere"),
     (results.main, f"pack . colour=red --output {ARCHIVE}", "colour=red"),
@@ -291,19 +290,20 @@ def test_rollouts_of_no_steps_and_of_no_numbers():
             simulator.rollout(given, gradient=False)
 
 
+NO_RAY = pytest.mark.skipif(find_spec("ray") is not None, reason="the extra ray is installed")
 EXTRAS = [
     ("pyvista", "render", render.main, "task=Rope"),
     ("PIL", "render", render.main, "task=Rope --output a.gif"),
     ("tensorboard", "tensorboard", main, "task=Move method=adam logger=tensorboard"),
     ("wandb", "wandb", main, "-m task=Move method=sac logger=wandb"),
-    ("hydra_plugins.hydra_ray_launcher", "ray", main, "-m hydra/launcher=ray seed=0,1"),
+    pytest.param(
+        "hydra_plugins.hydra_ray_launcher", "ray", main, "-m hydra/launcher=ray seed=0,1", marks=NO_RAY
+    ),
 ]
 
 
 @pytest.mark.parametrize(("package", "extra", "entry", "argv"), EXTRAS)
 def test_missing_extras(refused, monkeypatch, package, extra, entry, argv):
-    if extra == "ray" and find_spec(package) is not None:
-        pytest.skip("Hydra has registered the launcher")
     monkeypatch.setattr(graphics, "missing_graphics", MISSING.__wrapped__)
     monkeypatch.setitem(sys.modules, package, None)
     assert f"plab[{extra}]" in refused(argv.split(), entry)

@@ -321,7 +321,7 @@ def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone)
 
 
 def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -> None:
-    """What is lost is done again, to the same numbers; a replay buffer may hold more than the state knows."""
+    """Lost steps are computed again, to the same numbers; a replay buffer may be ahead of the state."""
     cfgs = [replace(cfg, checkpoint_seconds=3600) for cfg in configs(tmp_path, "td3")]
     with monkeypatch.context() as patch, stopped_at(27, Population, "_step"):
         # As if the process were killed.

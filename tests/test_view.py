@@ -199,7 +199,7 @@ def browser() -> Iterator:
 
 
 def seen(browser) -> tuple[bool, bool]:
-    """Whether anything red, of plasticine, and anything blue, of the target, is seen."""
+    """Return whether red plasticine is seen, and whether the blue target is."""
     canvas = browser.find_element("id", "canvasTarget").screenshot_as_png
     picture = np.asarray(Image.open(io.BytesIO(canvas)).convert("RGB"), int)
     redness = picture[..., 0] - picture[..., 2]

@@ -153,7 +153,7 @@ def start(near: Sequence[str] = (), **fields: np.ndarray) -> State:
 
 
 def components(kind: str) -> list[int]:
-    """Where a manipulator's degrees of freedom are in the action vector."""
+    """Return the indices of a manipulator's degrees of freedom in the action vector."""
     before = sum(m.action_dim for m in SCENE.manipulators[: KINDS.index(kind)])
     return list(range(before, before + SCENE.manipulators[KINDS.index(kind)].action_dim))
 

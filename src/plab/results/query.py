@@ -67,10 +67,13 @@ def query(
             raise QueryError(
                 'write one select, such as "select task, score from runs": results are only read'
             )
-        connection, unreadable = _connected(sources, "iterations" in sql.lower())
-        with connection:
-            answer = connection.execute(sql)
-            return [column[0] for column in answer.description], answer.fetchall(), unreadable
+        try:
+            return _answer(sources, sql, iterations=False)
+        except duckdb.CatalogException as error:
+            # Opening every file takes long: only for a query that names the table.
+            if "name iterations " not in str(error):
+                raise
+            return _answer(sources, sql, iterations=True)
     except duckdb.CatalogException as error:
         raise QueryError(f"{_one_line(error)}; there are {', '.join(_TABLES)}") from None
     except duckdb.Error as error:
@@ -136,6 +139,15 @@ _TABLES = {
 """Tables and their columns; ``iterations`` has those of the runs, too."""
 
 _PHASE = "seconds_"
+
+
+def _answer(
+    sources: Sequence[Path], sql: str, *, iterations: bool
+) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
+    connection, unreadable = _connected(sources, iterations)
+    with connection:
+        answer = connection.execute(sql)
+        return [column[0] for column in answer.description], answer.fetchall(), unreadable
 
 
 def _connected(

@@ -391,7 +391,7 @@ class TeamChoice:
         return best
 
     def _out_of_question(self, size: int) -> bool:
-        """Whether a team is clearly slower than the first one, which may not be so from one launch."""
+        """Return whether a team's fastest launch is clearly slower than the first team's."""
         first, own = (self._seconds.get(team, ()) for team in (self._sizes[0], size))
         return size != self._sizes[0] and bool(own) and min(own) > CLEARLY * min(first)
 

@@ -195,7 +195,7 @@ def sym_of_product(a, b):
 
 @dataclass(frozen=True)
 class Series:
-    """How many terms the series need for one precision.
+    """Numbers of terms of the series for one precision.
 
     Attributes:
         log_terms: Terms of the atanh series (odd powers of Z).

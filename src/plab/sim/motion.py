@@ -251,7 +251,7 @@ class PosePhases(Storage):
 
     @ti.func
     def action_of(self, e, start: ti.template(), m, t):
-        """Where manipulator m's numbers begin among the actions of all."""
+        """Return the index of manipulator m's first number among the actions of all environments."""
         own = ti.static(self.action_offsets[start]) + (m - start) * ti.static(self.action_dims[start])
         return (t * self.batch + e) * self.actions_per_step + own
 

@@ -80,7 +80,7 @@ def curve_order(x: np.ndarray, n: int) -> np.ndarray:
 
 
 class ParticleOrder:
-    """Which particle of those given is at which place of the tiles.
+    """Indices of the given particles by their places in the tiles.
 
     Attributes:
         initial: The order after :meth:`reset`, shape [batch, particle].

@@ -129,7 +129,7 @@ def broken_gradients(gradient: np.ndarray | torch.Tensor) -> dict[int, str]:
 
 
 def _all_finite(values: np.ndarray | torch.Tensor) -> np.ndarray:
-    """Whether all numbers along the last of three axes are finite, shape of the first two."""
+    """Return which vectors along the last of three axes are finite, shape of the first two."""
     return values.isfinite().all(2).cpu().numpy() if on_device(values) else np.isfinite(values).all(2)
 
 

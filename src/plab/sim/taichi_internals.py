@@ -162,7 +162,7 @@ def _position(context: Any, node: Any) -> str:
 
 
 _ENTRY = "_get_tree_and_ctx"
-"""What Taichi calls for each kernel and function that it compiles, and at no launch of one that it has."""
+"""Function that Taichi calls once per kernel or function that it compiles, and at no launch."""
 
 
 @contextlib.contextmanager
@@ -258,7 +258,7 @@ def cache_folder() -> Path:
 
 
 def cuda_available() -> bool:
-    """Whether Taichi can open a CUDA device."""
+    """Return whether Taichi can open a CUDA device."""
     return bool(ti._lib.core.with_cuda())
 
 
