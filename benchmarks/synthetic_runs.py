@@ -14,8 +14,8 @@ from plab.config import load_config
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.families import family
 from plab.objective import scores_from_iou
-from plab.provenance import now, provenance
 from plab.results import RunResult, config_dict, config_hash, result_path, write
+from plab.results.provenance import now, provenance
 from plab.results.schema import COLUMNS, loss_columns
 
 __all__ = ["SETTLE", "synthetic_run", "template", "write_runs"]

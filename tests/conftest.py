@@ -13,8 +13,8 @@ import pytest
 from browsing import browser  # noqa: F401
 from plab.config import Config
 from plab.config.checks import cuda_is_usable
-from plab.reuse import SimulatorCache
-from plab.tally import Outcome
+from plab.outcomes import Outcome
+from plab.runners.simulator_cache import SimulatorCache
 from refusals import ending, refusal, snapshot
 from suite import DEVICE
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from plab.scene import MANIPULATOR_SHAPES, Manipulator, Scene, sample_particles
+from plab.scenes import MANIPULATOR_SHAPES, Manipulator, Scene, sample_particles
 
 __all__ = [
     "State",

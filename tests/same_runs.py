@@ -14,7 +14,7 @@ import pytest
 from plab.config import Config
 from plab.results import RunResult, read, result_path
 from plab.results.running import RunFile
-from plab.reuse import SimulatorCache
+from plab.runners.simulator_cache import SimulatorCache
 
 TIMES = ["seconds"]
 """Columns in which two runs of the same numbers differ."""

@@ -15,7 +15,7 @@ import numpy as np
 import taichi as ti
 
 from plab.losses.term import ParticleTerm
-from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene
+from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene
 from plab.sim import Simulator, State
 
 if TYPE_CHECKING:

@@ -17,14 +17,14 @@ from plab.config import Config, ConfigError, build_scene, drawn_configs, load_co
 from plab.envs.core import EpisodeBatch
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
-from plab.reuse import SimulatorCache
 from plab.runners import actors, run_config
 from plab.runners.actors import DEVIATION_MIN, ActorPolicy, training_scenes
 from plab.runners.environments import evaluation, shared_batches
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
 from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
-from plab.scene import SceneError
+from plab.runners.simulator_cache import SimulatorCache
+from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
 

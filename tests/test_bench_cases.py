@@ -16,7 +16,7 @@ from plab.bench.stress_cases import StressPlan, refusals, stress_cases
 from plab.cli import bench
 from plab.report.costs import diagrams
 from plab.report.figures import save, style
-from plab.scene import Body, SceneError
+from plab.scenes import Body, SceneError
 
 
 def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:

@@ -15,8 +15,8 @@ from plab.cli.run import main
 from plab.config import GROUPS, Config, choices
 from plab.config.checks import cuda_is_usable
 from plab.results import ResultsError
-from plab.reuse import SimulatorCache
 from plab.runners import RunError
+from plab.runners.simulator_cache import SimulatorCache
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 

@@ -12,7 +12,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from plab.config import Config, ConfigError, build_scene, choices, conf_folder, load_config
-from plab.scene import SceneError
+from plab.scenes import SceneError
 
 SUITE = {
     "Move": (200, 10000, 6),

@@ -12,7 +12,7 @@ import pytest
 import taichi as ti
 
 import suite
-from plab.scene import Body
+from plab.scenes import Body
 from plab.sim.cpu_engine import CpuPhases
 from plab.sim.cuda_phases import CudaPhases
 from plab.sim.particle_phases import spline

@@ -19,7 +19,7 @@ from plab.losses import TERMS, check_gradient, make_terms
 from plab.losses.term import DistanceTerm
 from plab.objective import soft_iou
 from plab.results import check, load, read
-from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim import SimulationError, Simulator
 from suite import KINDS, Kinetic, scene, tools
 

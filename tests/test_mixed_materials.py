@@ -14,7 +14,7 @@ import reference_mpm as reference
 import suite
 from plab.autograd import simulate
 from plab.losses import make_terms
-from plab.scene import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
+from plab.scenes import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State
 
 WEIGHTS = {"density": 10.0, "sdf": 10.0, "contact": 1.0}

@@ -15,13 +15,13 @@ import pytest
 
 from plab.cli.run import main
 from plab.config import Config, ConfigError, build_scene, load_config
-from plab.mesh import Mesh, load_mesh
 from plab.objective import spread_mass, target_sdf
 from plab.render.graphics import RenderError
 from plab.render.recording import stored
 from plab.results import config_dict, config_hash, load
-from plab.scene import Body, Scene, SceneError, make_body, sample_particles
-from plab.shape_files import ShapeError, pinned, read_points
+from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
+from plab.scenes.mesh import Mesh, load_mesh
+from plab.scenes.shape_files import ShapeError, pinned, read_points
 from plab.targets import TargetError, build_target
 
 trimesh = pytest.importorskip("trimesh")

@@ -18,13 +18,13 @@ from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.results import BUDGETS, RunResult, checking, read, result_path
 from plab.results.checking import faults
-from plab.reuse import SimulatorCache
 from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
 from plab.runners.planners.planner import Answer, CandidateStart, Preview, Request, make_planner
 from plab.runners.planners.sampling import actions_of, knots_of
 from plab.runners.planners.starts import ContactStarts, support
-from plab.scene import sample_particles
+from plab.runners.simulator_cache import SimulatorCache
+from plab.scenes import sample_particles
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
 from suite import KINDS, TILT, manipulator

@@ -19,7 +19,7 @@ from plab.problem import Problem
 from plab.render.recording import record, result
 from plab.results import check, config_hash, load, pack, read, rows
 from plab.runners import run_config
-from plab.scene import Body, Scene, SceneError, sample_particles
+from plab.scenes import Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator
 from plab.sweep.plan import plan
 from plab.targets import TargetError

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import reference_mpm as ref
-from plab.scene import Body, Manipulator, Scene
+from plab.scenes import Body, Manipulator, Scene
 
 torch.set_num_threads(1)
 

@@ -23,7 +23,7 @@ from plab.render.recording import record
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, target_field
-from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
+from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
 from suite import SCALES, SIZES
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")

@@ -13,7 +13,6 @@ import synthetic
 from plab.bench import accuracy, precision, speed
 from plab.cli.report import main
 from plab.config.selection import select
-from plab.examples import measurements
 from plab.report.collect import NAMES, collect
 from plab.report.costs import precision_summary
 from plab.report.measurements import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
@@ -21,6 +20,7 @@ from plab.report.notebooks import NOTEBOOKS, notebook_folder
 from plab.report.table import MINUS
 from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
 from plab.results import ResultsError
+from plab.results.examples import measurements
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ import synthetic
 from plab.cli.report import main
 from plab.config import load_config
 from plab.config.selection import SelectionError, select
-from plab.examples import EXAMPLES, example_archive
 from plab.report.agreement import agreement
 from plab.report.collect import NAMES, MixedRunsError, Runs, Setting, changed_settings, collect
 from plab.report.hyperparameters import hyperparameters
@@ -29,6 +28,7 @@ from plab.report.tables import iou_per_configuration, iou_per_task, solvability
 from plab.report.times import timing
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load
+from plab.results.examples import EXAMPLES, example_archive
 
 GOLDEN = Path(__file__).parent / "golden"
 MINUS = "\N{MINUS SIGN}"

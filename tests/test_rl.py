@@ -23,6 +23,7 @@ from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.families import FAMILIES, family
 from plab.objective import scores
+from plab.outcomes import Outcome
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import Job, RunError, _runner, rl, run_batch, run_config
 from plab.runners.common import episode_columns
@@ -33,7 +34,6 @@ from plab.runners.population.runner import PopulationRunner
 from plab.runners.rl import RlRunner
 from plab.runners.rl_models import LinearDecay, cycle_steps
 from plab.runners.rl_trainer import Trainer
-from plab.tally import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plab.config import build_scene, load_config
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.targets import EPISODE_STEPS, demonstration
 
 SCRIPTED = ("Torus", "Writer", "Pinch", "RollingPin", "Chopsticks", "Assembly", "Table")

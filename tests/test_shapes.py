@@ -10,7 +10,7 @@ import torch
 
 import reference_mpm as reference
 from plab.losses import make_terms
-from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
+from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 from plab.sim import Simulator, shapes
 
 STEPS = 3

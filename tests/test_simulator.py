@@ -11,7 +11,7 @@ import torch
 
 import reference_mpm as reference
 from plab.losses import make_terms
-from plab.scene import Body, Manipulator, Scene, SceneError
+from plab.scenes import Body, Manipulator, Scene, SceneError
 from plab.sim import SimulationError, Simulator, storage
 from plab.sim.memory import ENTRIES_MAX, batch_limit
 from plab.sim.particles import curve_order, hilbert_index

@@ -14,7 +14,7 @@ from plab.config import load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.problem import Problem
-from plab.scene import Scene
+from plab.scenes import Scene
 
 TASKS = suite_tasks()
 COARSE = ("sim.grid_size=32", "sim.dt=2.7e-4", "sim.substeps=7", "sim.particles_scale=0.03")

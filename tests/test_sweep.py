@@ -16,8 +16,8 @@ import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, conf_folder, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.locks import acquire
 from plab.results import RunFile, config_hash, read, result_path
+from plab.results.locks import acquire
 from plab.runners.jobs import TogetherError
 from plab.sim.memory import batch_limit, kept_states
 from plab.sweep.carry import look_up

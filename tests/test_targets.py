@@ -10,7 +10,7 @@ import pytest
 from plab.config import ConfigError, build_scene, load_config
 from plab.objective import soft_iou, spread_mass, target_sdf
 from plab.problem import Problem
-from plab.scene import Scene, sample_particles
+from plab.scenes import Scene, sample_particles
 from plab.targets import (
     TARGET_SEED,
     TargetError,

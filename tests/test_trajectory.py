@@ -19,11 +19,11 @@ from plab.config import Config, ConfigError, MethodConfig, build_scene, load_con
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
-from plab.reuse import SimulatorCache
 from plab.runners import RunError, apg, run_config, trajectory
 from plab.runners.common import measures, shared_problem, simulator_key
 from plab.runners.environments import shared_batches
 from plab.runners.loggers import RunLog
+from plab.runners.simulator_cache import SimulatorCache
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
 from same_runs import assert_same_numbers, finished_as, stopped_at

@@ -28,7 +28,7 @@ from plab.results.loading import read_rows
 from plab.runners import run_config
 from plab.runners.policy import load_policy, policy_path, save_policy
 from plab.runners.rl_models import Spaces, model_kind
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target
 
 RUN = "Rope-v1/adam/seed0.h5"

@@ -36,7 +36,7 @@ import numpy as np
 from plab.losses import make_terms
 from plab.objective import target_sdf
 from plab.render.shapes import manipulator_parts
-from plab.scene import Body, Manipulator, Scene
+from plab.scenes import Body, Manipulator, Scene
 from plab.sim import Simulator
 
 tool = Manipulator("Disc", (0.06, 0.03), (0.5, 0.235, 0.5), scale=(0.02,) * 3 + (0.2,) * 3)
@@ -228,7 +228,7 @@ def with_the_disc(tmp_path) -> Path:
 
 
 def test_the_changes_for_a_manipulator_fit_the_source(tmp_path, with_the_disc):
-    code = "from plab.scene import MANIPULATOR_SHAPES; print(MANIPULATOR_SHAPES['Disc'].size_names)"
+    code = "from plab.scenes import MANIPULATOR_SHAPES; print(MANIPULATOR_SHAPES['Disc'].size_names)"
     assert python(tmp_path, "-c", code, path=with_the_disc).stdout == "('radius', 'r')\n"
 
 

@@ -27,7 +27,7 @@ from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.recording import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.scene import sample_particles
+from plab.scenes import sample_particles
 from plab.view import Viewer, show
 
 msgpack = pytest.importorskip("msgpack")

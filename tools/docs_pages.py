@@ -34,7 +34,7 @@ PYTHON = {
             "plab.losses",
             "plab.losses.term",
             "plab.autograd",
-            "plab.scene",
+            "plab.scenes",
             "plab.targets",
         ),
     ),

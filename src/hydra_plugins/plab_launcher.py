@@ -23,8 +23,8 @@ from omegaconf import DictConfig, open_dict
 
 if TYPE_CHECKING:
     from plab.config import Config
+    from plab.outcomes import Outcome
     from plab.sweep.carry import Carrier
-    from plab.tally import Outcome
 
 __all__ = ["BatchLauncher", "BatchSweeper"]
 
@@ -89,7 +89,7 @@ class BatchSweeper(BasicSweeper):
 class BatchLauncher(Launcher):
     """Runs the jobs of a sweep in batches that share a simulator.
 
-    How they ended is noted in the :class:`plab.tally.Tally` that the task function has as ``tally``:
+    How they ended is noted in the :class:`plab.outcomes.Tally` that the task function has as ``tally``:
     Hydra gives a launcher no other way to tell the command line.
     """
 
@@ -137,10 +137,10 @@ class BatchLauncher(Launcher):
         """Run all jobs, so many batches at a time."""
         from plab.config import ConfigError
         from plab.config.checks import check_device, check_packages
+        from plab.outcomes import Outcome, Tally
         from plab.results import result_path
         from plab.sweep.carry import run_sweep
         from plab.sweep.compose import Refused, compose_jobs
-        from plab.tally import Outcome, Tally
 
         load = self._context.config_loader.load_sweep_config
         entries = compose_jobs(job_overrides, lambda overrides: load(self._config, overrides))

@@ -17,7 +17,7 @@ from plab.envs import make, make_vec, register_suite
 if TYPE_CHECKING:
     from plab.config import build_scene, load_config
     from plab.results import load as load_results
-    from plab.scene import Scene
+    from plab.scenes import Scene
     from plab.sim import Simulator
 
 __all__ = [
@@ -38,7 +38,7 @@ TASKS = tuple(suite_tasks())
 """Names of the suite's tasks."""
 
 _PLACES = {
-    "Scene": ("plab.scene", "Scene"),
+    "Scene": ("plab.scenes", "Scene"),
     "Simulator": ("plab.sim", "Simulator"),
     "build_scene": ("plab.config", "build_scene"),
     "load_config": ("plab.config", "load_config"),

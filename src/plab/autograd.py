@@ -119,7 +119,7 @@ def simulate(
     Raises:
         TypeError: If ``initial`` names something else.
         ValueError: If a shape is wrong or an action is not finite.
-        plab.scene.SceneError: If the material cannot be simulated.
+        plab.scenes.SceneError: If the material cannot be simulated.
         plab.sim.SimulationError: If state or gradient stop being finite.
         MemoryError: If the gradient does not fit the memory budget.
         RuntimeError: If a gradient was asked for after the simulator has run again, or needs

@@ -80,7 +80,7 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.nd
         x: Particle positions [domain units], shape [particle, 3].
         n: Grid nodes per axis.
         mass: Mass per particle.
-        floor: Whose stencil such particles have, as in :class:`plab.scene.Scene`. With the release's, they
+        floor: Whose stencil such particles have, as in :class:`plab.scenes.Scene`. With the release's, they
             have negative weights instead of a ghost node.
 
     Returns:

@@ -27,7 +27,7 @@ from plab.objective import (
     target_sdf,
     total_loss,
 )
-from plab.scene import SceneError
+from plab.scenes import SceneError
 from plab.sim import Rollout, Simulator
 from plab.sim.tensors import Constants
 from plab.targets import TargetError, build_targets, check_target, load_release_target
@@ -35,7 +35,7 @@ from plab.targets import TargetError, build_targets, check_target, load_release_
 if TYPE_CHECKING:
     import torch
 
-    from plab.scene import Scene
+    from plab.scenes import Scene
 
 __all__ = [
     "Episodes",
@@ -99,7 +99,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
     Raises:
         plab.config.ConfigError: If a variant does not exist.
-        plab.scene.SceneError: If a scene cannot be simulated.
+        plab.scenes.SceneError: If a scene cannot be simulated.
     """
     kinds = kinds_of(cfgs)
     scenes = {kind: build_scene(cfgs[kinds.index(kind)]) for kind in dict.fromkeys(kinds)}
@@ -120,7 +120,7 @@ def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
 
     Raises:
         plab.config.ConfigError: If there is no such term of the loss.
-        plab.scene.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+        plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
         plab.sim.DeviceError: If CUDA was asked for and is not there.
     """
     sim, method = cfg.sim, cfg.method
@@ -172,7 +172,7 @@ class Problem:
 
         Raises:
             plab.config.ConfigError: If the configurations do not fit together.
-            plab.scene.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+            plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
             plab.sim.DeviceError: If CUDA was asked for and is not there.
         """

@@ -12,7 +12,7 @@ import os
 import sys
 from pathlib import Path
 
-from plab.scene import Scene, SceneError
+from plab.scenes import Scene, SceneError
 
 __all__ = [
     "REAL_BYTES",

@@ -12,7 +12,7 @@ SCRIPT = """
 import numpy as np
 import taichi as ti
 from plab.losses import make_terms
-from plab.scene import Body, Manipulator, Scene
+from plab.scenes import Body, Manipulator, Scene
 from plab.sim import Simulator
 n, rng = 16, np.random.default_rng(0)
 ball = Manipulator("Sphere", (0.1,), (0.36, 0.1, 0.5), scale=(0.03,) * 3)

@@ -14,7 +14,7 @@ import pytest
 
 from plab.bench.accuracy import UncheckedScene
 from plab.losses import make_terms
-from plab.scene import Body, Scene
+from plab.scenes import Body, Scene
 from plab.sim import Simulator, State
 from suite import DEVICE
 

@@ -18,7 +18,7 @@ import torch
 
 import reference_mpm as reference
 from plab.losses import make_terms
-from plab.scene import sample_particles
+from plab.scenes import sample_particles
 from plab.sim import Simulator, State
 from suite import DEVICE, FAR, KINDS, NEAR, assert_same_state, batch, reference_state, scene
 

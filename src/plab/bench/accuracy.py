@@ -38,7 +38,7 @@ from plab.bench.precision import angle
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import scores, spread_mass, target_sdf
-from plab.scene import CONTACTS, PRECISIONS, Body, Scene, sample_particles
+from plab.scenes import CONTACTS, PRECISIONS, Body, Scene, sample_particles
 from plab.sim import Simulator
 
 __all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Resolution", "attempts_at", "lattice", "rows"]

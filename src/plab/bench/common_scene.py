@@ -17,7 +17,7 @@ import numpy as np
 
 from plab.losses import make_terms
 from plab.losses.term import Term
-from plab.scene import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
+from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
 
 __all__ = [
     "PLACES",
@@ -62,7 +62,7 @@ def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -
         places: Shapes of the manipulators of the common kind.
 
     Raises:
-        plab.scene.SceneError: If there are too many manipulators or too few particles.
+        plab.scenes.SceneError: If there are too many manipulators or too few particles.
     """
     tools = [_parked(shape) for shape in places]
     for number, place in enumerate(_places(scene, places)):

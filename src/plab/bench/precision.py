@@ -22,7 +22,7 @@ from plab.bench.common_scene import common_actions, common_scene, grid_terms, ow
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
-from plab.scene import Scene, sample_particles
+from plab.scenes import Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
 

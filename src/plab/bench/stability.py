@@ -24,7 +24,7 @@ import numpy as np
 from plab.bench.stress_cases import StressCase, StressPlan, refusals
 from plab.config.suite import suite_tasks
 from plab.losses import make_terms
-from plab.scene import SceneError
+from plab.scenes import SceneError
 from plab.sim import SimulationError, Simulator
 
 __all__ = ["COLUMNS", "FULL", "QUICK", "REFUSAL", "run_cases", "run_refusals"]

@@ -17,7 +17,7 @@ import numpy as np
 from plab.bench.common_scene import common_actions, common_scene
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.scene import Body, Manipulator, Scene, Vec3, vector3
+from plab.scenes import Body, Manipulator, Scene, Vec3, vector3
 
 __all__ = ["StressCase", "StressPlan", "refusals", "stress_cases"]
 

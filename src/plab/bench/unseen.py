@@ -20,9 +20,9 @@ from plab.config.selection import OBSERVED
 from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
-from plab.reuse import SimulatorCache
 from plab.runners.environments import shared_batches
 from plab.runners.policy import Policy, load_policy
+from plab.runners.simulator_cache import SimulatorCache
 
 __all__ = ["COLUMNS", "FIRST", "rows", "scores_of"]
 

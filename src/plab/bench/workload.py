@@ -111,7 +111,7 @@ def build(
             known.
 
     Raises:
-        plab.scene.SceneError: If the scene cannot be simulated.
+        plab.scenes.SceneError: If the scene cannot be simulated.
         plab.targets.TargetError: If the target, which the best actions come from, has a mistake.
         plab.sim.DeviceError: If CUDA was asked for and is not there.
     """

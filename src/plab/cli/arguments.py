@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from plab.config.suite import suite_tasks
 from plab.errors import ArgumentError, pick
-from plab.examples import EXAMPLES, resolve
+from plab.results.examples import EXAMPLES, resolve
 
 __all__ = [
     "Parser",

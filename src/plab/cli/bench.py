@@ -22,7 +22,7 @@ from plab.cli.tables import measure_table, print_table, write_csv, write_markdow
 from plab.config import ConfigError
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.errors import ArgumentError, pick, tell
-from plab.scene import DEVICES, PRECISIONS
+from plab.scenes import DEVICES, PRECISIONS
 
 __all__ = [
     "accuracy",

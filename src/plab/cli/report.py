@@ -20,7 +20,6 @@ from plab.cli.arguments import Parser, folder, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.errors import tell
-from plab.examples import EXAMPLES, measurements, resolve
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
@@ -30,6 +29,7 @@ from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import Page
 from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError
+from plab.results.examples import EXAMPLES, measurements, resolve
 
 __all__ = ["main"]
 

@@ -18,9 +18,9 @@ from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.errors import tell
-from plab.examples import EXAMPLES, resolve
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
+from plab.results.examples import EXAMPLES, resolve
 from plab.results.loading import readable_rows
 from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError

@@ -14,8 +14,8 @@ from plab.config import load_config
 from plab.config.checks import check_sources
 from plab.config.selection import one_protocol, select
 from plab.config.words import IDLE, require_effect
-from plab.examples import EXAMPLES, resolve
 from plab.render.graphics import RenderError
+from plab.results.examples import EXAMPLES, resolve
 
 if TYPE_CHECKING:
     from plab.config import Config

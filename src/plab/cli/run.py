@@ -32,9 +32,9 @@ from plab.config.checks import check_device, check_packages, check_sources
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.words import quote_folders, shortened, unusable
 from plab.errors import PlabError
-from plab.reuse import SimulatorCache
-from plab.scene import SceneError
-from plab.tally import Refusal, Tally
+from plab.outcomes import Refusal, Tally
+from plab.runners.simulator_cache import SimulatorCache
+from plab.scenes import SceneError
 from plab.targets import TargetError
 
 __all__ = ["main"]

@@ -14,7 +14,7 @@ from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import select
-from plab.examples import EXAMPLES, resolve
+from plab.results.examples import EXAMPLES, resolve
 from plab.status.survey import NAMES, STATES, Survey, survey
 
 __all__ = ["main"]

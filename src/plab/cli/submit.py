@@ -18,7 +18,7 @@ from plab.cli.arguments import Parser, seed, sources_and_words, to_write
 from plab.cli.command import command_line, complain
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.examples import resolve
+from plab.results.examples import resolve
 from plab.submissions.collecting import from_policies, from_sources
 from plab.submissions.files import inconsistency, write
 from plab.submissions.schema import (

@@ -19,7 +19,7 @@ from plab.cli.arguments import Parser, sources_and_words
 from plab.cli.command import command_line, complain
 from plab.cli.tables import print_table
 from plab.errors import PlabError, tell
-from plab.scene import PRECISIONS
+from plab.scenes import PRECISIONS
 from plab.submissions.collecting import submission_files
 from plab.submissions.files import read
 from plab.submissions.schema import SUFFIX, Submission, SubmissionError

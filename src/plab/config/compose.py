@@ -30,7 +30,7 @@ from plab.config.words import parse, quote_folders, require_few, shortened, unus
 from plab.errors import ConfigError, pick
 from plab.families import family, schemas
 from plab.plugins import search_in
-from plab.scene import Scene, vector3
+from plab.scenes import Scene, vector3
 from plab.sizes import require_memory
 
 __all__ = [
@@ -269,7 +269,7 @@ def build_scene(cfg: Config) -> Scene:
 
     Raises:
         ConfigError: If the task is another variant's, or this computer's memory cannot hold the run.
-        plab.scene.SceneError: If the scene cannot be simulated.
+        plab.scenes.SceneError: If the scene cannot be simulated.
     """
     task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
     if cfg.variant not in task.variants:

@@ -9,7 +9,7 @@ from plab.config import ranges
 from plab.errors import ConfigError
 from plab.families import family
 from plab.losses.registry import check_terms
-from plab.scene import CONTACTS, DEVICES
+from plab.scenes import CONTACTS, DEVICES
 
 __all__ = [
     "ActorConfig",

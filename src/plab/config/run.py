@@ -10,7 +10,7 @@ from plab.config.method import MethodConfig
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
 from plab.losses.registry import check_terms
-from plab.scene import CONVENTIONS, DEVICES, PRECISIONS
+from plab.scenes import CONVENTIONS, DEVICES, PRECISIONS
 
 __all__ = ["Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
 
@@ -49,7 +49,7 @@ class SimConfig(ranges.Section):
     particles_scale: float = field(metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
         super().check(path)
         if self.memory_mb > MOST_MEMORY_MB:
             raise ConfigError(

@@ -7,8 +7,8 @@ from typing import Any
 
 from plab.config import ranges
 from plab.errors import ConfigError
-from plab.scene import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
-from plab.shape_files import ShapeError, pinned
+from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
+from plab.scenes.shape_files import ShapeError, pinned
 from plab.targets import TargetError, make_recipe
 
 __all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "RangeConfig", "TaskConfig"]
@@ -46,8 +46,8 @@ class BodyConfig(ranges.Section):
         """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
 
         Raises:
-            plab.scene.SceneError: If a mesh has no file, or something else has one.
-            plab.shape_files.ShapeError: If the file does not do.
+            plab.scenes.SceneError: If a mesh has no file, or something else has one.
+            plab.scenes.shape_files.ShapeError: If the file does not do.
         """
         particles = max(1, round(self.particles * particles_scale))
         material = {key: getattr(self, key) for key in MATERIAL_KEYS}
@@ -59,7 +59,7 @@ class ManipulatorConfig(ranges.Section):
     """A rigid manipulator.
 
     Attributes:
-        shape: A key of :data:`plab.scene.MANIPULATOR_SHAPES`.
+        shape: A key of :data:`plab.scenes.MANIPULATOR_SHAPES`.
         size: Lengths that the shape asks for [domain units].
         position: Position (x, y, z) at the start [domain units].
         rotation: Unit quaternion (w, x, y, z) at the start.
@@ -83,7 +83,7 @@ class ManipulatorConfig(ranges.Section):
     minimal_gap: float | None = field(default=None, metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
         super().check(path)
         ranges.vector(f"{path}.scale", self.scale, len(self.scale))
         for axis, low, at, high in zip("xyz", self.lower_bound, self.position, self.upper_bound, strict=True):
@@ -197,7 +197,7 @@ class TaskConfig(ranges.Section):
     release: dict[str, Any] = field(default_factory=dict)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scene.Scene.validate` does not look at."""
+        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
         super().check(path)
         for variant in self.variants:
             ranges.folder_name(f"{path}.variants", variant)

@@ -19,7 +19,7 @@ from plab.config.errors import explain
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
 from plab.config.words import parse
 from plab.errors import ConfigError, pick
-from plab.scene import Scene, SceneError
+from plab.scenes import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
 __all__ = [

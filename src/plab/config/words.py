@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 
 from plab.config.errors import explain
 from plab.errors import ConfigError
-from plab.tally import MOST_RUNS
+from plab.outcomes import MOST_RUNS
 
 __all__ = [
     "IDLE",

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from plab.config import Config, build_scene
-from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.targets import demonstration
 from plab.targets.scripted import DECIMALS
 

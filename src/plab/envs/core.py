@@ -21,7 +21,7 @@ from plab.config.words import word_list
 from plab.envs.observations import Observer, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
-from plab.scene import CONTACTS
+from plab.scenes import CONTACTS
 from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
@@ -178,7 +178,7 @@ class EpisodeBatch:
         Raises:
             ValueError: If the contact model does not exist.
             plab.config.ConfigError: If the configurations do not fit together.
-            plab.scene.SceneError: If a scene cannot be simulated or the scenes do not fit together.
+            plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
             plab.sim.DeviceError: If CUDA was asked for and is not there.
             RuntimeError: If this process was forked from one that has made environments.
@@ -204,7 +204,7 @@ class EpisodeBatch:
         Raises:
             ValueError: If they are not as many, or observations would hold other things.
             plab.config.ConfigError: If the configurations do not fit together.
-            plab.scene.SceneError: If a scene cannot be simulated or is of another kind.
+            plab.scenes.SceneError: If a scene cannot be simulated or is of another kind.
             plab.targets.TargetError: If a target cannot be built.
         """
         if len(cfgs) != self.size:

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from plab.config import Config
 from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.sim.tensors import Constants, on_device
 
 __all__ = ["Observer", "level_entries", "spaces"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from plab.errors import ArgumentError
 from plab.losses.term import Term
-from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim import Simulator, State
 
 __all__ = ["check_gradient"]

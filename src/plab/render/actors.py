@@ -13,7 +13,7 @@ from plab.render.camera import Camera
 from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud, hidden_share
 from plab.render.shapes import Part, manipulator_parts, pose_matrix, transform
 from plab.render.surface import Field, target_field
-from plab.scene import Manipulator, Scene
+from plab.scenes import Manipulator, Scene
 
 __all__ = [
     "MANIPULATOR_COLOR",

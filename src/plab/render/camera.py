@@ -9,7 +9,7 @@ import numpy as np
 
 from plab.objective import TARGET_MASS
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
-from plab.scene import Scene, sample_particles
+from plab.scenes import Scene, sample_particles
 
 __all__ = ["DEFAULT_VIEW", "VIEWS", "Camera", "View", "fit_camera", "scene_camera"]
 

@@ -20,7 +20,7 @@ from plab.objective import scores_from_iou, soft_iou
 from plab.problem import Problem, build_scenes, build_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.sim import Simulator, State
 from plab.targets import TargetError
 

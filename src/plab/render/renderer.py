@@ -13,7 +13,7 @@ from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
 from plab.render.camera import Camera, scene_camera
 from plab.render.shadows import AmbientLight, Cloud, floor_light
 from plab.render.surface import body_slices, body_surfaces
-from plab.scene import Scene, sample_particles
+from plab.scenes import Scene, sample_particles
 
 __all__ = ["BODY_COLORS", "INK", "PAPER", "Renderer"]
 
@@ -53,8 +53,8 @@ class Renderer:
         """Set the scene up.
 
         Args:
-            scene: The scene. Its particles must start where :func:`plab.scene.sample_particles` puts them, or
-                surfaces are rough.
+            scene: The scene. Its particles must start where :func:`plab.scenes.sample_particles` puts them,
+                or surfaces are rough.
             target_mass: Mass tensor of the target, shape [n, n, n]; None draws no target.
             size: Width and height of the pictures [pixels].
             camera: Where the pictures are taken from; :func:`plab.render.camera.scene_camera` if None.

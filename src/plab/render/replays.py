@@ -18,7 +18,7 @@ from plab.progress import show_progress
 from plab.render import recording
 from plab.render.graphics import RenderError, require_graphics
 from plab.render.pictures import save, save_set
-from plab.scene import SceneError
+from plab.scenes import SceneError
 from plab.sim import DeviceError, SimulationError
 from plab.targets import TargetError
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plab.scene import Manipulator
+from plab.scenes import Manipulator
 
 __all__ = ["Part", "manipulator_parts", "pose_matrix", "transform"]
 

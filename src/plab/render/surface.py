@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 
-from plab.scene import Body, MeshBody, Scene, sample_particles
+from plab.scenes import Body, MeshBody, Scene, sample_particles
 
 __all__ = ["BodySurface", "Field", "body_slices", "body_surfaces", "target_field"]
 

@@ -16,11 +16,11 @@ import pandas as pd
 from plab.config.selection import OBSERVED, Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import PlabError
-from plab.locks import held
 from plab.report.methods import method, ordered
 from plab.report.splitting import SEED, split_rows
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows, sources_of
+from plab.results.locks import held
 
 __all__ = [
     "KEYS",

@@ -11,12 +11,12 @@ import pandas as pd
 from IPython.display import HTML, Image, Markdown, display
 
 from plab.config.selection import select
-from plab.examples import measurements, resolve
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
 from plab.report.measurements import Benchmark, measured
 from plab.report.table import Table, aligned
 from plab.results import ResultsError
+from plab.results.examples import measurements, resolve
 
 __all__ = ["benchmark", "gather", "say", "show_figure", "show_origin", "show_table"]
 

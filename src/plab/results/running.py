@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from plab.locks import NO_LOCKS, Lock, acquire, lock_path
-from plab.provenance import provenance, version_changes
 from plab.results.files import cause, make_folder, opened, read, remove_folders, write
+from plab.results.locks import NO_LOCKS, Lock, acquire, lock_path
+from plab.results.provenance import provenance, version_changes
 from plab.results.schema import (
     PARTIAL_SUFFIX,
     REPLAY_SUFFIX,

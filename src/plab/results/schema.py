@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plab.bodies import MATERIAL_KEYS
 from plab.config.selection import lookup
 from plab.errors import PlabError
 from plab.families import FAMILIES
+from plab.scenes.bodies import MATERIAL_KEYS
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,12 +15,12 @@ from typing import Any
 from plab.config import Config
 from plab.errors import TRACEBACK, ConfigError, traceback_wanted
 from plab.families import family
+from plab.outcomes import Outcome
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.results.schema import resume_fault
-from plab.reuse import SimulatorCache
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
 from plab.runners.runner import Runner, Step, Track
-from plab.tally import Outcome
+from plab.runners.simulator_cache import SimulatorCache
 
 __all__ = ["Job", "RunError", "Runner", "SimulatorCache", "Step", "Track", "run_batch", "run_config"]
 

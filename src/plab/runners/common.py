@@ -11,9 +11,9 @@ import numpy as np
 from plab.config import Config
 from plab.errors import ConfigError, out_of_memory
 from plab.problem import Episodes, Problem, build_scenes, build_simulator
-from plab.reuse import SimulatorCache
 from plab.runners.jobs import RunError
-from plab.scene import Scene
+from plab.runners.simulator_cache import SimulatorCache
+from plab.scenes import Scene
 from plab.sim import DeviceError, SimulationError
 from plab.sim.batch import scene_kind
 

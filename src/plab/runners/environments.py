@@ -15,9 +15,9 @@ import torch
 from plab.config import Config, MethodConfig, build_scene
 from plab.config.selection import OBSERVED
 from plab.envs.core import EpisodeBatch
-from plab.reuse import SimulatorCache
 from plab.runners.common import LAST, episode_columns, simulator_key
 from plab.runners.runner import Runner, Track
+from plab.runners.simulator_cache import SimulatorCache
 
 __all__ = [
     "Evaluation",

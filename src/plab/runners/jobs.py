@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from plab.config import Config
 from plab.errors import ConfigError, PlabError
 from plab.families import family
+from plab.outcomes import Outcome
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
 from plab.results.schema import counts_last
-from plab.scene import SceneError
-from plab.tally import Outcome
+from plab.scenes import SceneError
 from plab.targets import TargetError
 
 __all__ = [

@@ -21,10 +21,10 @@ from plab.families import SOLVED, family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
 from plab.results import BUDGETS, ResultsError, row_count
-from plab.reuse import SimulatorCache
 from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
 from plab.runners.loggers import RunLog
+from plab.runners.simulator_cache import SimulatorCache
 from plab.sim import DeviceError, SimulationError
 from plab.sim.taichi_internals import watch_compiling
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scene import Material, Scene, SceneError
+from plab.scenes import Material, Scene, SceneError
 
 __all__ = [
     "YIELD_STRAIN_MAX",

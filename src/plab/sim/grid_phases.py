@@ -4,7 +4,7 @@ import math
 
 import taichi as ti
 
-from plab.scene import MANIPULATOR_SHAPES
+from plab.scenes import MANIPULATOR_SHAPES
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import (
     AT_FRAME_GAP,

@@ -6,7 +6,7 @@ import math
 
 import taichi as ti
 
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
 from plab.sizes import REAL_BYTES
 

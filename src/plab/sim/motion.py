@@ -7,7 +7,7 @@ quaternion products. Everything here is float64 in both precisions; a manipulato
 
 import taichi as ti
 
-from plab.scene import MANIPULATOR_SHAPES, ROLL_RADIUS
+from plab.scenes import MANIPULATOR_SHAPES, ROLL_RADIUS
 from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 
@@ -145,7 +145,7 @@ def displacement(motion: ti.template(), pose, u):
 @ti.func
 def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
     """Pose (8) after one substep, by this substep's share u (7) of the clipped and scaled action; ``motion``
-    is a rule of :class:`plab.scene.ManipulatorShape`."""
+    is a rule of :class:`plab.scenes.ManipulatorShape`."""
     out = pose
     if ti.static(motion != "static"):
         move = displacement(motion, pose, u)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from plab.errors import ArgumentError, PlabError
-from plab.scene import DEVICES, PRECISIONS
+from plab.scenes import DEVICES, PRECISIONS
 from plab.sim.taichi_internals import (
     cache_folder,
     cuda_available,

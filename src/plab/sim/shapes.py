@@ -1,6 +1,6 @@
 """Signed distances of the manipulators in their own frames, with what the adjoint of contact needs of them.
 
-Every shape of :data:`plab.scene.MANIPULATOR_SHAPES` has its functions of a local point in :data:`SURFACES`.
+Every shape of :data:`plab.scenes.MANIPULATOR_SHAPES` has its functions of a local point in :data:`SURFACES`.
 All distances are exact, so the normal, their gradient, has length 1, and the broad phase may rely on it.
 """
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from plab.scene import MANIPULATOR_SHAPES, SceneError
+from plab.scenes import MANIPULATOR_SHAPES, SceneError
 
 __all__ = ["SURFACES", "Surface", "gap_slope", "hessian_product", "require_surfaces", "signed_distance"]
 
@@ -258,7 +258,7 @@ SURFACES: dict[str, Surface] = {
     "Cylinder": Surface(cylinder_distance, cylinder_hessian_product),
     "Box": Surface(box_distance, box_hessian_product),
 }
-"""The surface of each of :data:`plab.scene.MANIPULATOR_SHAPES`."""
+"""The surface of each of :data:`plab.scenes.MANIPULATOR_SHAPES`."""
 
 
 def require_surfaces(shapes: Iterable[str]) -> None:

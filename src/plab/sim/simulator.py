@@ -12,7 +12,7 @@ import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
-from plab.scene import CONTACTS, Scene, SceneError, sample_particles
+from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
 from plab.sim.callbacks import ClosedLoop, Recording, StateRecorder
 from plab.sim.cpu_engine import CpuEngine

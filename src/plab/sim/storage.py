@@ -21,7 +21,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike
 
-from plab.scene import MANIPULATOR_SHAPES, Scene
+from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim.batch import material_parameters
 from plab.sim.linalg import Series
 from plab.sim.runtime import Runtime

@@ -14,12 +14,12 @@ from typing import Any, TypeAlias, cast
 
 from plab.config.selection import Selection, SelectionError, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
-from plab.locks import held
+from plab.outcomes import MOST_RUNS
 from plab.results import ResultsError, Row, row_count
 from plab.results.files import columns_of, opened, split_archive, summary_of
 from plab.results.loading import readable_rows, sources_of
+from plab.results.locks import held
 from plab.results.schema import parse_member
-from plab.tally import MOST_RUNS
 
 __all__ = ["NAMES", "STATES", "Group", "Run", "Survey", "survey"]
 

@@ -12,11 +12,11 @@ from typing import Any
 
 from plab.config import Config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.examples import example_archive
 from plab.report.budgets import BUDGETS
 from plab.report.methods import GRADIENT, method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.results import ResultsError, Row, config_dict
+from plab.results.examples import example_archive
 from plab.results.loading import readable_rows
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.files import read

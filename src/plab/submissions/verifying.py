@@ -12,9 +12,9 @@ from typing import Any
 
 import plab
 from plab.config import Config
-from plab.provenance import now
 from plab.results.files import replace_file
-from plab.scene import PRECISIONS
+from plab.results.provenance import now
+from plab.scenes import PRECISIONS
 from plab.submissions.playing import Played, play_plans, play_policy
 from plab.submissions.policies import load
 from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission, SubmissionError

@@ -9,13 +9,13 @@ from omegaconf import DictConfig
 
 from plab import runners
 from plab.config import Config
-from plab.locks import held, lock_path
+from plab.outcomes import Outcome
 from plab.results import ResultsError, RunFile, read, result_path
+from plab.results.locks import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
-from plab.reuse import SimulatorCache
 from plab.runners.jobs import outcome
+from plab.runners.simulator_cache import SimulatorCache
 from plab.sweep.plan import plan
-from plab.tally import Outcome
 
 __all__ = ["BatchTask", "Carrier", "carry_here", "look_up", "run_sweep"]
 

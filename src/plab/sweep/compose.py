@@ -15,7 +15,7 @@ from plab.config.checks import check_sources
 from plab.config.composer import Composer, lines, sets_a_value
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.words import parse
-from plab.scene import SceneError
+from plab.scenes import SceneError
 from plab.targets import TargetError
 
 __all__ = ["Refused", "compose_jobs"]

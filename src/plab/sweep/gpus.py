@@ -20,10 +20,10 @@ from plab import runners
 from plab.config import Config
 from plab.config.checks import cuda_devices
 from plab.errors import ConfigError
+from plab.outcomes import Outcome
 from plab.progress import forward_to, show_several
-from plab.reuse import SimulatorCache
+from plab.runners.simulator_cache import SimulatorCache
 from plab.sweep.carry import Carrier, look_up
-from plab.tally import Outcome
 
 __all__ = ["choose", "gpus", "processes_on"]
 

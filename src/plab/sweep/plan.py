@@ -13,7 +13,7 @@ from plab.config.selection import OBSERVED
 from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.sim.batch import scene_kind
 from plab.sim.memory import batch_limit
 from plab.sizes import most_environments

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.objective import spread_mass
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.targets import files, geometric, scripted
 from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore

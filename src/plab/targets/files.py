@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plab.scene import Scene
-from plab.shape_files import ShapeError, read_points, read_tensor
+from plab.scenes import Scene
+from plab.scenes.shape_files import ShapeError, read_points, read_tensor
 from plab.targets.recipe import TargetError
 
 __all__ = ["MassTarget", "PointsTarget"]

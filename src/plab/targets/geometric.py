@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plab.scene import Body, Scene, SceneError, make_body, sample_particles
-from plab.shape_files import ShapeError
+from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
+from plab.scenes.shape_files import ShapeError
 from plab.targets.recipe import TargetError
 
 __all__ = ["BodiesTarget", "RingTarget", "TargetBody"]
@@ -37,7 +37,7 @@ class TargetBody:
     sha256: str | None = None
 
     def build(self, particles: int) -> Body:
-        """Return the body with so many particles; see :func:`plab.scene.make_body` for errors."""
+        """Return the body with so many particles; see :func:`plab.scenes.make_body` for errors."""
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
 
 

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from plab.errors import PlabError
-from plab.scene import Scene
+from plab.scenes import Scene
 
 __all__ = ["EPISODE_STEPS", "GeometricRecipe", "ScriptedRecipe", "TargetError", "TensorRecipe"]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scene import ROLL_RADIUS, Body, Manipulator, Scene
+from plab.scenes import ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipe import EPISODE_STEPS, TargetError
 
 __all__ = [

@@ -15,7 +15,7 @@ import numpy as np
 
 from plab.cache import cache_dir
 from plab.reading import UnreadableError, read_array, read_arrays
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.targets.recipe import TargetError
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from plab.runners.common import shared_problem
 from plab.runners.environments import torch_settings
 from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import Runner, Step, Track
-from plab.scene import Scene
+from plab.scenes import Scene
 from plab.sim.memory import batch_limit
 
 __all__ = [

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from plab.scene import MANIPULATOR_SHAPES, ROLL_RADIUS, Manipulator, Scene, sample_particles
+from plab.scenes import MANIPULATOR_SHAPES, ROLL_RADIUS, Manipulator, Scene, sample_particles
 from plab.targets.scripted import ActionTrack
 
 __all__ = ["ContactStarts", "support"]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from plab.bodies import (
+from plab.scenes.bodies import (
     BODY_SHAPES,
     MATERIAL_KEYS,
     Body,
@@ -40,6 +40,7 @@ __all__ = [
     "MeshBody",
     "Scene",
     "SceneError",
+    "Vec3",
     "make_body",
     "sample_particles",
     "vector3",

@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from plab.shape_files import ShapeError, pinned, read_triangles
+from plab.scenes.shape_files import ShapeError, pinned, read_triangles
 
 __all__ = ["Mesh", "load_mesh"]
 
@@ -34,11 +34,11 @@ def load_mesh(file: str, sha256: str | None = None) -> Mesh:
     """Return the mesh of a file; the same one as long as the file is the same.
 
     Args:
-        file: OBJ, STL or PLY file, see :func:`plab.shape_files.pinned`.
+        file: OBJ, STL or PLY file, see :func:`plab.scenes.shape_files.pinned`.
         sha256: What it has to hold, likewise.
 
     Raises:
-        plab.shape_files.ShapeError: If it cannot be read, or bounds no solid.
+        plab.scenes.shape_files.ShapeError: If it cannot be read, or bounds no solid.
     """
     return _loaded(*pinned(file, sha256))
 

@@ -1,7 +1,7 @@
 """Files of a user's own shapes: where they are, what they hold, and which ones they are.
 
 A configuration records a file by its SHA-256: a changed file is another configuration. What a shape is for,
-:mod:`plab.mesh` and the recipes of targets know.
+:mod:`plab.scenes.mesh` and the recipes of targets know.
 """
 
 from __future__ import annotations
