@@ -192,3 +192,23 @@ def test_scores_of_a_batch_are_those_of_its_episodes() -> None:
     np.testing.assert_array_equal(printed, [one.score_printed for one in alone])
     tensor, _printed = batch_scores(torch.from_numpy(scale), torch.from_numpy(end))
     np.testing.assert_array_equal(tensor.numpy(), score)
+
+
+@pytest.mark.parametrize("x", [[1.0 - 1.0 / N, 0.5, 0.5], [0.5, -1.0 / N, 0.5]])
+def test_particles_outside_the_grid_are_refused(x):
+    with pytest.raises(ValueError):
+        spread_mass([x], N, 1.0)
+
+
+def test_scores_where_nothing_can_be_gained_and_beyond_the_target():
+    assert scores_from_iou(0.5, 0.45, 0.4).score == 1.0
+    assert scores_from_iou(0.5, 0.35, 0.4).score == 0.0
+    np.testing.assert_array_equal(batch_scores(score_scale([0.2], [0.5]), np.array([0.6]))[0], [1.0])
+
+
+def test_mass_at_a_wall_is_smoothed_into_the_void():
+    start, target = np.zeros((2, 32, 32, 32))
+    start[0, 0, 0] = target[16, 16, 16] = 1.0
+    change = mass_change(start, target)
+    assert change.clip(0.0).sum() == pytest.approx(1.0, abs=1e-3)
+    assert (-change).clip(0.0).sum() < 0.5
