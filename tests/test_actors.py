@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 import torch
 
-from plab.bench.unseen import FIRST
-from plab.cli.bench import unseen
+import unseen
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
 from plab.problem import Trials
@@ -171,28 +170,29 @@ def test_scores_in_scenes_that_a_policy_has_not_seen(finished, tmp_path, capsys,
         batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
         return [batch]
 
-    monkeypatch.setattr("plab.bench.unseen.shared_batches", kept)
-    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene != FIRST)
-    assert unseen([*line, "--together", str(ENVS), "--csv", str(table)]) == 0
+    monkeypatch.setattr("unseen.shared_batches", kept)
+    monkeypatch.setattr("unseen.fits", lambda one: one.seed_scene != unseen.FIRST)
+    assert unseen.main([*line, "--together", str(ENVS), "--csv", str(table)]) == 0
     assert str(finished.path) in capsys.readouterr().out
     (row,) = pd.read_csv(table).to_dict("records")
     drawn = {"shac": "2 drawn scenes", "pods": "5 drawn scenes"}[name]
     assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", drawn, 4)
-    alone = (environments(scene)[1] for scene in drawn_configs(cfg, range(FIRST + 1, FIRST + 5)))
+    seeds = range(unseen.FIRST + 1, unseen.FIRST + 5)
+    alone = (environments(scene)[1] for scene in drawn_configs(cfg, seeds))
     found = [evaluation(judge, policy).measures["score"] for judge in alone]
     # Student's t with three degrees of freedom; the table has three digits.
     mean, half = np.mean(found), 3.182446 * np.std(found, ddof=1) / 2.0
     expected = mean, mean - half, mean + half, np.median(found)
     assert [row[key] for key in ("score", "lower", "upper", "median")] == pytest.approx(expected, abs=6e-4)
-    monkeypatch.setattr("plab.bench.unseen.fits", lambda one: one.seed_scene == FIRST)
-    assert unseen(line) == 2
+    monkeypatch.setattr("unseen.fits", lambda one: one.seed_scene == unseen.FIRST)
+    assert unseen.main(line) == 2
     assert "1 of 5 scenes" in capsys.readouterr().err
 
 
 def test_what_cannot_be_tried(told: Callable[..., str]) -> None:
-    assert "result file" in told(["task=Move"], unseen)
-    assert "--scenes" in told(["a.h5", "--scenes", "1"], unseen)
-    assert "a.policy.npz" in told(["a.h5"], unseen)
+    assert "result file" in told(["task=Move"], unseen.main)
+    assert "--scenes" in told(["a.h5", "--scenes", "1"], unseen.main)
+    assert "a.policy.npz" in told(["a.h5"], unseen.main)
 
 
 def test_targets_look_ahead_as_far_as_lambda_says() -> None:

@@ -9,21 +9,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Plan, attempts_at, lattice, rows
-from plab.bench.precision import angle
-from plab.bench.stability import run_cases, run_refusals
-from plab.bench.stress_cases import StressPlan, refusals, stress_cases
-from plab.cli import bench
+import precision
+import stress
+from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Attempt, Plan, angle, lattice, rows
+from plab.bench.stability import StressPlan, main, run_cases
 from plab.report.costs import diagrams
 from plab.report.figures import save, style
 from plab.scenes import Body, SceneError
 
 
 def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:
-    for scene in refusals().values():
+    for scene in stress.refusals().values():
         with pytest.raises(SceneError):
             scene.validate()
-    said = {row["case"]: row["where"] for row in run_refusals()}
+    said = {row["case"]: row["where"] for row in stress.run_refusals()}
     assert "substeps >= 112" in said["E times 100 without more substeps"]
     assert "0.3 " in said["manipulator moves by cells per substep"]
     assert "substeps >= 64" in said["manipulator moves by cells per substep"]
@@ -32,12 +31,12 @@ def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:
 
 @pytest.mark.nightly
 def test_few_particles_survive(tmp_path: Path) -> None:
-    cases = [c for c in stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
+    cases = [c for c in stress.stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
     found = list(run_cases(cases, "float32"))
     assert len(found) == 4
     assert {row["outcome"] for row in found} == {"survived"}
     path = tmp_path / "new" / "norms.csv"
-    bench._write_norms(found, path)
+    stress.write_norms(found, path)
     table = pd.read_csv(path).set_index(["case", "back"])["norm"]
     assert len(table) == 4 * 3 and np.isfinite(table).all()
     for row in found:
@@ -64,7 +63,7 @@ def test_lattices_fill_bodies_evenly_and_every_setting_has_a_scene() -> None:
     assert np.linalg.norm(round_ - ball.center, axis=1).max() <= 0.1
     for plan, spread in ((Plan(), 1.5), (QUICK, 1.6)):
         settings = [*plan.settings(), *plan.references().values()]
-        for attempt in attempts_at(TASKS, plan):
+        for attempt in [Attempt(task, plan) for task in TASKS]:
             for setting in settings:
                 scene, x = attempt.start(setting)
                 scene.validate()
@@ -97,10 +96,10 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_every_quick_case_survives_and_float32_is_close_to_float64(tmp_path: Path) -> None:
-    assert bench.stability(["--quick", "--precision", "float32"]) == 0
+    assert main(["--quick", "--precision", "float32"]) == 0
     out, summary = tmp_path / "rows.csv", tmp_path / "new" / "summary.md"
     command = ["--task", "Move", "--variant", "1", "--particles", "200", "--csv", str(out)]
-    assert bench.precision([*command, "--markdown", str(summary)]) == 0
+    assert precision.main([*command, "--markdown", str(summary)]) == 0
     table = pd.read_csv(out, keep_default_na=False)
     assert list(table["actions"]) == ["demonstration", "random"] and (table["failures"] == "").all()
     assert table["difference"].abs().max() < 0.01
@@ -111,6 +110,6 @@ def test_every_quick_case_survives_and_float32_is_close_to_float64(tmp_path: Pat
 def test_finer_steps_come_closer_to_the_reference() -> None:
     plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(24, 32), steps=6, particles=200)
     table = pd.DataFrame(rows(["Move"], plan)).query("contact == 'hard' and material == 'series'")
-    for precision, some in table[table["axis"] == "substeps"].groupby("precision"):
+    for name, some in table[table["axis"] == "substeps"].groupby("precision"):
         errors = some.set_index("substeps")["positions"].astype(float)
-        assert errors[20] < errors[5], precision
+        assert errors[20] < errors[5], name

@@ -118,16 +118,11 @@ def parsed(module: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> arg
             raise Parsed
 
         monkeypatch.setattr(argparse.ArgumentParser, name, parse)
-    package, _, name = module.rpartition(".")
-    if package == "plab.bench":
-        entry = getattr(importlib.import_module("plab.cli.bench"), name)
-    else:
-        found = importlib.import_module(module)
-        if hasattr(found, "__path__"):
-            found = importlib.import_module(f"{module}.__main__")
-        entry = found.main
+    found = importlib.import_module(module)
+    if hasattr(found, "__path__"):
+        found = importlib.import_module(f"{module}.__main__")
     with pytest.raises(Parsed):
-        entry(argv)
+        found.main(argv)
     return options[0]
 
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 HEAVY = {"matplotlib", "pandas", "pyvista", "scipy.ndimage", "stable_baselines3", "taichi", "torch", "vtk"}
 
 STARTING = """
-import plab.cli.bench
+import plab.bench
 from plab.cli.run import main
 from plab.config import load_config
 load_config(["task=Move"])

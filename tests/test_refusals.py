@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab import sizes
+import unseen
+from plab import bench, sizes
+from plab.bench import accuracy, speed, stability
 from plab.cli import (
-    bench,
     demonstrations,
     export,
     leaderboard,
@@ -205,12 +206,12 @@ TOOLS = [
     (submit.main, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
     (verify.main, "nowhere", "nowhere"),
     (leaderboard.main, "nowhere", "nowhere"),
-    (bench.speed, "--batch 0", "--batch"),
-    (bench.stability, "--quick --family nothing", "nothing"),
-    (bench.accuracy, "--task Table", "Table"),
+    (speed.main, "--batch 0", "--batch"),
+    (stability.main, "--quick --family nothing", "nothing"),
+    (accuracy.main, "--task Table", "Table"),
     (bench.main, "sped", "did you mean speed?"),
     (plab_main, "rnu", "choose from: run"),
-    (bench.unseen, "nowhere.h5 --scenes 0", "--scenes"),
+    (unseen.main, "nowhere.h5 --scenes 0", "--scenes"),
 ]
 """Command lines, their arguments, and what the answer names."""
 
@@ -229,7 +230,7 @@ IN_THE_WAY = [
     (export.main, "task=Rope --output blocked"),
     (targets.main, "--task Rope --csv blocked/a.csv"),
     (demonstrations.main, "--task Move --markdown blocked/a.md"),
-    (bench.speed, "--csv blocked/a.csv"),
+    (speed.main, "--csv blocked/a.csv"),
 ]
 
 

@@ -1,1 +1,26 @@
-"""Benchmarks: what each measures, in rows; their command lines stand in :mod:`plab.cli.bench`."""
+"""Benchmarks of speed, accuracy and stability; each module has its own command line."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from plab.cli.command import command_line
+from plab.errors import ArgumentError, pick
+
+__all__ = ["BENCHMARKS", "main"]
+
+BENCHMARKS = ("speed", "accuracy", "stability")
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark that the first argument names; return its exit code."""
+    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has a --help of its own")
+        return 0
+    if name not in BENCHMARKS:
+        raise ArgumentError(f"unknown benchmark {name}; {pick(name, BENCHMARKS)}")
+    return int(importlib.import_module(f"plab.bench.{name}").main(rest))

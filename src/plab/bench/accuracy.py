@@ -13,35 +13,32 @@ of the mass tensors relative to the mass, score, and the gradient's relative nor
 those of an environment step with gradient, of one environment.
 
 The actions are 0.7 times a demonstration's, and the target is what the demonstration itself ends with in the
-hard contact model, so that scores are those of an attempt that half succeeds. The loss has no contact term,
-see :mod:`plab.bench.common_scene`.
+hard contact model, so that scores are those of an attempt that half succeeds. The loss has the suite's terms
+of the mass tensor.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 
-from plab.bench.common_scene import (
-    common_actions,
-    common_places,
-    common_scene,
-    grid_terms,
-    own_components,
-)
-from plab.bench.precision import angle
-from plab.config import Config, build_scene, load_config
+from plab.bench.workload import with_particles
+from plab.cli.arguments import Parser, folder, positive, task_list
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table
+from plab.config import build_scene
 from plab.demonstrations import known_actions
+from plab.losses import make_terms
 from plab.objective import scores, spread_mass, target_sdf
-from plab.scenes import CONTACTS, PRECISIONS, Body, Scene, sample_particles
+from plab.scenes import CONTACTS, DEVICES, PRECISIONS, Body, Scene, sample_particles
 from plab.sim import Simulator
-
-__all__ = ["COLUMNS", "QUICK", "QUICK_TASKS", "TASKS", "Plan", "Resolution", "attempts_at", "lattice", "rows"]
 
 TASKS = ("Move", "Rope", "RollingPin", "Chopsticks")
 QUICK_TASKS = ("Move", "Rope")
@@ -134,19 +131,25 @@ QUICK = Plan(32, (3, 5, 10, 20), 10, reference=80, grids=(24, 32, 40), steps=20,
 
 @dataclass(frozen=True)
 class Result:
-    """What a setting made of a task.
+    """Outcome of one setting for a task in one contact model.
 
     Attributes:
         x: Final positions, shape [particle, 3].
         gradient: Gradient of the loss per mass, shape [T, A].
         seconds: Run time of an environment step with gradient.
-        outcome: ``stable``, or what went wrong.
+        outcome: ``stable``, or the failure.
     """
 
     x: np.ndarray
     gradient: np.ndarray
     seconds: float
     outcome: str
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too; NaN if one vanishes."""
+    a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
+    return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
 
 def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
@@ -171,39 +174,27 @@ def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
     return out
 
 
-def attempts_at(tasks: Sequence[str], plan: Plan) -> list[Attempt]:
-    """Return the first variants of tasks, in a common kind of scene."""
-    cfgs = [load_config([f"task={task}", "variant=1"]) for task in tasks]
-    places = common_places([build_scene(cfg) for cfg in cfgs])
-    return [Attempt(cfg, plan, places) for cfg in cfgs]
+def _volume(body: Body) -> float:
+    return float(np.prod(body.size)) if body.shape == "box" else 4.0 / 3.0 * np.pi * body.size[0] ** 3
 
 
 class Attempt:
-    """A task with the actions that are tried and the targets that they half reach."""
+    """A task with the actions that are tried and the states that they half reach."""
 
-    def __init__(self, cfg: Config, plan: Plan, places: Sequence[str]) -> None:
-        """Build the task's scene.
-
-        Args:
-            cfg: Configuration of the task.
-            plan: Numbers of environment steps and particles.
-            places: Shapes of the manipulators of the common scene.
-        """
-        self.task = cfg.task.name
+    def __init__(self, task: str, plan: Plan) -> None:
+        """Build the scene of the task's first variant."""
+        cfg = with_particles([f"task={task}", "variant=1"], plan.particles)
+        self.task = task
         self.scene = build_scene(cfg)
-        self.components = own_components(self.scene, places)
-        self.demonstration = common_actions(
-            self.scene, cast(np.ndarray, known_actions(cfg))[: plan.steps], places
-        )
-        self.targets: dict[str, np.ndarray] = {}
+        self.demonstration = cast(np.ndarray, known_actions(cfg))[: plan.steps]
+        self.ends: dict[str, np.ndarray] = {}
         self._plan = plan
-        self._places = places
 
     def start(self, setting: Resolution) -> tuple[Scene, np.ndarray]:
-        """Return the common scene of a setting and its particles.
+        """Return the scene of a setting and its particles.
 
         Grids have particles on a lattice, as many per cell: random ones would differ between grids by more
-        than what is to be seen.
+        than the grids themselves.
         """
         plan, scene = self._plan, self.scene
         if setting.axis == "grid":
@@ -211,123 +202,131 @@ class Attempt:
             parts = lattice(scene.bodies, np.cbrt(volume / plan.particles) * plan.grid / setting.grid)
             counted = zip(scene.bodies, parts, strict=True)
             scene = replace(scene, bodies=tuple(replace(b, particles=len(x)) for b, x in counted))
-            scene = common_scene(scene, scene.particle_count, self._places)
             x = np.concatenate(parts)
         else:
-            scene = common_scene(scene, plan.particles, self._places)
             x = sample_particles(scene)
         values = {field.name: getattr(scene, field.name) for field in fields(Scene)}
         values |= {"grid_size": setting.grid, "substeps": setting.substeps}
         return UncheckedScene(**values | {"dt": STEP_TIME / setting.substeps}), x
 
+    def run(self, setting: Resolution, repeats: int) -> dict[str, Result]:
+        """Simulate and time one setting.
 
-def _volume(body: Body) -> float:
-    return float(np.prod(body.size)) if body.shape == "box" else 4.0 / 3.0 * np.pi * body.size[0] ** 3
+        Args:
+            setting: The setting. The first one of an axis determines the target: the demonstration is run
+                with it, and its final state becomes the target.
+            repeats: Rollouts after the first, which compiles; the fastest of them is timed.
 
-
-def simulate(setting: Resolution, attempts: Sequence[Attempt], repeats: int, device: str) -> Iterator[tuple]:
-    """Run all tasks and contact models in one setting.
-
-    Args:
-        setting: The setting.
-        attempts: The tasks. Where one has no target for the setting's axis yet, its demonstration is run
-            first, and what that ends with becomes the target.
-        repeats: Rollouts after the first, which compiles; the fastest of them is timed.
-        device: ``cpu`` or ``cuda``.
-
-    Yields:
-        Task, contact model and :class:`Result`.
-    """
-    simulator = None
-    for attempt in attempts:
-        scene, x = attempt.start(setting)
-        if simulator is None or simulator.particle_count != scene.particle_count:
-            # Taichi's memory goes with the old simulator, before there is a new one.
-            simulator = None
-            simulator = Simulator(
-                [scene],
-                terms=grid_terms(),
-                precision=setting.precision,
-                device=device,
-                particles=[x],
-                _singular_values=setting.material != "series",
-            )
-        simulator.set_scenes([scene], particles=[x])
-        if setting.axis not in attempt.targets:
+        Returns:
+            A result per contact model.
+        """
+        scene, x = self.start(setting)
+        simulator = Simulator(
+            [scene],
+            # The suite's terms of the mass tensor.
+            terms=make_terms({"density": 10.0, "sdf": 10.0}),
+            precision=setting.precision,
+            device=self._plan.device,
+            particles=[x],
+            _singular_values=setting.material != "series",
+        )
+        if setting.axis not in self.ends:
             simulator.set_contact("hard")
-            simulator.rollout(attempt.demonstration[None], gradient=False)
-            attempt.targets[setting.axis] = simulator.state().x[0]
-        end = attempt.targets[setting.axis]
+            simulator.rollout(self.demonstration[None], gradient=False)
+            self.ends[setting.axis] = simulator.state().x[0]
+        end = self.ends[setting.axis]
         mass = scene.particle_mass * scene.particle_count
         target = spread_mass(end, scene.grid_size, mass / len(end))
         simulator.set_target(target[None], target_sdf(target, 0.1 * scene.particle_mass)[None])
+        actions, found = EFFORT * self.demonstration[None], {}
         for contact in CONTACTS:
             simulator.set_contact(contact)
-            yield attempt, contact, _roll(simulator, attempt, repeats, mass)
+            seconds = []
+            for _ in range(repeats + 1):
+                begin = time.perf_counter()
+                rollout = simulator.rollout(actions, strict=False)
+                seconds.append((time.perf_counter() - begin) / actions.shape[1])
+            gradient = cast(np.ndarray, rollout.gradient)[0] / mass
+            outcome = next(iter(rollout.failures.values()), "stable")
+            found[contact] = Result(simulator.state().x[0], gradient, min(seconds[1:] or seconds), outcome)
+        return found
 
-
-def _roll(simulator: Simulator, attempt: Attempt, repeats: int, mass: float) -> Result:
-    """Run and time one task in one contact model."""
-    actions = EFFORT * attempt.demonstration[None]
-    seconds = []
-    # The first rollout compiles.
-    for _ in range(repeats + 1):
-        begin = time.perf_counter()
-        rollout = simulator.rollout(actions, strict=False)
-        seconds.append((time.perf_counter() - begin) / actions.shape[1])
-    gradient = cast(np.ndarray, rollout.gradient)[0][:, attempt.components] / mass
-    outcome = next(iter(rollout.failures.values()), "stable")
-    return Result(simulator.state().x[0], gradient, min(seconds[1:] or seconds), outcome)
-
-
-def judge(
-    setting: Resolution, attempt: Attempt, result: Result, exact: Result, grid: int
-) -> dict[str, float]:
-    """Return the errors of a result by column, NaN where there is nothing to compare; mass tensors are
-    compared on so many grid nodes per axis."""
-    start = attempt.start(setting)[1]
-    target = spread_mass(attempt.targets[setting.axis], grid, 1.0 / len(attempt.targets[setting.axis]))
-    errors = dict.fromkeys(("positions", "mass", "score", "gradient", "angle_deg"), float("nan"))
-    if result.outcome != "stable":
+    def errors(self, setting: Resolution, result: Result, exact: Result, grid: int) -> dict[str, float]:
+        """Return the errors of a result by column, NaN where there is nothing to compare; mass tensors are
+        compared on ``grid`` nodes per axis."""
+        end = self.ends[setting.axis]
+        errors = dict.fromkeys(("positions", "mass", "score", "gradient", "angle_deg"), float("nan"))
+        if result.outcome != "stable":
+            return errors
+        positions = (self.start(setting)[1], result.x, exact.x, end)
+        initial, found, right, target = (spread_mass(x, grid, 1.0 / len(x)) for x in positions)
+        if setting.axis == "substeps":
+            errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
+        errors["mass"] = float(np.abs(found - right).sum())
+        judged = [scores(initial, tensor, target).score for tensor in (found, right)]
+        errors["score"] = abs(judged[0] - judged[1])
+        lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
+        if all(lengths):
+            # Without contact there is no gradient, hence no direction.
+            errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
+            errors["angle_deg"] = angle(result.gradient, exact.gradient)
         return errors
-    tensors = [spread_mass(x, grid, 1.0 / len(x)) for x in (start, result.x, exact.x)]
-    judged = [scores(tensors[0], tensor, target).score for tensor in tensors[1:]]
-    if setting.axis == "substeps":
-        errors["positions"] = float(np.sqrt(((result.x - exact.x) ** 2).sum(axis=1).mean()))
-    errors["mass"] = float(np.abs(tensors[1] - tensors[2]).sum())
-    errors["score"] = abs(judged[0] - judged[1])
-    lengths = [np.linalg.norm(r.gradient) for r in (result, exact)]
-    if all(lengths):
-        # Without contact there is no gradient, hence no direction.
-        errors["gradient"] = float(abs(lengths[0] / lengths[1] - 1.0))
-        errors["angle_deg"] = angle(result.gradient, exact.gradient)
-    return errors
 
 
 def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
-    """Run a plan; yields a row of :data:`COLUMNS` per setting, task and contact model."""
-    attempts = attempts_at(tasks, plan)
-    exact: dict[tuple[str, str, str], Result] = {}
-    for axis, setting in plan.references().items():
-        for attempt, contact, result in simulate(setting, attempts, 0, plan.device):
-            exact[axis, attempt.task, contact] = result
+    """Run a plan; yields a row of :data:`COLUMNS` per task, setting and contact model."""
     grids = {"substeps": plan.grid, "grid": plan.grids[0]}
-    for setting in plan.settings():
-        for attempt, contact, result in simulate(setting, attempts, plan.repeats, plan.device):
-            errors = judge(
-                setting, attempt, result, exact[setting.axis, attempt.task, contact], grids[setting.axis]
-            )
-            yield vars(setting) | {
-                "task": attempt.task,
-                "contact": contact,
-                "particles": len(result.x),
-                "ms_per_step": f"{1e3 * result.seconds:.3f}",
-                **{name: f"{value:.3g}" for name, value in errors.items()},
-                "outcome": result.outcome,
-            }
+    for task in tasks:
+        attempt = Attempt(task, plan)
+        exact = {axis: attempt.run(setting, 0) for axis, setting in plan.references().items()}
+        for setting in plan.settings():
+            for contact, result in attempt.run(setting, plan.repeats).items():
+                errors = attempt.errors(setting, result, exact[setting.axis][contact], grids[setting.axis])
+                yield vars(setting) | {
+                    "task": task,
+                    "contact": contact,
+                    "particles": len(result.x),
+                    "ms_per_step": f"{1e3 * result.seconds:.3f}",
+                    **{name: f"{value:.3g}" for name, value in errors.items()},
+                    "outcome": result.outcome,
+                }
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Compare settings with references, print, write the table and the diagrams."""
+    import pandas as pd
+
+    from plab.report.costs import diagrams
+    from plab.report.figures import save, style
+
+    options = _options(argv)
+    plan = QUICK if options.quick else Plan()
+    plan = replace(plan, particles=options.particles or plan.particles, device=options.device)
+    tasks, output = options.task or (QUICK_TASKS if options.quick else TASKS), options.output
+    output.mkdir(parents=True, exist_ok=True)
+    table = measure_table(COLUMNS, rows(tasks, plan), output / "accuracy.csv")
+    with style():
+        drawings = diagrams(pd.DataFrame(table))
+    save(drawings, output, {"footer": ["python -m plab.bench.accuracy"]})
+    for drawing in drawings:
+        print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
+
+
+def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser("plab.bench.accuracy", __doc__)
+    parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
+    text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"
+    parser.add_argument("--task", type=task_list, help=text)
+    text = "particles per environment (10000; 1000 with --quick)"
+    parser.add_argument("--particles", type=positive, help=text)
+    parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
+    parser.add_argument("--output", type=folder, default=Path("accuracy"), help="folder to write to")
+    options = parser.parse_intermixed_args(argv)
+    if unknown := set(options.task or ()) - set(TASKS):
+        parser.error(f"no diagrams for {', '.join(sorted(unknown))}; choose from: {', '.join(TASKS)}")
+    return options
 
 
 if __name__ == "__main__":
-    from plab.cli.bench import accuracy
-
-    sys.exit(accuracy())
+    sys.exit(main())

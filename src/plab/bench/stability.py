@@ -1,33 +1,36 @@
-"""What the simulator survives: a matrix of cases that break simulators, and a count of those survived.
+"""Stability of the simulator under violent actions.
 
     python -m plab.bench.stability                      # everything, in both precisions
     python -m plab.bench.stability --quick              # a few minutes on two cores
     python -m plab.bench.stability --precision float32 --particles 1000 --csv cases.csv
-    python -m plab.bench.stability --quick --family "1000 steps" --gradients norms.csv
+    python -m plab.bench.stability --quick --family "1000 steps"
 
-Every case is simulated forwards and backwards. It has survived if state, loss terms and gradient are finite,
-no particle ever moved by more than a cell in a substep, all particles are inside the domain, and the mass
-tensor holds all mass. What cannot be simulated must be refused with the reason; those cases come last. The
-exit code is 1 if any case failed. With ``--gradients`` the norm of the gradient is written for each step back
-in time, and drawn into a PNG of the same name.
+Cases are the suite's configurations under random and bang-bang actions, in both contact models, over 50
+steps, and of first variants over 1000. Every case is simulated forwards and backwards. It has survived if
+state, loss terms and gradient are finite, no particle ever moved by more than a cell in a substep, all
+particles are inside the domain, and the mass tensor holds all mass. The exit code is 1 if any case failed.
 """
 
 from __future__ import annotations
 
-import math
+import argparse
+import itertools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
 
-from plab.bench.stress_cases import StressCase, StressPlan, refusals
-from plab.config.suite import suite_tasks
+from plab.bench.workload import with_particles
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table, print_table
+from plab.config import ConfigError, build_scene
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.losses import make_terms
-from plab.scenes import SceneError
-from plab.sim import SimulationError, Simulator
-
-__all__ = ["COLUMNS", "FULL", "QUICK", "REFUSAL", "run_cases", "run_refusals"]
+from plab.scenes import PRECISIONS, Scene
+from plab.sim import Simulator, State
 
 BATCH = 12
 """Environments simulated together."""
@@ -35,13 +38,89 @@ BATCH = 12
 MASS_TOLERANCE = {"float32": 1e-4, "float64": 1e-10}
 """Relative error allowed in the sum of a mass tensor: rounding of one addition per particle."""
 
-REFUSAL = "refusal"
-"""Family of the scenes that are to be refused."""
+HOLD = 10
+"""Longest that a bang-bang action is held [environment steps]."""
 
 COLUMNS = ("precision", "family", "case", "outcome", "speed", "gradient", "where")
 
+
+@dataclass(frozen=True)
+class StressPlan:
+    """Size of the matrix of cases.
+
+    Attributes:
+        particles: Particles per environment.
+        variants: Variants of each task.
+        long_tasks: Tasks that are run over the long horizon.
+        long_horizon: Environment steps of the long horizon.
+        horizon: Environment steps otherwise.
+    """
+
+    particles: int
+    variants: tuple[str, ...] = SUITE_VARIANTS
+    long_tasks: tuple[str, ...] = ()
+    long_horizon: int = 1000
+    horizon: int = 50
+
+
 FULL = StressPlan(particles=300, long_tasks=tuple(suite_tasks()))
 QUICK = StressPlan(particles=64, variants=("1",), long_tasks=("Move",))
+
+
+@dataclass(frozen=True)
+class StressCase:
+    """A scene and actions that the simulator has to survive.
+
+    Attributes:
+        family: Group of cases.
+        name: Name within the family.
+        scene: The scene.
+        actions: Actions, shape [T, A].
+        contact: Contact model.
+        state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
+        contact_weight: Weight of the loss's contact term.
+    """
+
+    family: str
+    name: str
+    scene: Scene
+    actions: np.ndarray
+    contact: str
+    state: Mapping[str, np.ndarray] = field(default_factory=dict)
+    contact_weight: float = 0.0
+
+
+def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """Uniform and independent, shape [steps, size]."""
+    return rng.uniform(-1.0, 1.0, size=(steps, size))
+
+
+def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
+    """Every component at one end of its range or the other, held for up to :data:`HOLD` steps."""
+    out = np.empty((steps, size))
+    for column in out.T:
+        lengths = rng.integers(1, HOLD + 1, size=steps)
+        column[:] = np.repeat(rng.choice([-1.0, 1.0], size=steps), lengths)[:steps]
+    return out
+
+
+ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
+
+
+def stress_cases(plan: StressPlan) -> Iterator[StressCase]:
+    """Yield the configurations of a plan under random and bang-bang actions, in both contact models."""
+    family = f"{plan.long_horizon} steps"
+    short = itertools.product(["suite"], suite_tasks(), plan.variants)
+    long = itertools.product([family], plan.long_tasks, ["1"])
+    number = 0
+    for family, task, variant in itertools.chain(short, long):
+        scene = build_scene(with_particles([f"task={task}", f"variant={variant}"], plan.particles))
+        steps = plan.horizon if family == "suite" else plan.long_horizon
+        for kind, contact in itertools.product(ACTIONS, ("soft", "hard")):
+            number += 1
+            actions = ACTIONS[kind](np.random.default_rng(number), steps, scene.action_dim)
+            name = f"{task}-v{variant} {kind} {contact}"
+            yield StressCase(family, name, scene, actions, contact, contact_weight=1.0)
 
 
 def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str, object]]:
@@ -52,47 +131,30 @@ def run_cases(cases: Sequence[StressCase], precision: str) -> Iterator[dict[str,
         precision: ``float32`` or ``float64``.
 
     Yields:
-        A row of :data:`COLUMNS` per case: outcome (``survived`` or why not), fastest particle [cells per
+        A row of :data:`COLUMNS` per case: outcome (``survived`` or the failure), fastest particle [cells per
         substep], largest gradient component, and the environment step of that component; beyond the columns
         ``norms``, those of the gradient with respect to each step's actions, shape [T].
     """
-    for group in _groups(cases).values():
-        scenes = [group[0].scene] * min(BATCH, len(group))
+    for group in _groups(cases):
         terms = make_terms({"density": 10.0, "sdf": 10.0, "contact": group[0].contact_weight})
+        scenes = [group[0].scene] * min(BATCH, len(group))
         simulator = Simulator(scenes, terms=terms, precision=precision)
         simulator.set_target(*_target(simulator))
         for at in range(0, len(group), simulator.batch):
-            part = group[at : at + simulator.batch]
-            yield from ({"precision": precision, **row} for row in _run_together(simulator, part))
+            yield from _run_together(simulator, group[at : at + simulator.batch])
         # Taichi's memory goes with the simulator, before the next one is built.
         del simulator
 
 
-def run_refusals() -> Iterator[dict[str, object]]:
-    """Check that scenes that cannot be simulated are refused.
-
-    Yields:
-        A row of :data:`COLUMNS` per scene; ``where`` is the message.
-    """
-    for name, scene in refusals().items():
-        outcome, why = "was not refused", ""
-        try:
-            scene.validate()
-        except SceneError as error:
-            outcome, why = "refused", str(error)
-        values = ("any", REFUSAL, name, outcome, "", "", why)
-        yield dict(zip(COLUMNS, values, strict=True))
-
-
-def _groups(cases: Sequence[StressCase]) -> dict[tuple, list[StressCase]]:
-    """Cases by what a compiled simulator is made for, and by what one rollout shares."""
+def _groups(cases: Sequence[StressCase]) -> list[list[StressCase]]:
+    """Group the cases that can share a compiled simulator and a rollout."""
     groups: dict[tuple, list[StressCase]] = {}
     for case in cases:
         scene = case.scene
         shapes = tuple(m.shape for m in scene.manipulators)
         kind = (shapes, scene.particle_count, scene.grid_size, scene.dt, scene.substeps)
         groups.setdefault((*kind, len(case.actions), case.contact_weight), []).append(case)
-    return groups
+    return list(groups.values())
 
 
 def _target(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
@@ -105,84 +167,100 @@ def _target(simulator: Simulator) -> tuple[np.ndarray, np.ndarray]:
     return np.broadcast_to(mass, shape), np.broadcast_to(np.maximum(distance, 0.0), shape)
 
 
-def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> list[dict[str, object]]:
+def _run_together(simulator: Simulator, cases: Sequence[StressCase]) -> Iterator[dict[str, object]]:
     """Run at most a batch of cases of one group."""
     full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
-    _start(simulator, full)
+    simulator.set_scenes([case.scene for case in full])
+    simulator.set_contact([case.contact for case in full])
+    start = simulator.state()
+    for e, case in enumerate(full):
+        for name, value in case.state.items():
+            getattr(start, name)[e] = value
+    simulator.set_initial_state(start)
     actions = np.stack([case.actions for case in full])
     rollout = simulator.rollout(actions, strict=False)
     state, mass = simulator.state(), simulator.mass_tensor()
-    outcomes = [
-        _outcome(simulator, case, rollout.failures.get(e), e, state, mass) for e, case in enumerate(cases)
-    ]
-    alive = [case for case, outcome in zip(cases, outcomes, strict=True) if outcome == "survived"]
-    speeds = iter(_speeds(simulator, alive) if alive else [])
-    rows = []
+    fastest = np.zeros(simulator.batch)
+    simulator.reset()
+    for t in range(actions.shape[1]):
+        simulator.step(actions[:, t], check=False)
+        fastest = np.maximum(fastest, np.linalg.norm(simulator.observe(1)[:, :, 3:], axis=2).max(axis=1))
     for e, case in enumerate(cases):
         gradient = cast(np.ndarray, rollout.gradient)[e]
         sizes = np.abs(gradient).max(axis=1, initial=0.0)
-        speed, outcome = math.nan, outcomes[e]
-        if outcome == "survived":
-            speed = next(speeds) * case.scene.dt / case.scene.dx
-            # Written so that nan fails it, too.
-            outcome = "survived" if speed <= 1.0 else "a particle crossed a cell in a substep"
-        rows.append(
-            {
-                "family": case.family,
-                "case": case.name,
-                "outcome": outcome,
-                "speed": f"{speed:.3f}",
-                "gradient": f"{sizes.max():.3g}",
-                "where": int(sizes.argmax()) + 1,
-                "norms": np.linalg.norm(gradient, axis=1),
-            }
-        )
-    return rows
+        speed = fastest[e] * case.scene.dt / case.scene.dx
+        yield {
+            "precision": simulator.precision,
+            "family": case.family,
+            "case": case.name,
+            "outcome": rollout.failures.get(e) or _outcome(simulator.precision, case, e, state, mass, speed),
+            "speed": f"{speed:.3f}",
+            "gradient": f"{sizes.max():.3g}",
+            "where": int(sizes.argmax()) + 1,
+            "norms": np.linalg.norm(gradient, axis=1),
+        }
 
 
-def _start(simulator: Simulator, cases: Sequence[StressCase]) -> None:
-    """Put a batch of cases into their initial states."""
-    simulator.set_scenes([case.scene for case in cases])
-    simulator.set_contact([case.contact for case in cases])
-    state = simulator.state()
-    for e, case in enumerate(cases):
-        for name, value in case.state.items():
-            getattr(state, name)[e] = value
-    simulator.set_initial_state(state)
-
-
-def _outcome(simulator, case: StressCase, failure: str | None, e: int, state, mass: np.ndarray) -> str:
-    """Judge the end of a case."""
-    if failure is not None:
-        return failure
+def _outcome(precision: str, case: StressCase, e: int, state: State, mass: np.ndarray, speed: float) -> str:
+    """Judge the last state of environment e, its mass tensor and its speed [cells per substep]."""
     if not all(np.isfinite(getattr(state, name)[e]).all() for name in ("x", "v", "C", "F", "poses")):
         return "the last state is not finite"
     if state.x[e].min() < 0.0 or state.x[e].max() > 1.0 - 2.999 * case.scene.dx:
         return "a particle left the domain"
-    total = case.scene.particle_mass * case.scene.particle_count
-    error = abs(mass[e].sum() / total - 1.0)
-    if not error <= MASS_TOLERANCE[simulator.precision]:
+    error = abs(mass[e].sum() / (case.scene.particle_mass * case.scene.particle_count) - 1.0)
+    # The comparisons are written so that NaN fails them, too.
+    if not error <= MASS_TOLERANCE[precision]:
         return f"mass changed by {error:.1e} of itself"
-    return "survived"
+    return "survived" if speed <= 1.0 else "a particle crossed a cell in a substep"
 
 
-def _speeds(simulator: Simulator, cases: Sequence[StressCase]) -> np.ndarray:
-    """Largest speed of any particle after any environment step, shape [case]."""
-    full = [*cases, *([cases[-1]] * (simulator.batch - len(cases)))]
-    _start(simulator, full)
-    fastest = np.zeros(simulator.batch)
-    for t in range(len(cases[0].actions)):
-        try:
-            simulator.step(np.stack([case.actions[t] for case in full]))
-        except SimulationError:
-            # Stepping follows the rollout to rounding only, which decides in a chaotic case.
-            fastest[:] = np.inf
-            break
-        fastest = np.maximum(fastest, np.linalg.norm(simulator.observe(1)[:, :, 3:], axis=2).max(axis=1))
-    return fastest[: len(cases)]
+def summarise(rows: Sequence[Mapping[str, object]]) -> int:
+    """Print how many cases of each family survived; return the exit code."""
+    survived: dict[tuple, list[bool]] = {}
+    for row in rows:
+        survived.setdefault((row["precision"], row["family"]), []).append(row["outcome"] == "survived")
+    every = [one for own in survived.values() for one in own]
+    counts = [(*which, len(own), sum(own)) for which, own in survived.items()]
+    print()
+    columns = ("precision", "family", "cases", "survived")
+    print_table(columns, [*counts, ("", "all", len(every), sum(every))])
+    return 0 if all(every) else 1
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Simulate the cases, print, write the file asked for; return the exit code."""
+    options = options_of(Parser("plab.bench.stability", __doc__), argv)
+    return summarise(measure(options, stress_cases))
+
+
+def options_of(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the options of a command line that runs cases, with those that the parser already has."""
+    parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
+    parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
+    parser.add_argument("--particles", type=positive, help="particles per environment (300; 64 with --quick)")
+    parser.add_argument("--horizon", type=positive, help="environment steps of the long horizon (1000)")
+    parser.add_argument("--family", nargs="+", help="only these families of cases")
+    parser.add_argument("--csv", type=to_write, help="file to write a row per case to")
+    options = parser.parse_intermixed_args(argv)
+    plan = QUICK if options.quick else FULL
+    plan = replace(plan, particles=options.particles or plan.particles)
+    options.plan = replace(plan, long_horizon=options.horizon or plan.long_horizon)
+    return options
+
+
+def measure(
+    options: argparse.Namespace, cases_of: Callable[[StressPlan], Iterable[StressCase]]
+) -> list[Mapping[str, object]]:
+    """Run and print the cases of the plan that the options of :func:`options_of` ask for; return the rows."""
+    cases = list(cases_of(options.plan))
+    families = list(dict.fromkeys(case.family for case in cases))
+    if unknown := set(options.family or ()) - set(families):
+        raise ConfigError(f"no cases of {', '.join(sorted(unknown))}; choose from: {', '.join(families)}")
+    chosen = [case for case in cases if case.family in (options.family or families)]
+    each = (run_cases(chosen, precision) for precision in options.precision)
+    return measure_table(COLUMNS, itertools.chain.from_iterable(each), options.csv)
 
 
 if __name__ == "__main__":
-    from plab.cli.bench import stability
-
-    sys.exit(stability())
+    sys.exit(main())

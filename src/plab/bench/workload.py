@@ -1,58 +1,34 @@
-"""What the speed benchmarks run: a batch of environments in the middle of a demonstration."""
+"""Workload of the speed benchmarks: a batch of environments in the middle of a demonstration."""
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
-from plab.config import Config, build_scene
+from plab.config import Config, build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.losses import make_terms
-from plab.objective import OBSERVED_PARTICLES, target_sdf
+from plab.objective import target_sdf
 from plab.sim import Simulator
-
-if TYPE_CHECKING:
-    import torch
-
-__all__ = [
-    "FORWARD",
-    "GRADIENT",
-    "KINDS",
-    "OBSERVATION",
-    "REWARD",
-    "ROLLOUT",
-    "TENSORS",
-    "Timing",
-    "Workload",
-    "build",
-    "peak_rss_mb",
-    "restart_peak_rss",
-    "time_calls",
-]
 
 FORWARD = "forward"
 REWARD = "forward + reward"
-OBSERVATION = "forward + reward + observation"
-TENSORS = "forward + reward + observation, tensors"
 ROLLOUT = "rollout + losses"
 GRADIENT = "forward + backward"
 
 NOISE = 0.02
-"""Actions of the environments of a batch differ by this much, so that no two do the same."""
+"""Half-width of the noise that makes the actions of a batch's environments differ."""
 
 SOLID = 0.1
-"""Share of the largest mass from which on a node belongs to the target."""
+"""Mass of a node that belongs to the target, as a share of the largest mass of any node."""
 
 WARM_UP = 2
-"""Calls after the first, which compiles, that are not counted: the CPU's kernels try sizes of their teams."""
+"""Uncounted calls after the first, which compiles: the CPU's kernels try sizes of their teams in them."""
 
 
 @dataclass(frozen=True)
@@ -76,32 +52,18 @@ class Workload:
         """Environment steps of a rollout."""
         return self.actions.shape[1]
 
-    @cached_property
-    def tensor(self) -> torch.Tensor:
-        """The actions on the device."""
-        # Imported here: it takes time and memory, which no other kind should be charged with.
-        import torch
 
-        return torch.as_tensor(self.actions, device="cuda")
-
-    def call(self, kind: str) -> Callable[[], object]:
-        """Return what is timed: a rollout of one of the :data:`KINDS`."""
-        if kind == TENSORS:
-            # The way to the device is no part of what is timed.
-            _ = self.tensor
-        return lambda: KINDS[kind](self)
+def with_particles(overrides: Sequence[str], particles: int) -> Config:
+    """Compose a configuration with a number of particles."""
+    whole = sum(body.particles for body in load_config(overrides).task.bodies.values())
+    return load_config([*overrides, f"sim.particles_scale={particles / whole}"])
 
 
-def build(
-    cfg: Config,
-    batch: int,
-    steps: int,
-    *,
-    from_start: bool = False,
-) -> Workload:
+def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> Workload:
     """Build a simulator and put it where the plasticine is being worked on.
 
-    Targets cost time to make and none to compare with, so the target is the initial shape, moved.
+    A task's own target takes time to make and none to compare with, so the initial shape, moved, is the
+    target.
 
     Args:
         cfg: The configuration.
@@ -126,7 +88,7 @@ def build(
     )
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
-    # Relative to its largest: with few particles all masses are small.
+    # Relative to the largest mass, because all masses are small where there are few particles.
     distance = target_sdf(mass, threshold=SOLID * mass.max())
     shape = (batch, *mass.shape)
     simulator.set_target(np.broadcast_to(mass, shape), np.broadcast_to(distance, shape))
@@ -147,15 +109,14 @@ def build(
 
 
 def _run(simulator: Simulator, actions: np.ndarray) -> None:
-    """Go through actions, shape [batch, T, A], from the initial state."""
     simulator.reset()
     for t in range(actions.shape[1]):
         simulator.step(actions[:, t])
 
 
 def _before_contact(simulator: Simulator, actions: np.ndarray) -> int:
-    """Take the state for the initial one, and return how many steps by actions, shape [batch, T, A], go by
-    before a manipulator touches a body; 0 if none does."""
+    """Make the current state the initial one, and count the steps of actions, shape [batch, T, A], before a
+    manipulator touches a body; 0 if none does."""
     simulator.set_initial_state(simulator.state())
     simulator.reset()
     for t in range(actions.shape[1]):
@@ -174,21 +135,12 @@ def _actions(cfg: Config, batch: int, width: int) -> np.ndarray:
     return np.clip(known + rng.uniform(-NOISE, NOISE, size=(batch, *known.shape)), -1.0, 1.0)
 
 
-def _forward(
-    load: Workload, *, reward: bool = False, observation: bool = False, tensors: bool = False
-) -> None:
-    simulator = load.simulator
-    simulator.reset()
-    stride = max(simulator.particle_count // OBSERVED_PARTICLES, 1)
-    like = load.tensor if tensors else None
-    actions = load.actions if like is None else like
+def _forward(load: Workload, reward: bool) -> None:
+    load.simulator.reset()
     for t in range(load.steps):
-        simulator.step(actions[:, t], check=not reward)
-        if observation:
-            simulator.observe(stride, like)
-            simulator.poses(like)
+        load.simulator.step(load.actions[:, t], check=not reward)
         if reward:
-            simulator.measure(like)
+            load.simulator.measure()
     ti.sync()
 
 
@@ -198,64 +150,37 @@ def _rollout(load: Workload, gradient: bool) -> None:
 
 
 KINDS: dict[str, Callable[[Workload], None]] = {
-    FORWARD: _forward,
+    FORWARD: lambda load: _forward(load, reward=False),
     REWARD: lambda load: _forward(load, reward=True),
-    OBSERVATION: lambda load: _forward(load, reward=True, observation=True),
-    TENSORS: lambda load: _forward(load, reward=True, observation=True, tensors=True),
     ROLLOUT: lambda load: _rollout(load, gradient=False),
     GRADIENT: lambda load: _rollout(load, gradient=True),
 }
-"""What can be timed. The reward is what every step's is made of, loss terms and IoU, on the host; the
-observation is what the environments return. With tensors, actions, rewards and observations are on the
-device, as in training there; on the CPU there is no such row. A rollout is one call for all steps and their
-loss terms, as for the optimisers; the backward pass includes it."""
+"""Kinds of calls that can be timed. The reward needs the loss terms and the IoU of every step on the host. A
+rollout is one call for all steps and their loss terms, as the optimisers make it; the backward pass includes
+it."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Times of a call.
+def time_calls(load: Workload, kind: str, repeats: int) -> tuple[float, np.ndarray]:
+    """Time one of the :data:`KINDS`, cold and after the warm-up.
 
-    Attributes:
-        first_s: Seconds of the first call; it compiles, or loads from Taichi's cache.
-        seconds: Seconds of each counted call, shape [repeat].
+    Returns:
+        Seconds of the first call, which compiles, or loads from Taichi's cache; milliseconds per environment
+        step of ``repeats`` calls: median, least, most.
     """
-
-    first_s: float
-    seconds: np.ndarray
-
-    def ms(self, steps: int) -> np.ndarray:
-        """Milliseconds per environment step: median, least, most."""
-        values = self.seconds / steps * 1e3
-        return np.array([np.median(values), values.min(), values.max()])
-
-
-def time_calls(call: Callable[[], object], repeats: int) -> Timing:
-    """Time a call that leaves nothing running: once cold, and ``repeats`` times after the warm-up."""
-    start = time.perf_counter()
-    call()
-    first = time.perf_counter() - start
-    for _ in range(WARM_UP):
-        call()
-    seconds = np.empty(repeats)
-    for i in range(repeats):
+    seconds = []
+    for _ in range(1 + WARM_UP + repeats):
         start = time.perf_counter()
-        call()
-        seconds[i] = time.perf_counter() - start
-    return Timing(first, seconds)
-
-
-def restart_peak_rss() -> None:
-    """Start the process's peak resident memory anew, where Linux allows it."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
+        KINDS[kind](load)
+        seconds.append(time.perf_counter() - start)
+    ms = np.array(seconds[1 + WARM_UP :]) / load.steps * 1e3
+    return seconds[0], np.array([np.median(ms), ms.min(), ms.max()])
 
 
 def peak_rss_mb() -> float:
-    """Peak resident memory of the process [MB] since it was started anew; NaN where it is not known."""
+    """Peak resident memory of the process [MB]; NaN where it is not known."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return float("nan")
-    return next(
-        (int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")), float("nan")
-    )
+    peaks = [int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("VmHWM")]
+    return peaks[0] if peaks else float("nan")

@@ -10,7 +10,7 @@ plab export task=Rope                     a run as files for other programs
 plab demonstrations                       best known actions of the suite
 plab targets                              targets of tasks
 plab submit, verify, leaderboard          results to publish, and tables of them
-plab bench speed                          benchmarks: speed, accuracy, stability and others
+plab bench speed                          benchmarks of speed, accuracy and stability
 
 Each has a --help of its own, and is also a module: python -m plab.run.
 """
@@ -55,5 +55,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if name not in COMMANDS:
         raise ArgumentError(f"unknown command {name}; {pick(name, COMMANDS)}")
-    module = importlib.import_module(f"plab.cli.{name}")
+    module = importlib.import_module("plab.bench" if name == "bench" else f"plab.cli.{name}")
     return int(module.main(rest))

@@ -183,7 +183,7 @@ def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
     """Return the worst and the median difference of float32 from float64, per task and kind of actions.
 
     Args:
-        table: What ``python -m plab.bench.precision`` wrote, read by the same.
+        table: What ``python benchmarks/precision.py`` wrote, read by the same.
     """
     rows = []
     for (task, kind), own in table.groupby(["task", "actions"], sort=False):

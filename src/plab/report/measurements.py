@@ -49,7 +49,7 @@ ACCURACY = Benchmark(
 )
 PRECISION = Benchmark(
     "precision.csv",
-    "python -m plab.bench.precision --csv {file}",
+    "python benchmarks/precision.py --csv {file}",
     ("task", "actions", "difference", "angle_deg", "failures"),
 )
 

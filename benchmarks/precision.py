@@ -1,12 +1,12 @@
 """float32 against float64 on the fifty configurations: demonstrations and random actions.
 
-    python -m plab.bench.precision --csv precision.csv --markdown precision.md
-    python -m plab.bench.precision --particles 10000                     # as many as the tasks have
-    python -m plab.bench.precision --device cuda --deterministic         # float32 whose sums are of integers
+    python benchmarks/precision.py --csv precision.csv --markdown precision.md
+    python benchmarks/precision.py --particles 10000                     # as many as the tasks have
+    python benchmarks/precision.py --device cuda --deterministic         # float32 whose sums are of integers
 
 prints a row per configuration and kind of actions: the score in both precisions in the hard contact model,
 and how far apart the gradients of the trajectory loss are in the soft one, over 50 steps. All configurations
-share one compiled simulator per precision, see :mod:`plab.bench.common_scene`; the loss has no contact term.
+share one compiled simulator per precision, see ``common_scene.py``; the loss has no contact term.
 """
 
 from __future__ import annotations
@@ -17,16 +17,21 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 
-from plab.bench.common_scene import common_actions, common_scene, grid_terms, own_components
+from common_scene import common_actions, common_scene, grid_terms, own_components
+from plab.bench.accuracy import angle
+from plab.cli.arguments import Parser, positive, task_list, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table, write_markdown
 from plab.config import build_scene, load_config
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import TARGET_MASS, scores, spread_mass, target_sdf
-from plab.scenes import Scene, sample_particles
+from plab.report.costs import precision_summary
+from plab.scenes import DEVICES, Scene, sample_particles
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
-
-__all__ = ["COLUMNS", "angle", "compare", "starts"]
 
 COLUMNS = (
     "task", "variant", "actions", "score_float32", "score_float64", "difference", "positions_rms", "mass_l1",
@@ -68,12 +73,6 @@ class Simulated:
     x: np.ndarray
     gradient: np.ndarray
     failures: str
-
-
-def angle(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two arrays taken as vectors [degrees]; exact for small ones, too; NaN if one vanishes."""
-    a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
-    return float(np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))))
 
 
 def starts(tasks: Sequence[str], variants: Sequence[str], particles: int) -> list[Start]:
@@ -173,7 +172,27 @@ def _rows(configurations: Sequence[Start], exact: Sequence, rounded: Iterator) -
             }
 
 
-if __name__ == "__main__":
-    from plab.cli.bench import precision
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Compare float32 with float64, print, write the files asked for."""
+    parser = Parser("precision", __doc__)
+    parser.prog = "python benchmarks/precision.py"
+    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="tasks, with commas between")
+    parser.add_argument("--variant", nargs="+", default=list(SUITE_VARIANTS), help="variants")
+    parser.add_argument("--particles", type=positive, default=1000, help="particles per environment")
+    parser.add_argument("--device", choices=DEVICES, default="cpu", help="cpu or cuda")
+    parser.add_argument("--deterministic", action="store_true", help="sums of integers in float32, on CUDA")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    parser.add_argument("--markdown", type=to_write, help="file to write a table to, a row per task")
+    options = parser.parse_intermixed_args(argv)
+    configurations = starts(options.task, options.variant, options.particles)
+    rows = compare(configurations, options.device, options.deterministic)
+    table = measure_table(COLUMNS, rows, options.csv)
+    if options.markdown is not None:
+        worst = precision_summary(pd.DataFrame(table))
+        heading = f"float32 against float64, {options.particles} particles, 50 steps.\n\n"
+        write_markdown(options.markdown, heading, list(worst.columns), worst.to_dict("records"))
 
-    sys.exit(precision())
+
+if __name__ == "__main__":
+    sys.exit(main())

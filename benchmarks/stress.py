@@ -1,6 +1,15 @@
-"""The cases of :mod:`plab.bench.stability`: what a simulator must survive, and what it must refuse.
+"""Cases that break simulators, and scenes that a simulator must refuse.
 
-All cases of one kind of scene share a compiled simulator, see :mod:`plab.bench.common_scene`.
+    python benchmarks/stress.py                         # everything, in both precisions
+    python benchmarks/stress.py --quick                 # a few minutes on two cores
+    python benchmarks/stress.py --precision float32 --particles 1000 --csv cases.csv
+    python benchmarks/stress.py --quick --family "1000 steps" --gradients norms.csv
+
+Beside the suite's configurations, which ``plab bench stability`` has, too: extreme materials, bodies crushed,
+thrown at walls, overlapping, inverted, flat. Cases survive as :mod:`plab.bench.stability` says; scenes that
+cannot be simulated have to be refused with the reason, and come last. All cases of one kind of scene share a
+compiled simulator, see ``common_scene.py``. With ``--gradients`` the norm of the gradient is written for each
+step back in time, and drawn into a PNG of the same name.
 """
 
 from __future__ import annotations
@@ -8,18 +17,30 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
-from plab.bench.common_scene import common_actions, common_scene
+from common_scene import common_actions, common_scene
+from plab.bench.stability import (
+    ACTIONS,
+    COLUMNS,
+    StressCase,
+    StressPlan,
+    measure,
+    options_of,
+    summarise,
+)
+from plab.cli.arguments import Parser, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table, write_csv
 from plab.config import build_scene, load_config
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.scenes import Body, Manipulator, Scene, Vec3, vector3
-
-__all__ = ["StressCase", "StressPlan", "refusals", "stress_cases"]
+from plab.config.suite import suite_tasks
+from plab.scenes import Body, Manipulator, Scene, SceneError, Vec3, vector3
 
 STEP_TIME = 19e-4
 """Simulated time of an environment step of the suite [s]."""
@@ -27,76 +48,14 @@ STEP_TIME = 19e-4
 DEFORMED = 512
 """Substeps per environment step of bodies that start strongly deformed."""
 
-HOLD = 10
-"""Longest that a bang-bang action is held [environment steps]."""
-
-
-@dataclass(frozen=True)
-class StressPlan:
-    """How much is run.
-
-    Attributes:
-        particles: Particles per environment.
-        variants: Variants of each task.
-        long_tasks: Tasks that are run over the long horizon.
-        long_horizon: Environment steps of the long horizon.
-        horizon: Environment steps otherwise.
-    """
-
-    particles: int
-    variants: tuple[str, ...] = SUITE_VARIANTS
-    long_tasks: tuple[str, ...] = ()
-    long_horizon: int = 1000
-    horizon: int = 50
-
-
-@dataclass(frozen=True)
-class StressCase:
-    """One thing to survive.
-
-    Attributes:
-        family: What it is about.
-        name: Which one of the family.
-        scene: The scene.
-        actions: Actions, shape [T, A].
-        contact: Contact model.
-        state: Parts of the initial state that differ from rest: ``x``, ``v`` or ``F``, each [particle, ...].
-        contact_weight: Weight of the loss's contact term.
-    """
-
-    family: str
-    name: str
-    scene: Scene
-    actions: np.ndarray
-    contact: str
-    state: Mapping[str, np.ndarray] = field(default_factory=dict)
-    contact_weight: float = 0.0
+LABELLED = 12
+"""Largest number of cases for which the figure of norms has a legend: colours repeat."""
 
 
 def stress_cases(plan: StressPlan) -> list[StressCase]:
     """Return all cases of a plan."""
     families = (suite_actions, materials, crushing, walls, overlaps, deformations, stiff, few_particles)
     return [case for family in families for case in family(plan)]
-
-
-# ---------------------------------------------------------------------------------------------------- actions
-
-
-def random_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Uniform and independent, shape [steps, size]."""
-    return rng.uniform(-1.0, 1.0, size=(steps, size))
-
-
-def bang_bang_actions(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Every component at one end of its range or the other, held for up to :data:`HOLD` steps."""
-    out = np.empty((steps, size))
-    for column in out.T:
-        lengths = rng.integers(1, HOLD + 1, size=steps)
-        column[:] = np.repeat(rng.choice([-1.0, 1.0], size=steps), lengths)[:steps]
-    return out
-
-
-ACTIONS = {"random": random_actions, "bang-bang": bang_bang_actions}
 
 
 @functools.cache
@@ -130,9 +89,6 @@ def suite_actions(plan: StressPlan) -> Iterator[StressCase]:
         steps = plan.horizon if family == "suite" else plan.long_horizon
         own = ACTIONS[kind](np.random.default_rng(number), steps, scene.action_dim)
         yield common_case(plan, family, f"{task}-v{variant} {kind} {contact}", scene, own, contact)
-
-
-# ----------------------------------------------------------------------------------------------------- scenes
 
 
 def box_scene(*manipulators: Manipulator, center: Vec3 = (0.5, 0.1, 0.5), **changes: Any) -> Scene:
@@ -296,9 +252,6 @@ def few_particles(plan: StressPlan) -> Iterator[StressCase]:
         yield StressCase("few particles", name, scene, actions, contact, contact_weight=1.0)
 
 
-# --------------------------------------------------------------------------------------------------- refusals
-
-
 def refusals() -> dict[str, Scene]:
     """Scenes that cannot be simulated, by what is wrong with them."""
     nan, inf = math.nan, math.inf
@@ -349,3 +302,70 @@ def refusals() -> dict[str, Scene]:
             lower_bound=(0.9, 0.0, 0.0), upper_bound=(0.1, 1.0, 1.0)
         ),
     }
+
+
+def run_refusals() -> Iterator[dict[str, object]]:
+    """Check that scenes that cannot be simulated are refused.
+
+    Yields:
+        A row of :data:`plab.bench.stability.COLUMNS` per scene; ``where`` is the message.
+    """
+    for name, scene in refusals().items():
+        outcome, message = "was not refused", ""
+        try:
+            scene.validate()
+        except SceneError as error:
+            outcome, message = "survived", str(error)
+        yield dict(zip(COLUMNS, ("any", "refusal", name, outcome, "", "", message), strict=True))
+
+
+def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
+    """Write, and draw, the norm of the gradient for each step back in time.
+
+    Args:
+        rows: Rows of :func:`plab.bench.stability.run_cases`.
+        path: CSV file; the drawing is a PNG of the same name.
+    """
+    from plab.report.figures import legend, log_axis, single, style
+
+    parts = [
+        (row["precision"], row["family"], row["case"], cast(np.ndarray, row["norms"])[::-1]) for row in rows
+    ]
+    table = [(*which, back, norm) for *which, norms in parts for back, norm in enumerate(norms)]
+    write_csv(path, [("precision", "family", "case", "back", "norm"), *table], digits=6)
+    with style():
+        figure, panel = single(7.0, 4.0)
+        colours: dict[str, str] = {}
+        for precision, _family, case, norms in parts:
+            label = None if case in colours else str(case)
+            colour = colours.setdefault(str(case), f"C{len(colours) % 10}")
+            # Steps that nothing depends on have no place on a log scale.
+            norms = np.where(norms > 0, norms, np.nan)
+            panel.plot(norms, "-" if precision == "float32" else ":", color=colour, label=label)
+        panel.set_xlabel("environment steps back from the end")
+        panel.set_title("solid: float32, dotted: float64", loc="right")
+        log_axis(panel, "norm of a step's gradient", vertical=True)
+        if len(colours) <= LABELLED:
+            legend(figure, columns=3)
+        figure.savefig(path.with_suffix(".png"))
+    print(path.with_suffix(".png"))
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> int:
+    """Simulate the cases, print, write the files asked for; return the exit code."""
+    parser = Parser("stress", __doc__)
+    parser.prog = "python benchmarks/stress.py"
+    parser.add_argument(
+        "--gradients", type=to_write, help="file for the gradient's norm per step back in time"
+    )
+    options = options_of(parser, argv)
+    table = measure(options, stress_cases)
+    if options.gradients is not None:
+        write_norms(table, options.gradients)
+    refused = [] if options.family else measure_table(COLUMNS, run_refusals(), None)
+    return summarise([*table, *refused])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

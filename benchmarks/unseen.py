@@ -1,7 +1,7 @@
-"""What trained policies score in scenes that they have not seen: ``variant=random`` of their task.
+"""Scores of trained policies in scenes that they have not seen: ``variant=random`` of their task.
 
-    python -m plab.bench.unseen results/Move-vrandom9000/shac/seed0-12ab34cd.h5
-    python -m plab.bench.unseen A.h5 B.h5 --scenes 20 --csv unseen.csv sim.device=cpu
+    python benchmarks/unseen.py results/Move-vrandom9000/shac/seed0-12ab34cd.h5
+    python benchmarks/unseen.py A.h5 B.h5 --scenes 20 --csv unseen.csv sim.device=cpu
 
 A row per policy: mean score in the hard contact model with its 95 % interval (Student's t), median, and the
 share of scenes with at least 0.9. The settings of the simulation are those of the training; scenes that do
@@ -15,6 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from plab.cli.arguments import Parser, positive, sources_and_words, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVED
 from plab.errors import ArgumentError
@@ -23,8 +26,6 @@ from plab.results import read
 from plab.runners.environments import shared_batches
 from plab.runners.policy import Policy, load_policy
 from plab.runners.simulator_cache import SimulatorCache
-
-__all__ = ["COLUMNS", "FIRST", "rows", "scores_of"]
 
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
 
@@ -83,7 +84,24 @@ def rows(
         yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
 
 
-if __name__ == "__main__":
-    from plab.cli.bench import unseen
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Try policies in scenes that they have not seen, print, write a CSV file if asked to."""
+    parser = Parser("unseen", __doc__ or "")
+    parser.prog = "python benchmarks/unseen.py"
+    parser.add_argument("what", nargs="+", metavar="RESULT | KEY=VALUE", help="keys are those of plab.run")
+    parser.add_argument("--scenes", type=positive, default=100, metavar="N", help="number of scenes")
+    parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows to")
+    options = parser.parse_intermixed_args(argv)
+    paths, words = sources_and_words(options.what)
+    if not paths:
+        parser.error("name the result file of a run that has trained a policy")
+    if options.scenes < 2:
+        parser.error("--scenes has to be at least 2: one score has no interval")
+    widths = {"policy": max(map(len, paths)), "trained_on": 17}
+    measure_table(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
 
-    sys.exit(unseen())
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,22 +1,31 @@
-"""The least time of an environment step: what it has to move through memory, at the speed of a copy.
+"""Lower bound of the time of an environment step: its memory traffic at the speed of a copy.
 
-Each phase of a substep has to read and write the state of the particles and the grid nodes that hold mass
-once; what a phase reads again is assumed to be in registers or caches. Strain and both scatters are counted
-again in the backward pass. Arithmetic, atomic additions, launches, checkpoints and losses come on top: the
-ratio of a row to the bound says how much of its time is not memory's.
+    python benchmarks/bound.py task=Move sim.device=cuda --batch 1 64
+
+prints the speed of copies of 1 to 256 MB, and a row per number of environments and kind of call. Each phase
+of a substep has to read and write the state of the particles and the grid nodes that hold mass once; what a
+phase reads again is assumed to be in registers or caches. Strain and both scatters are counted again in the
+backward pass. Arithmetic, atomic additions, launches, checkpoints and losses come on top: the ratio of a row
+to the bound shows the share of its time that is not memory's.
 """
 
+import sys
 import time
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import taichi as ti
 
-from plab.bench.workload import Workload
+from plab.bench.workload import GRADIENT, KINDS, Workload, build, time_calls
+from plab.cli.arguments import Parser, positive, to_write
+from plab.cli.command import command_line
+from plab.cli.tables import measure_table
+from plab.config import Config, load_config
 from plab.sim.cpu_engine import SPLIT
 from plab.sim.runtime import Runtime, start_runtime
 from plab.sim.storage import STATE
 
-__all__ = ["FOOTPRINTS", "bandwidth", "least_ms", "traffic"]
+COLUMNS = ("batch", "what", "median_ms", "bound_ms", "times_bound")
 
 FOOTPRINTS = tuple(2.0**k * 1e6 for k in (0, 2, 4, 6, 8))
 """Bytes that a copy touches, both arrays together: caches are faster."""
@@ -134,3 +143,34 @@ def least_ms(load: Workload, phases: list[float], speeds: tuple[float, ...]) -> 
     # The working set of the largest phase decides which of the caches it fits into.
     speed = float(np.interp(np.log(max(phases) * particles), np.log(FOOTPRINTS), speeds))
     return 1e3 * sum(phases) * particles * simulator.substeps / speed
+
+
+def rows(cfg: Config, batches: Sequence[int], speeds: tuple[float, ...]) -> Iterator[dict[str, object]]:
+    """Time each kind of call; yield a row of :data:`COLUMNS` per number of environments and kind."""
+    for batch in batches:
+        load = build(cfg, batch, 10)
+        for kind in KINDS:
+            median = time_calls(load, kind, 7)[1][0]
+            least = least_ms(load, traffic(load, kind == GRADIENT), speeds)
+            numbers = round(median, 3), round(least, 3), round(median / least, 1)
+            yield dict(zip(COLUMNS, (batch, kind, *numbers), strict=True))
+
+
+@command_line
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure the speed of copies, and calls beside their bounds."""
+    parser = Parser("bound", __doc__ or "")
+    parser.prog = "python benchmarks/bound.py"
+    parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
+    parser.add_argument("--batch", type=positive, nargs="+", default=[1], help="numbers of environments")
+    parser.add_argument("--csv", type=to_write, help="file to write the rows of calls to")
+    options = parser.parse_intermixed_args(argv)
+    cfg = load_config(options.overrides)
+    speeds = bandwidth(cfg.sim.device)
+    for footprint, speed in zip(FOOTPRINTS, speeds, strict=True):
+        print(f"{footprint / 1e6:8.0f} MB  {speed / 1e9:8.1f} GB/s")
+    measure_table(COLUMNS, rows(cfg, options.batch, speeds), options.csv, {"what": max(map(len, KINDS))})
+
+
+if __name__ == "__main__":
+    sys.exit(main())

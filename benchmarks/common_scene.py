@@ -9,8 +9,6 @@ out.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,15 +16,6 @@ import numpy as np
 from plab.losses import make_terms
 from plab.losses.term import Term
 from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, SceneError
-
-__all__ = [
-    "PLACES",
-    "common_actions",
-    "common_places",
-    "common_scene",
-    "grid_terms",
-    "own_components",
-]
 
 PLACES = (*["Sphere"] * 6, "Capsule", "RollingPin", "Chopsticks", "Torus", "Cylinder", "Box")
 """Shapes of the manipulators, in order: as many of each as the task with the most of them has, and a box."""
@@ -47,58 +36,50 @@ def grid_terms() -> tuple[Term, ...]:
     return make_terms({"density": 10.0, "sdf": 10.0})
 
 
-def common_places(scenes: Sequence[Scene]) -> tuple[str, ...]:
-    """Shapes of the manipulators that some scenes need together: as many of each as the one with most."""
-    counts = [Counter(manipulator.shape for manipulator in scene.manipulators) for scene in scenes]
-    return tuple(shape for shape in MANIPULATOR_SHAPES for _ in range(max(c[shape] for c in counts)))
-
-
-def common_scene(scene: Scene, particles: int, places: Sequence[str] = PLACES) -> Scene:
+def common_scene(scene: Scene, particles: int) -> Scene:
     """Give a scene all manipulators of a common kind of scene, and a number of particles.
 
     Args:
         scene: A scene with no more manipulators of a shape than there are places for.
         particles: Particles of all its bodies together, at least as many as there are bodies.
-        places: Shapes of the manipulators of the common kind.
 
     Raises:
         plab.scenes.SceneError: If there are too many manipulators or too few particles.
     """
-    tools = [_parked(shape) for shape in places]
-    for number, place in enumerate(_places(scene, places)):
+    tools = [_parked(shape) for shape in PLACES]
+    for number, place in enumerate(_places(scene)):
         tools[place] = scene.manipulators[number]
     return replace(scene, manipulators=tuple(tools), bodies=_shared(scene.bodies, particles))
 
 
-def common_actions(scene: Scene, actions: np.ndarray, places: Sequence[str] = PLACES) -> np.ndarray:
+def common_actions(scene: Scene, actions: np.ndarray) -> np.ndarray:
     """Turn a scene's actions into those of its :func:`common_scene`.
 
     Args:
         scene: The scene.
         actions: Its actions, shape [..., A].
-        places: Shapes of the manipulators of the common kind.
 
     Returns:
         Actions of the common scene, 0 for parked manipulators, shape [..., A'].
     """
-    out = np.zeros((*actions.shape[:-1], sum(len(MANIPULATOR_SHAPES[p].action_names) for p in places)))
-    out[..., own_components(scene, places)] = actions
+    out = np.zeros((*actions.shape[:-1], sum(len(MANIPULATOR_SHAPES[p].action_names) for p in PLACES)))
+    out[..., own_components(scene)] = actions
     return out
 
 
-def own_components(scene: Scene, places: Sequence[str] = PLACES) -> list[int]:
-    """Where a scene's action components are among those of its :func:`common_scene`."""
-    dims = [len(MANIPULATOR_SHAPES[shape].action_names) for shape in places]
-    starts = [sum(dims[:place]) for place in range(len(places))]
-    return [starts[p] + i for p in _places(scene, places) for i in range(dims[p])]
+def own_components(scene: Scene) -> list[int]:
+    """Indices of a scene's action components among those of its :func:`common_scene`."""
+    dims = [len(MANIPULATOR_SHAPES[shape].action_names) for shape in PLACES]
+    starts = [sum(dims[:place]) for place in range(len(PLACES))]
+    return [starts[p] + i for p in _places(scene) for i in range(dims[p])]
 
 
-def _places(scene: Scene, places: Sequence[str]) -> list[int]:
+def _places(scene: Scene) -> list[int]:
     """Return the place of each of the scene's manipulators."""
-    free = list(range(len(places)))
+    free = list(range(len(PLACES)))
     taken = []
     for manipulator in scene.manipulators:
-        place = next((p for p in free if places[p] == manipulator.shape), None)
+        place = next((p for p in free if PLACES[p] == manipulator.shape), None)
         if place is None:
             raise SceneError(f"{scene.name} has more manipulators of shape {manipulator.shape} than places")
         free.remove(place)
