@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from plab.cache import cache_dir
 from plab.cli.arguments import Parser, refuse_task, task_list, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import print_table, write_csv
@@ -27,6 +26,7 @@ from plab.config import build_scene, load_config
 from plab.config.checks import check_sources
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import IDLE, require_effect
+from plab.files import cache_dir
 from plab.objective import mass_change, target_sdf
 from plab.problem import make_targets
 from plab.sim import Simulator

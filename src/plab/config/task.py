@@ -7,8 +7,8 @@ from typing import Any
 
 from plab.config import ranges
 from plab.errors import ConfigError
+from plab.files import ShapeError, pinned
 from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
-from plab.scenes.shape_files import ShapeError, pinned
 from plab.targets import TargetError, make_recipe
 
 __all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "RangeConfig", "TaskConfig"]
@@ -47,7 +47,7 @@ class BodyConfig(ranges.Section):
 
         Raises:
             plab.scenes.SceneError: If a mesh has no file, or something else has one.
-            plab.scenes.shape_files.ShapeError: If the file does not do.
+            plab.files.ShapeError: If the file does not do.
         """
         particles = max(1, round(self.particles * particles_scale))
         material = {key: getattr(self, key) for key in MATERIAL_KEYS}

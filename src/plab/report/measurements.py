@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from plab.reading import regular_file
+from plab.files import regular_file
 from plab.results import ResultsError
 
 __all__ = ["ACCURACY", "PRECISION", "SPEED", "Benchmark", "measured", "origin"]

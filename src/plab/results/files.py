@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from plab.config.selection import lookup
-from plab.reading import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
+from plab.files import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     COLUMNS,
@@ -251,7 +251,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def opened_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive, turning whatever is wrong with it into a ResultsError; see :mod:`plab.reading`."""
+    """Open an archive, turning whatever is wrong with it into a ResultsError; see :mod:`plab.files`."""
     with explained(path), opened_zip(path, packed=True) as members:
         yield members
 

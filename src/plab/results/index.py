@@ -18,7 +18,7 @@ from typing import Any
 
 import pandas as pd
 
-from plab.cache import cache_dir
+from plab.files import cache_dir
 from plab.results.schema import SCHEMA_VERSION, ResultsError
 
 __all__ = ["COLUMNS", "File", "Row", "indexed_rows"]

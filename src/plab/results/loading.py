@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from plab.config.selection import lookup
-from plab.reading import member_bytes
+from plab.files import member_bytes
 from plab.results.files import (
     columns_of,
     config_of,

@@ -26,7 +26,7 @@ from stable_baselines3.common.utils import get_device
 
 from plab.config import ConfigError, PolicyConfig
 from plab.families import FAMILIES, family
-from plab.reading import DAMAGE, one_line, read_arrays
+from plab.files import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.files import replace_file
 from plab.runners.model_state import module_arrays, restore_module

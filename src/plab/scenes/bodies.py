@@ -170,13 +170,13 @@ def make_body(
         size: Sphere: radius. Box: edge lengths x, y, z. Mesh: longest edge of its bounding box [domain
             units].
         particles: Number of particles.
-        file: Mesh only: OBJ, STL or PLY file, see :func:`plab.scenes.shape_files.pinned`.
+        file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
         sha256: What the file has to hold, likewise.
         **material: What it does not share with the scene, by the names of :data:`MATERIAL_KEYS`.
 
     Raises:
         SceneError: If a mesh has no file, or something else has one.
-        plab.scenes.shape_files.ShapeError: If the file does not do.
+        plab.files.ShapeError: If the file does not do.
     """
     if shape != "mesh":
         if file is not None:

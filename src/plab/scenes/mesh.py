@@ -1,44 +1,47 @@
-"""Solids that a closed mesh of triangles bounds: which points are inside, volume, thickness, random points.
+"""Solids bounded by a closed mesh of triangles: points inside, volume, thickness, random points.
 
-Points are drawn and judged in plain float64 arithmetic: the same file gives the same points everywhere.
+Random points are judged in plain float64 arithmetic: the same file gives the same points everywhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import cached_property, lru_cache
+import io
+import logging
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from plab.scenes.shape_files import ShapeError, pinned, read_triangles
+from plab.files import ShapeError, one_line, pinned
 
-__all__ = ["Mesh", "load_mesh"]
+__all__ = ["MESHES", "Mesh", "load_mesh", "read_mesh"]
 
-_MOST_TRIANGLES = 1_000_000
-"""Most triangles: what a grid of 449 nodes per axis, the largest in 16 GB, can tell apart on a surface."""
+MESHES = (".obj", ".stl", ".ply")
+"""Endings of mesh files."""
 
 _LEAST_SHARE = 1e-4
-"""Least share of its bounding box that a solid fills: points inside are found by trying."""
+"""Least share of its bounding box that a solid fills: points inside are found by rejection."""
 
-_DRAWN = 8192
-"""Points that are tried at a time; which ones are inside depends on it, so it stays."""
+_BLOCK = 8192
+"""Points drawn at a time. Which of them are inside depends on it, so it must not change."""
 
-_TRIED, _MEASURED = 1 << 15, 512
-"""Points tried for the volume, and points inside that the thickness is the median of."""
-
-_PAIRS = 1 << 21
-"""Pairs of a point and a triangle that are looked at together, by their memory."""
+_TRIED = 1 << 15
+"""Points tried when the enclosed volume is compared with that of the faces."""
 
 
 def load_mesh(file: str, sha256: str | None = None) -> Mesh:
     """Return the mesh of a file; the same one as long as the file is the same.
 
     Args:
-        file: OBJ, STL or PLY file, see :func:`plab.scenes.shape_files.pinned`.
-        sha256: What it has to hold, likewise.
+        file: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
+        sha256: SHA-256 that it must have, likewise.
 
     Raises:
-        plab.scenes.shape_files.ShapeError: If it cannot be read, or bounds no solid.
+        plab.files.ShapeError: If it cannot be read, or bounds no solid.
     """
     return _loaded(*pinned(file, sha256))
 
@@ -48,8 +51,40 @@ def _loaded(file: str, sha256: str) -> Mesh:
     return Mesh(file, sha256)
 
 
+def read_mesh(file: str, **options: Any) -> Any:
+    """Read an OBJ, STL or PLY file with trimesh.
+
+    Args:
+        file: The file.
+        **options: Further arguments of ``trimesh.load``.
+
+    Returns:
+        A ``trimesh.Trimesh``, or another of trimesh's objects with vertices.
+
+    Raises:
+        plab.files.ShapeError: If it cannot be read, or trimesh is not installed.
+    """
+    try:
+        # Imported here: nothing else needs it, and it takes a second.
+        import trimesh
+    except ImportError:
+        raise ShapeError(f"{file} is read with trimesh: pip install 'plab[mesh]'") from None
+    # Without a handler, warnings of its parsers would be printed beside plab's own message.
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())
+    kind = Path(file).suffix[1:].lower()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            # Read from memory: materials would be loaded from other files, named in this one.
+            content = io.BytesIO(Path(file).read_bytes())
+            return trimesh.load(content, file_type=kind, process=False, skip_materials=True, **options)
+        # The parsers answer damage with whatever error they run into.
+        except Exception as error:
+            raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
+
+
 class Mesh:
-    """A solid in a unit of its own: the longest edge of its bounding box is 1, the centre of that at 0.
+    """A solid in units of the longest edge of its bounding box, whose centre is the origin.
 
     Meshes are equal if their files are.
 
@@ -58,33 +93,38 @@ class Mesh:
         faces: Triangles by the indices of their vertices, shape [triangle, 3].
         extent: Edges of the bounding box, shape [3].
         volume: Volume.
+        thickness: Hydraulic diameter, four times the volume over the surface: the diameter of a long rod,
+            twice the thickness of a plate, two thirds of a ball's diameter.
         sha256: SHA-256 of the file.
     """
 
     def __init__(self, file: str, sha256: str) -> None:
         """Read and check a mesh; see :func:`load_mesh` for arguments and errors."""
-        vertices, faces, self.sha256 = read_triangles(file, sha256)
-        if len(faces) > _MOST_TRIANGLES:
-            raise ShapeError(f"{file} has {len(faces)} triangles: simplify it to {_MOST_TRIANGLES} or less")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise ShapeError(f"{file} has faces with vertices that do not exist")
-        if not np.isfinite(vertices).all():
-            raise ShapeError(f"{file} has vertices that are not finite numbers")
+        if Path(file).suffix.lower() not in MESHES:
+            raise ShapeError(f"{file} is not a file of a mesh: give {', '.join(MESHES)}")
+        self.sha256 = sha256
+        surface = read_mesh(file, force="mesh")
+        faces = np.asarray(getattr(surface, "faces", []))
+        if not len(faces):
+            raise ShapeError(f"{file} has no faces")
+        if faces.min() < 0 or faces.max() >= len(surface.vertices) or not np.isfinite(surface.vertices).all():
+            raise ShapeError(f"{file} has vertices that do not exist or are not finite numbers")
         # Formats without indices, and those with several normals at a corner, repeat a vertex.
-        vertices, same = np.unique(vertices, axis=0, return_inverse=True)
-        faces = same.reshape(-1)[faces]
-        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        _require_closed(file, faces)
-        corners = vertices[np.unique(faces)]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        longest = (high - low).max()
-        if not 0 < longest < np.inf:
-            raise ShapeError(f"{file} has an extent of {longest:g}")
-        self.vertices, self.faces = (vertices - (low / 2 + high / 2)) / longest, faces
-        self.extent = (high - low) / longest
-        a, b, c = self.vertices[faces].transpose(1, 0, 2)
-        self.volume = abs(float(np.einsum("ij,ij->", a, np.cross(b, c)))) / 6
-        self._sheets = [_Sheet(self.vertices, faces, axis) for axis in range(3)]
+        surface.merge_vertices(merge_tex=True, merge_norm=True)
+        surface.update_faces(surface.nondegenerate_faces())
+        if not surface.is_watertight:
+            raise ShapeError(f"{file} is not watertight: close its holes, so that each edge has two faces")
+        if not surface.is_winding_consistent:
+            raise ShapeError(f"{file} has neighbouring faces that look to different sides: unify its normals")
+        (low, high), volume = surface.bounds, abs(float(surface.volume))
+        longest = float((high - low).max())
+        self.extent, self.volume = (high - low) / longest, volume / longest**3
+        self.thickness = 4 * volume / float(surface.area) / longest
+        self.vertices, self.faces = (surface.vertices - (low / 2 + high / 2)) / longest, surface.faces
+        flat = self.vertices[:, ::2][self.faces]
+        # A margin for rounding: the exact test follows.
+        self._radii = (np.ptp(flat, axis=1).max(axis=1) / 2) * (1 + 1e-9) + 1e-12
+        self._centers = (flat.min(axis=1) + flat.max(axis=1)) / 2
         self._require_volume(file)
 
     def __eq__(self, other: object) -> bool:
@@ -94,18 +134,28 @@ class Mesh:
         return hash(self.sha256)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points, shape [point, 3], are inside; bool, shape [point]."""
+        """Return which points, shape [point, 3], are inside, by their winding numbers; bool, shape
+        [point]."""
+        # Imported here: SciPy's start-up would be paid by every `--help`.
+        from scipy.spatial import KDTree
+
         winding = np.zeros(len(points), dtype=np.int64)
-        for point, height, sense in self._sheets[1].crossings(points):
-            above = height > points[point, 1]
-            np.add.at(winding, point[above], sense[above])
+        for start in range(0, len(points), _BLOCK):
+            block = points[start : start + _BLOCK]
+            near = KDTree(block[:, ::2]).query_ball_point(self._centers, self._radii, p=np.inf)
+            triangle = np.repeat(np.arange(len(near)), [len(found) for found in near])
+            point = np.fromiter(chain.from_iterable(near), np.int64, len(triangle))
+            above, height, sense = self._crossings(block[point][:, ::2], self.faces[triangle])
+            point = point[above]
+            counts = height > block[point, 1]
+            np.add.at(winding, start + point[counts], sense[counts])
         return winding != 0
 
     def fill(self, count: int, draw: Callable[[tuple[int, int]], np.ndarray]) -> np.ndarray:
         """Draw points uniformly inside.
 
         Args:
-            count: How many.
+            count: Number of points.
             draw: Returns uniform random numbers in [0, 1) of a shape.
 
         Returns:
@@ -113,124 +163,43 @@ class Mesh:
         """
         found, parts = 0, []
         while found < count:
-            points = (draw((_DRAWN, 3)) - 0.5) * self.extent
+            points = (draw((_BLOCK, 3)) - 0.5) * self.extent
             parts.append(points[self.inside(points)])
             found += len(parts[-1])
         return np.concatenate([np.empty((0, 3)), *parts])[:count]
 
-    @cached_property
-    def thickness(self) -> float:
-        """How thick it is: half of the volume is at least as thick along each axis."""
-        points = self.fill(_MEASURED, np.random.default_rng(0).random)
-        thickness = np.full(len(points), np.inf)
-        for axis, sheet in enumerate(self._sheets):
-            above, below = np.full(len(points), np.inf), np.full(len(points), np.inf)
-            for point, height, _ in sheet.crossings(points):
-                way = height - points[point, axis]
-                np.minimum.at(above, point[way >= 0], way[way >= 0])
-                np.minimum.at(below, point[way < 0], -way[way < 0])
-            thickness = np.minimum(thickness, above + below)
-        return float(np.median(thickness))
-
-    def _require_volume(self, file: str) -> None:
-        """Refuse what has too little volume to draw points in, and parts that overlap or face inwards."""
-        box = float(np.prod(self.extent))
-        if not self.volume > _LEAST_SHARE * box:
-            raise ShapeError(
-                f"{file} has no volume worth speaking of: {self.volume:.2g} of the cube of its longest edge"
-            )
-        points = (np.random.default_rng(0).random((_TRIED, 3)) - 0.5) * self.extent
-        share, expected = float(self.inside(points).mean()), self.volume / box
-        # Four standard deviations of what is counted, and a little for overlaps that do no harm.
-        if abs(share - expected) > 0.02 * expected + 4 * np.sqrt(expected / _TRIED):
-            raise ShapeError(
-                f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
-                "parts that overlap, and let all faces look outwards"
-            )
-
-
-def _require_closed(file: str, faces: np.ndarray) -> None:
-    """Refuse a surface that is not closed: at each edge, as many faces go one way as the other."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    turned = edges[:, 0] > edges[:, 1]
-    _, edge = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
-    open_edges = int((np.bincount(edge) % 2).sum())
-    if open_edges or not len(faces):
-        raise ShapeError(f"{file} is not watertight: {open_edges} edges have no second face; close its holes")
-    if (np.bincount(edge, np.where(turned, 1.0, -1.0)) != 0).any():
-        raise ShapeError(f"{file} has neighbouring faces that look to different sides: unify its normals")
-
-
-class _Sheet:
-    """The triangles as lines along an axis meet them: sorted into the squares of a grid across it."""
-
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray, axis: int) -> None:
-        self._height = vertices[:, axis]
-        self._flat = np.delete(vertices, axis, axis=1)
-        self._others = [other for other in range(3) if other != axis]
-        self._faces = faces
-        # Without (x, z) it would be (z, x): seen along y, axes turn the other way round.
-        self._sense = -1 if axis == 1 else 1
-        corners = self._flat[faces]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        self._squares = min(256, int(np.sqrt(len(faces) / 2)) + 1)
-        while True:
-            first, last = self._square(low), self._square(high)
-            wide = last - first + 1
-            # Long triangles lie in many squares: fewer squares then.
-            if self._squares == 1 or wide.prod(axis=1).sum() <= 8 * len(faces) + 65536:
-                break
-            self._squares //= 2
-        triangle, nth = _repeated(wide.prod(axis=1))
-        across = wide[triangle, 1]
-        square = (first[triangle, 0] + nth // across) * self._squares + first[triangle, 1] + nth % across
-        self._triangles = triangle[np.argsort(square, kind="stable")]
-        self._ends = np.cumsum(np.bincount(square, minlength=self._squares**2))
-
-    def _square(self, flat: np.ndarray) -> np.ndarray:
-        return np.clip(((flat + 0.5) * self._squares).astype(np.int64), 0, self._squares - 1)
-
-    def crossings(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield where lines along the axis through some points, shape [point, 3], meet triangles.
-
-        Yields:
-            Indices of points, heights along the axis, and 1 or -1 for triangles that look up or down, shape
-            [crossing] each.
-        """
-        flat = points[:, self._others]
-        square = self._square(flat) @ np.array([self._squares, 1])
-        count = np.diff(self._ends, prepend=0)[square]
-        start = self._ends[square] - count
-        split = np.flatnonzero(np.diff(np.cumsum(count) // _PAIRS)) + 1
-        for some in np.split(np.arange(len(points)), split):
-            which, nth = _repeated(count[some])
-            point = some[which]
-            triangle = self._triangles[start[point] + nth]
-            met, height, sense = self._meet(flat[point], self._faces[triangle])
-            yield point[met], height, sense
-
-    def _meet(self, at: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return which of some triangles lie above or below a point each, at what height, and their sense."""
+    def _crossings(self, at: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which vertical lines at (x, z), shape [pair, 2], cross a triangle each, shape [pair, 3]; and
+        of those that do, the heights and 1 or -1 for triangles that look up or down."""
+        flat = self.vertices[:, ::2]
         area, left = np.empty((3, len(at))), np.empty((3, len(at)), dtype=bool)
         for k in range(3):
             a, b = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
             turned = a > b
             # Neighbours compute the same for the edge that they share: no line slips through between them.
-            from_, to = self._flat[np.where(turned, b, a)], self._flat[np.where(turned, a, b)]
+            from_, to = flat[np.where(turned, b, a)], flat[np.where(turned, a, b)]
             edge, way = to - from_, at - from_
             cross = edge[:, 0] * way[:, 1] - edge[:, 1] * way[:, 0]
             area[k] = np.where(turned, -cross, cross)
             left[k] = (cross >= 0) ^ turned
-        up = np.asarray(left.all(axis=0))
-        met = up | ~np.asarray(left.any(axis=0))
+        down = np.asarray(left.all(axis=0))
+        met = down | ~np.asarray(left.any(axis=0))
         area = area[:, met]
         with np.errstate(invalid="ignore", divide="ignore"):
-            height = (area * self._height[faces[met].T]).sum(axis=0) / area.sum(axis=0)
-        return met, height, self._sense * np.where(up[met], 1, -1)
+            height = (area * self.vertices[:, 1][faces[met].T]).sum(axis=0) / area.sum(axis=0)
+        # Seen along y, (x, z) is left-handed.
+        return met, height, np.where(down[met], -1, 1)
 
-
-def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each index as often as it counts, and which time of it that is."""
-    index = np.repeat(np.arange(len(counts)), counts)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
+    def _require_volume(self, file: str) -> None:
+        """Refuse solids with too little volume to draw points in, and parts that overlap."""
+        box = float(np.prod(self.extent))
+        if not self.volume > _LEAST_SHARE * box:
+            raise ShapeError(f"{file} has too little volume, {self.volume:.2g} of its longest edge's cube")
+        points = (np.random.default_rng(0).random((_TRIED, 3)) - 0.5) * self.extent
+        share, expected = float(self.inside(points).mean()), self.volume / box
+        # Four standard deviations of the count, and a little for overlaps that do no harm.
+        if abs(share - expected) > 0.02 * expected + 4 * np.sqrt(expected / _TRIED):
+            raise ShapeError(
+                f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
+                "parts that overlap, and let all faces look outwards"
+            )

@@ -372,7 +372,7 @@ class Scene:
             thickness = body.size[0] * body.mesh.thickness
             _require(
                 thickness >= self.dx,
-                f"{label}: half of it is thinner than {thickness:.2g}, less than a cell of the grid, "
+                f"{label}: its hydraulic diameter {thickness:.2g} is less than a cell of the grid, "
                 f"{self.dx:.2g}: use a size of {1.01 * body.size[0] * self.dx / thickness:.2g} or more, or a "
                 "finer grid",
             )

@@ -46,7 +46,7 @@ import taichi as ti
 from taichi.lang import _ndarray, impl, kernel_impl
 from taichi.lang.source_builder import SourceBuilder
 
-from plab.cache import cache_dir
+from plab.files import cache_dir
 
 __all__ = [
     "BITCODE",

@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 
 import plab
 from plab.config.suite import suite_tasks
-from plab.reading import UnreadableError, member_bytes, opened_zip
+from plab.files import UnreadableError, member_bytes, opened_zip
 from plab.results.files import replace_file, zipped
 from plab.submissions.schema import (
     SUFFIX,
@@ -124,7 +124,7 @@ def read_members(
 ) -> dict[str, bytes]:
     """Read all of a zip file into memory.
 
-    Of no member more is unpacked than the file says it holds; see :mod:`plab.reading`. There may be ``count``
+    Of no member more is unpacked than the file says it holds; see :mod:`plab.files`. There may be ``count``
     members, of ``each`` bytes at most and ``total`` bytes together.
 
     Returns:

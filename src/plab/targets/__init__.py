@@ -14,9 +14,18 @@ from plab.targets.build import (
     demonstration,
     make_recipe,
 )
-from plab.targets.files import MassTarget, PointsTarget
-from plab.targets.geometric import BodiesTarget, RingTarget, TargetBody
-from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
+from plab.targets.recipes import (
+    EPISODE_STEPS,
+    BodiesTarget,
+    GeometricRecipe,
+    MassTarget,
+    PointsTarget,
+    RingTarget,
+    ScriptedRecipe,
+    TargetBody,
+    TargetError,
+    TensorRecipe,
+)
 from plab.targets.store import load_release_target
 
 __all__ = [

@@ -14,8 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.objective import spread_mass
 from plab.scenes import Scene
-from plab.targets import files, geometric, scripted
-from plab.targets.recipe import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
+from plab.targets import recipes, scripted
+from plab.targets.recipes import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore
 
 if TYPE_CHECKING:
@@ -38,10 +38,10 @@ bodies."""
 Recipe: TypeAlias = GeometricRecipe | ScriptedRecipe | TensorRecipe
 
 RECIPES: dict[str, type[Recipe]] = {
-    "bodies": geometric.BodiesTarget,
-    "ring": geometric.RingTarget,
-    "points": files.PointsTarget,
-    "mass": files.MassTarget,
+    "bodies": recipes.BodiesTarget,
+    "ring": recipes.RingTarget,
+    "points": recipes.PointsTarget,
+    "mass": recipes.MassTarget,
     "carry": scripted.CarryTarget,
     "dent": scripted.DentTarget,
     "draw": scripted.DrawTarget,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.scenes import ROLL_RADIUS, Body, Manipulator, Scene
-from plab.targets.recipe import EPISODE_STEPS, TargetError
+from plab.targets.recipes import EPISODE_STEPS, TargetError
 
 __all__ = [
     "DECIMALS",
@@ -99,7 +99,7 @@ class Script(ABC):
     seed: int
 
     def actions(self, scene: Scene) -> np.ndarray:
-        """See :meth:`plab.targets.recipe.ScriptedRecipe.actions`."""
+        """See :meth:`plab.targets.recipes.ScriptedRecipe.actions`."""
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         if not any(m.action_dim for m in scene.manipulators):

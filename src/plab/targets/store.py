@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plab.cache import cache_dir
-from plab.reading import UnreadableError, read_array, read_arrays
+from plab.files import UnreadableError, cache_dir, read_array, read_arrays
 from plab.scenes import Scene
-from plab.targets.recipe import TargetError
+from plab.targets.recipes import TargetError
 
 if TYPE_CHECKING:
     from plab.sim import Simulator

@@ -1,0 +1,286 @@
+"""Files of other people and other programs: archives, NumPy arrays and shapes; and plab's cache folder.
+
+Files are read as data: nothing is unpickled, extracted or executed, and no file unpacks to more than a limit.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import lzma
+import os
+import stat
+import sys
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
+
+import numpy as np
+
+from plab.errors import PlabError
+
+__all__ = [
+    "DAMAGE",
+    "LARGEST",
+    "ShapeError",
+    "UnreadableError",
+    "cache_dir",
+    "member_bytes",
+    "one_line",
+    "opened_zip",
+    "pinned",
+    "read_array",
+    "read_arrays",
+    "regular_file",
+]
+
+LARGEST = 1 << 31
+"""Most bytes that an array, a table or a member of an archive may take in memory."""
+
+DAMAGE = (
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
+    zlib.error,
+)
+"""Errors of h5py, json, zlib and PyTorch for files that are cut short, damaged or of another kind."""
+
+_RATIO, _SMALL = 200, 1 << 24
+"""Largest ratio of unpacked to packed size, for results above a size [B]. Deflate reaches 1,032."""
+
+_UNPACKING_MEMORY = 1 << 28
+"""Most memory that xz may take besides its result [B]; plab's own archives need a quarter."""
+
+_LONGEST_HEADER = 4096
+"""Longest header of an array [B]; NumPy's own take 128."""
+
+_LARGEST_SHAPE = 1 << 28
+"""Largest file of a mesh, point cloud or mass tensor [B]; a million triangles as text take 250 MB."""
+
+
+class UnreadableError(ValueError):
+    """A file that is not what it should be; the message is the reason alone, without the file's name."""
+
+
+class ShapeError(PlabError, ValueError):
+    """A mesh, point cloud or mass tensor that cannot be used; the message names the file and the reason."""
+
+
+def cache_dir() -> Path:
+    """Return the folder for what plab can make again: ``PLAB_CACHE_DIR``, or ``plab`` in the user's cache."""
+    chosen = os.environ.get("PLAB_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(base) if base else Path.home() / ".cache") / "plab"
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's message as one line of bounded length, without control characters."""
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return " ".join(text.split())[:300] or type(error).__name__
+
+
+def regular_file(path: Path) -> os.stat_result:
+    """Return the state of a regular file: opening a pipe or a device could wait forever.
+
+    Raises:
+        UnreadableError: If it is a folder, pipe or device.
+        OSError: If there is nothing, or permission is denied.
+    """
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise UnreadableError("it is a folder, pipe or device, not a file")
+    return found
+
+
+# --------------------------------------------------------------------------------------------------- archives
+
+
+@contextmanager
+def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]:
+    """Open a zip file for :func:`member_bytes`; if ``packed``, it is compressed as a whole, by xz.
+
+    The last unpacked archive is kept in memory.
+
+    Raises:
+        UnreadableError: If a member leads out of the folder, occurs twice or overlaps another, or the archive
+            would unpack to more than a limit.
+        ValueError: If it is no zip file, or damaged.
+        OSError: If it cannot be opened.
+    """
+    found = regular_file(path)
+    size = found.st_size
+    with path.open("rb") as packed_file, ExitStack() as stack:
+        file: BinaryIO = packed_file
+        if packed:
+            content = _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino)
+            file, size = stack.enter_context(io.BytesIO(content)), len(content)
+        try:
+            archive = zipfile.ZipFile(file)
+        except (OSError, MemoryError):
+            raise
+        # The library's parser answers damage with whatever error it runs into.
+        except Exception as error:
+            raise ValueError(str(error)) from error
+        with archive:
+            _check_members(archive, size)
+            yield archive
+
+
+def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Return the content of a member of an archive.
+
+    Raises:
+        UnreadableError: If it would unpack to more than a limit.
+        ValueError: If it is damaged or encrypted.
+        KeyError: If there is none of this name.
+    """
+    info = archive.getinfo(name)
+    if info.file_size > min(LARGEST, max(_SMALL, _RATIO * info.compress_size)):
+        raise UnreadableError(
+            f"{name} has {info.compress_size} bytes that stand for {info.file_size}: plab packs no such file"
+        )
+    try:
+        return archive.read(info)
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise ValueError(str(error)) from error
+
+
+@functools.lru_cache(maxsize=1)
+def _unpacked(path: Path, size: int, *_: int) -> bytes:
+    """Return the content of an xz file; the other arguments identify its version."""
+    most = min(LARGEST, max(_SMALL, _RATIO * size))
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING_MEMORY)
+    try:
+        content = unpacker.decompress(path.read_bytes(), most)
+    except lzma.LZMAError as error:
+        raise ValueError(str(error)) from error
+    if not unpacker.eof and len(content) == most:
+        raise UnreadableError(f"{size} bytes stand for more than {most}: plab packs no such file")
+    if not unpacker.eof or unpacker.unused_data:
+        raise ValueError("it is cut short, or something follows its end")
+    return content
+
+
+def _check_members(archive: zipfile.ZipFile, size: int) -> None:
+    seen = set()
+    for info in archive.infolist():
+        name = info.orig_filename
+        parts = PurePosixPath(name.replace("\\", "/"))
+        if not name or "\0" in name or parts.is_absolute() or ".." in parts.parts or ":" in name:
+            raise UnreadableError(f"its member {name!r} leads out of the folder")
+        if info.filename in seen:
+            raise UnreadableError(f"it has two members {name!r}")
+        seen.add(info.filename)
+        # Other methods unpack a whole member before its size is known.
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise UnreadableError(f"its member {name!r} is compressed in a way that plab does not write")
+    if sum(info.compress_size for info in archive.infolist()) > size:
+        raise UnreadableError("its members overlap")
+
+
+# ----------------------------------------------------------------------------------------------------- arrays
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Return the array of a ``.npy`` file.
+
+    Raises:
+        UnreadableError: If it is no such file, cut short, or holds anything but numbers and text.
+        OSError: If it cannot be opened.
+    """
+    regular_file(path)
+    with path.open("rb") as file:
+        return _array(file)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an ``.npz`` file by their names.
+
+    Raises:
+        UnreadableError: If it holds anything but numbers and text.
+        ValueError: If it is no such file, or damaged.
+        OSError: If it cannot be opened.
+    """
+    arrays = {}
+    with opened_zip(path) as archive:
+        if sum(info.file_size for info in archive.infolist()) > LARGEST:
+            raise UnreadableError(f"its arrays would take more than {LARGEST / 1e9:.1f} GB")
+        for name in archive.namelist():
+            try:
+                arrays[name.removesuffix(".npy")] = _array(io.BytesIO(member_bytes(archive, name)))
+            except UnreadableError as error:
+                raise UnreadableError(f"{name}: {error}") from error
+    return arrays
+
+
+def _array(file: BinaryIO) -> np.ndarray:
+    try:
+        array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)
+    except OSError:
+        raise
+    # The header is Python's own syntax, and damage to it raises whatever its parser runs into.
+    except Exception as error:
+        raise UnreadableError(f"it holds no NumPy array of numbers or text ({one_line(error)})") from error
+    if array.dtype.kind not in "biufU":
+        raise UnreadableError(f"it holds {array.dtype}, neither numbers nor text")
+    return array
+
+
+# ----------------------------------------------------------------------------------------------------- shapes
+
+
+def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
+    """Find a file of a shape, and return its place and the SHA-256 of its content.
+
+    Args:
+        file: The file. A relative one is looked for in the working directory, then where modules of the
+            user's own are: in the config folder and in the folder above it. An absolute one that is not there
+            is looked for by its name in the same places if its SHA-256 is known.
+        sha256: SHA-256 that the content must have; None for any content.
+
+    Raises:
+        ShapeError: If there is no such file, it cannot be read, or its content is another.
+    """
+    path = _find(file, sha256 is not None)
+    try:
+        if regular_file(path).st_size > _LARGEST_SHAPE:
+            raise UnreadableError(f"it has more than {_LARGEST_SHAPE / 1e6:.0f} MB")
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except (UnreadableError, OSError) as error:
+        raise ShapeError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if sha256 not in (None, digest):
+        raise ShapeError(
+            f"{path} is another file than this configuration's: its SHA-256 begins with {digest[:8]}, not "
+            f"with {str(sha256)[:8]!r}; put that file back, or compose the configuration again"
+        )
+    return str(path), digest
+
+
+def _find(file: str, known: bool) -> Path:
+    path = Path(file)
+    folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
+    places = [path] if path.is_absolute() else [folder / path for folder in folders]
+    if path.is_absolute() and known:
+        places += [folder / path.name for folder in folders]
+    for place in places:
+        # Path.exists raises for a name that is too long, or a folder that may not be entered.
+        if os.path.exists(place):
+            # Not resolved: the target of a link may have another ending.
+            return place.absolute()
+    raise ShapeError(
+        f"there is no file {file}: put it there, into the working directory, into the config folder or into "
+        "the folder above it"
+    )

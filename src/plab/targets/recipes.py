@@ -1,0 +1,325 @@
+"""Target recipes: dataclasses whose fields are the remaining keys of a task's ``target`` section.
+
+Protocols of the three kinds of recipes, and the recipes that need no simulation: solids, whose points are
+drawn uniformly and spread over the grid, and files with a point cloud or a mass tensor. Total masses agree
+with the scene's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from plab.errors import PlabError
+from plab.files import ShapeError, one_line, pinned, read_array
+from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
+from plab.scenes.mesh import read_mesh
+
+__all__ = [
+    "EPISODE_STEPS",
+    "BodiesTarget",
+    "GeometricRecipe",
+    "MassTarget",
+    "PointsTarget",
+    "RingTarget",
+    "ScriptedRecipe",
+    "TargetBody",
+    "TargetError",
+    "TensorRecipe",
+    "read_points",
+    "read_tensor",
+]
+
+EPISODE_STEPS = 50
+"""Environment steps of the suite's episodes, hence of its scripted demonstrations."""
+
+
+class TargetError(PlabError, ValueError):
+    """A target that cannot be built; the message says why."""
+
+
+@runtime_checkable
+class GeometricRecipe(Protocol):
+    """A target that is a shape."""
+
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+        """Draw points that the mass of the scene's particles is shared out among.
+
+        Args:
+            scene: The scene that the target belongs to.
+            rng: Source of randomness.
+
+        Returns:
+            Positions [domain units], shape [point, 3].
+        """
+        ...
+
+
+@runtime_checkable
+class TensorRecipe(Protocol):
+    """A target that is given on the grid."""
+
+    def mass(self, scene: Scene) -> np.ndarray:
+        """Return the mass tensor.
+
+        Args:
+            scene: The scene that the target belongs to.
+
+        Returns:
+            Mass tensor, shape [n, n, n], with the mass of the scene's particles.
+        """
+        ...
+
+
+@runtime_checkable
+class ScriptedRecipe(Protocol):
+    """A target that is what a demonstration makes of the scene, simulated in the hard contact model."""
+
+    def actions(self, scene: Scene) -> np.ndarray:
+        """Draw the demonstration's actions.
+
+        Args:
+            scene: The scene that is handled.
+
+        Returns:
+            Actions in [-1, 1], shape [EPISODE_STEPS, A].
+        """
+        ...
+
+
+# ----------------------------------------------------------------------------------------------------- solids
+
+
+@dataclass
+class TargetBody:
+    """One solid body of a target.
+
+    Attributes:
+        shape: ``sphere``, ``box`` or ``mesh``.
+        center: Centre (x, y, z) [domain units]; of a mesh, that of its bounding box.
+        size: Sphere: ``[radius]``. Box: edge lengths ``[x, y, z]``. Mesh: ``[longest]``, the longest edge of
+            its bounding box.
+        file: Mesh only: OBJ, STL or PLY file, as of :class:`plab.config.BodyConfig`.
+        sha256: Mesh only: SHA-256 of the file, likewise.
+    """
+
+    shape: str
+    center: list[float]
+    size: list[float]
+    file: str | None = None
+    sha256: str | None = None
+
+    def build(self, particles: int) -> Body:
+        """Return the body with so many particles; see :func:`plab.scenes.make_body` for errors."""
+        return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256)
+
+
+@dataclass
+class BodiesTarget:
+    """Solid bodies of uniform density.
+
+    Attributes:
+        bodies: The bodies, by name; the scene's particles are shared out in proportion to their volumes.
+    """
+
+    bodies: dict[str, TargetBody]
+
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+        """See :meth:`GeometricRecipe.sample`."""
+        if not self.bodies:
+            raise TargetError("target.bodies is empty: name at least one body")
+        for name, body in self.bodies.items():
+            if len(body.center) != 3:
+                raise TargetError(f"target.bodies.{name}.center must be 3 numbers, not {body.center}")
+        solids = []
+        for name, body in self.bodies.items():
+            try:
+                solids.append(body.build(1))
+            except (SceneError, ShapeError) as error:
+                raise TargetError(f"target.bodies.{name}: {error}") from None
+        volumes = np.array([solid.volume for solid in solids])
+        if not np.all(volumes > 0):
+            raise TargetError("target.bodies: sizes must be positive")
+        # Rounding the running total shares out every particle and errs by less than one per body.
+        ends = np.rint(np.cumsum(volumes) / volumes.sum() * scene.particle_count).astype(int)
+        counts = np.diff(ends, prepend=0)
+        bodies = tuple(replace(solid, particles=int(n)) for solid, n in zip(solids, counts, strict=True))
+        filled = replace(scene, bodies=bodies, particle_seed=int(rng.integers(2**31)))
+        try:
+            filled.validate()
+        except SceneError as error:
+            raise TargetError(f"target.{error}") from None
+        return sample_particles(filled)
+
+
+@dataclass
+class RingTarget:
+    """A closed, level ring of square section around a manipulator.
+
+    Attributes:
+        around: Index of the manipulator whose x and z are the ring's centre.
+        radius: Mean radius [domain units].
+        section: Edge of the square section [domain units].
+        floor: Height of the underside [domain units].
+    """
+
+    around: int
+    radius: float
+    section: float
+    floor: float
+
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+        """See :meth:`GeometricRecipe.sample`."""
+        if not 0 <= self.around < len(scene.manipulators):
+            raise TargetError(
+                f"target.around {self.around} is not the index of a manipulator, 0 .. "
+                f"{len(scene.manipulators) - 1}"
+            )
+        if not 0 < self.section < 2 * self.radius:
+            raise TargetError(
+                f"target.section {self.section:g} must be between 0 and twice the radius {self.radius:g}"
+            )
+        inner, outer = self.radius - self.section / 2, self.radius + self.section / 2
+        unit = rng.random((scene.particle_count, 3))
+        # Uniform in the area of the annulus, not in its radius.
+        distance = np.sqrt(inner**2 + unit[:, 0] * (outer**2 - inner**2))
+        angle = 2 * math.pi * unit[:, 1]
+        x, _, z = scene.manipulators[self.around].position
+        height = self.floor + unit[:, 2] * self.section
+        return np.stack([x + distance * np.cos(angle), height, z + distance * np.sin(angle)], axis=1)
+
+
+# ------------------------------------------------------------------------------------------------------ files
+
+
+_MEASURED = 1000
+"""Most points whose distance to the next one is measured."""
+
+
+@dataclass
+class PointsTarget:
+    """A solid that points fill, in domain units; those of a surface alone make a shell.
+
+    Attributes:
+        file: NumPy array of shape [point, 3], PLY file, of which the vertices count, or XYZ file. A relative
+            one is looked for in the working directory, in the config folder and in the folder above it.
+        sha256: SHA-256 of the file. Found out where it is not given; refused if it is another one.
+    """
+
+    file: str
+    sha256: str | None = None
+
+    def sample(self, scene: Scene, _: np.random.Generator) -> np.ndarray:
+        """See :meth:`GeometricRecipe.sample`."""
+        # Imported here: SciPy's start-up would be paid by every `--help`.
+        from scipy.spatial import KDTree
+
+        try:
+            points = read_points(*pinned(self.file, self.sha256))
+        except ShapeError as error:
+            raise TargetError(f"target: {error}") from None
+        some = points[:: -(-len(points) // _MEASURED)]
+        distance = float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
+        # Farther apart, they would be dots on the grid instead of a solid.
+        if distance > scene.dx:
+            raise TargetError(
+                f"target: half of the points of {self.file} have no other within {distance:.2g}, more than a "
+                f"cell of the grid, {scene.dx:.2g}: give more points, or a coarser grid"
+            )
+        return points
+
+
+@dataclass
+class MassTarget:
+    """A mass tensor; node (i, j, k) is at (i, j, k) / n.
+
+    Attributes:
+        file: NumPy array of shape [n, n, n], n as in ``sim.grid_size``, not negative; found as those of
+            :class:`PointsTarget` are.
+        sha256: SHA-256 of the file, likewise.
+    """
+
+    file: str
+    sha256: str | None = None
+
+    def mass(self, scene: Scene) -> np.ndarray:
+        """See :meth:`TensorRecipe.mass`."""
+        try:
+            mass = read_tensor(*pinned(self.file, self.sha256))
+        except ShapeError as error:
+            raise TargetError(f"target: {error}") from None
+        n = scene.grid_size
+        if mass.shape != (n, n, n):
+            raise TargetError(f"target: {self.file} has shape {list(mass.shape)}, but the grid has {[n] * 3}")
+        return mass * (scene.particle_count * scene.particle_mass / mass.sum())
+
+
+@lru_cache(maxsize=8)
+def read_points(file: str, _sha256: str = "") -> np.ndarray:
+    """Read a point cloud, once for each content.
+
+    Args:
+        file: NumPy array of shape [point, 3], PLY file, of which the vertices count, or XYZ file, a text of
+            which the first three columns count.
+
+    Returns:
+        Positions, shape [point, 3], float64, finite.
+
+    Raises:
+        plab.files.ShapeError: If the file cannot be read, or holds no points.
+    """
+    kind = Path(file).suffix.lower()
+    if kind == ".ply":
+        points = np.asarray(read_mesh(file).vertices)
+    elif kind == ".xyz":
+        try:
+            points = np.loadtxt(file, usecols=(0, 1, 2), ndmin=2, encoding="utf-8")
+        except (OSError, ValueError) as error:
+            raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
+    else:
+        points = _numbers(file, "a point cloud: give .npy, .ply, .xyz")
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise ShapeError(f"{file} holds an array of shape {list(points.shape)}, not points [point, 3]")
+    if not np.isfinite(points).all():
+        raise ShapeError(f"{file} has points that are not finite numbers")
+    return points.astype(np.float64)
+
+
+@lru_cache(maxsize=8)
+def read_tensor(file: str, _sha256: str = "") -> np.ndarray:
+    """Read a mass tensor, once for each content.
+
+    Args:
+        file: NumPy array of shape [n, n, n].
+
+    Returns:
+        The tensor, float64, finite, not negative, not empty.
+
+    Raises:
+        plab.files.ShapeError: If the file cannot be read, or holds no mass.
+    """
+    mass = _numbers(file, "a mass tensor: give .npy")
+    if mass.ndim != 3:
+        raise ShapeError(f"{file} holds an array of shape {list(mass.shape)}, not masses [n, n, n]")
+    if not np.isfinite(mass).all():
+        raise ShapeError(f"{file} has masses that are not finite numbers")
+    if mass.size and mass.min() < 0:
+        raise ShapeError(f"{file} has negative masses: the least is {mass.min():.3g}")
+    if not mass.any():
+        raise ShapeError(f"{file} holds a total mass of 0")
+    return mass
+
+
+def _numbers(file: str, expected: str) -> np.ndarray:
+    """Return the numbers of a ``.npy`` file, float64."""
+    if Path(file).suffix.lower() != ".npy":
+        raise ShapeError(f"{file} is not a file of {expected}")
+    try:
+        return read_array(Path(file)).astype(np.float64)
+    except (OSError, ValueError) as error:
+        raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
