@@ -23,15 +23,16 @@ BENCH = "reports/bench"  # folder of the benchmarks' CSV files; "example" has th
 COMMAND = "Jupyter"  # what is given as the command that made this
 
 # %%
+import numpy as np
 import pandas as pd
 
-from plab.report.costs import contact_models, precision_summary, work_precision
-from plab.report.figures import style
-from plab.report.measurements import ACCURACY, PRECISION, origin
+from plab.report.accuracy import precision_summary, work_precision
+from plab.report.figures import Drawing, legend_of_methods, single, style
+from plab.report.formats import number
 from plab.report.methods import method
-from plab.report.notebook import benchmark, gather, show_figure, show_origin, show_table
+from plab.report.notebook_cells import benchmark, gather, show_figure, show_origin, show_table
+from plab.report.reference import ACCURACY, PRECISION, origin
 from plab.report.series import load_series
-from plab.report.table import number
 
 runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
@@ -60,9 +61,48 @@ if table is not None:
 # Gradient methods find their actions in the contact model of their rollouts (soft, but for Adam-H) and are
 # judged in the hard one. Below the line: what was won in the one is lost in the other.
 
+
 # %%
+def draw_contact_models(runs, series):
+    """Draw the score of each run's best row against that of its final evaluation; None without runs.
+
+    Gradient methods find their actions in the contact model of their rollouts (soft but for Adam-H) and are
+    judged in the hard one.
+
+    Args:
+        runs: Our runs.
+        series: Their rows, in the order of ``runs.table``.
+    """
+    if runs.table.empty:
+        return None
+    figure, panel = single(width=3.6, height=3.1)
+    panel.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
+    gaps = {name: [] for name in runs.methods}
+    for row, (_, rows) in zip(runs.table.to_dict("records"), series, strict=True):
+        best = rows["score"][rows["iteration"] == row["best_iteration"]]
+        if len(best):
+            before = min(max(float(best[0]), 0.0), 1.0)
+            panel.plot(
+                before, row["score_best"], "o", color=method(row["method"]).colour, markersize=3.5, alpha=0.8
+            )
+            gaps[row["method"]].append(row["score_best"] - before)
+    panel.set(
+        xlim=(-0.02, 1.02),
+        ylim=(-0.02, 1.02),
+        xlabel="score of the best row, in its own contact model",
+        ylabel="score of the final evaluation, hard contact",
+    )
+    legend_of_methods(figure, [name for name in runs.methods if gaps[name]])
+    numbers = {
+        name: {"runs": len(own), "mean": float(np.mean(own)), "largest": float(max(own, key=abs))}
+        for name, own in gaps.items()
+        if own
+    }
+    return Drawing("contact_models", figure, ["A point per run."], numbers)
+
+
 with style():
-    drawing = contact_models(runs, load_series(runs))
+    drawing = draw_contact_models(runs, load_series(runs))
 show_figure(drawing)
 
 # %%

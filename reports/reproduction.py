@@ -24,12 +24,15 @@ BENCH = "reports/bench"  # folder of the benchmarks' CSV files; "example" has th
 COMMAND = "Jupyter"  # what is given as the command that made this
 
 # %%
+import math
+
+from plab.report.agreement import RULE, TOLERANCE, VERDICTS, verdict_grid, verdicts
 from plab.report.curves import aggregates, rewards
-from plab.report.figures import style
-from plab.report.notebook import gather, say, show_figure, show_origin, show_table
+from plab.report.figures import Drawing, legend_of_methods, single, style
+from plab.report.methods import method
+from plab.report.notebook_cells import gather, say, show_figure, show_origin, show_table
 from plab.report.series import load_series
-from plab.report.tables import iou_per_task, settings_note, solvability
-from plab.report.verdicts import RULE, VERDICTS, differences, verdict_grid, verdicts
+from plab.report.tables import iou_per_task, ordered_tasks, settings_note, solvability
 
 runs = gather(RESULTS, WORDS)
 show_origin(runs, COMMAND)
@@ -61,9 +64,39 @@ show_table(verdict_grid(per_task), settings_note(runs))
 # %% [markdown]
 # ## Differences
 
+
 # %%
+def draw_differences(runs):
+    """Draw the differences per task and method with their intervals; None without any."""
+    judged = verdicts(runs)
+    judged = judged[judged["verdict"] != "no runs"]
+    if judged.empty:
+        return None
+    tasks = [task for task in ordered_tasks(runs.tasks) if task in set(judged["task"])]
+    methods = [name for name in runs.methods if name in set(judged["method"])]
+    rows = len(tasks) * (len(methods) + 1)
+    figure, panel = single(width=6.4, height=0.16 * rows + 0.5)
+    panel.axvspan(-TOLERANCE, TOLERANCE, color="#EDEDED", zorder=0)
+    panel.axvline(0.0, color="#555555", linewidth=0.8)
+    for row in judged.to_dict("records"):
+        look = method(row["method"])
+        y = tasks.index(row["task"]) * (len(methods) + 1) + methods.index(row["method"])
+        reach = [[row["difference"] - row["low"]], [row["high"] - row["difference"]]]
+        bars = None if math.isnan(row["low"]) else reach
+        inside = look.colour if row["runs"] >= row["expected"] else "white"
+        dots = {"fmt": "o", "markersize": 4, "capsize": 2, "markerfacecolor": inside}
+        panel.errorbar(row["difference"], y, xerr=bars, color=look.colour, **dots)
+    middle = (len(methods) - 1) / 2
+    panel.set_yticks([place * (len(methods) + 1) + middle for place in range(len(tasks))], tasks)
+    panel.set(ylim=(rows - 1.5, -1.0), xlabel="score, plab minus the paper")
+    panel.grid(axis="y", visible=False)
+    legend_of_methods(figure, methods)
+    notes = ["Points: differences of mean scores; bars: 95 % intervals; open: runs are missing."]
+    return Drawing("differences", figure, notes)
+
+
 with style():
-    drawing = differences(runs)
+    drawing = draw_differences(runs)
 show_figure(drawing)
 
 # %% [markdown]

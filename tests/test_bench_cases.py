@@ -13,7 +13,7 @@ import precision
 import stress
 from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Attempt, Plan, angle, lattice, rows
 from plab.bench.stability import StressPlan, main, run_cases
-from plab.report.costs import diagrams
+from plab.report.accuracy import diagrams
 from plab.report.figures import save, style
 from plab.scenes import Body, SceneError
 

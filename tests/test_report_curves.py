@@ -12,12 +12,12 @@ from scipy import stats
 import synthetic
 from plab.cli.report import main
 from plab.config.selection import select
-from plab.report.aggregate import common_strata, improvement, interquartile_mean, performance_profile
-from plab.report.budgets import at_budgets, score_at_budget, scores_at
 from plab.report.collect import NAMES, collect, collect_ablation
 from plab.report.curves import rl_scores
 from plab.report.figures import style
-from plab.report.series import band, load_series, rows_on_axes
+from plab.report.series import at_budgets, band, load_series, rows_on_axes, scores_at
+from plab.report.statistics import common_strata, improvement, interquartile_mean, performance_profile
+from plab.report.tables import score_at_budget
 
 # ------------------------------------------------------------------------------------------------------ bands
 

@@ -14,12 +14,12 @@ import synthetic
 from plab.bench import accuracy, speed
 from plab.cli.report import main
 from plab.config.selection import select
+from plab.report.accuracy import precision_summary
+from plab.report.agreement import VERDICTS, verdict, verdict_grid, verdicts
 from plab.report.collect import NAMES, collect
-from plab.report.costs import precision_summary
-from plab.report.measurements import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
+from plab.report.formats import MINUS
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
-from plab.report.table import MINUS
-from plab.report.verdicts import VERDICTS, verdict, verdict_grid, verdicts
+from plab.report.reference import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
 from plab.results import ResultsError
 from plab.results.examples import measurements
 
@@ -113,7 +113,7 @@ def run_cells(name: str, monkeypatch: pytest.MonkeyPatch, **parameters: object) 
     """Run a notebook's code in this process; return what it displays as text and HTML."""
     jupytext, display = pytest.importorskip("jupytext"), pytest.importorskip("IPython.display")
     shown: list[str] = []
-    for place in ("IPython.display", "plab.report.notebook"):
+    for place in ("IPython.display", "plab.report.notebook_cells"):
         monkeypatch.setattr(f"{place}.display", lambda thing: shown.append(str(thing.data)))
     assert display
     space: dict[str, object] = {}

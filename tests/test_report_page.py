@@ -15,10 +15,10 @@ from browsing import browsing, press, until
 from plab.cli.report import main
 from plab.config.selection import select
 from plab.render.graphics import missing_graphics
-from plab.report.aggregate import interquartile_mean, shared_strata
 from plab.report.collect import NAMES, collect
 from plab.report.media import best_runs, present
 from plab.report.methods import method
+from plab.report.statistics import interquartile_mean, shared_strata
 from plab.results import load
 from synthetic_runs import synthetic_run, template
 

@@ -18,7 +18,7 @@ from plab.cli.arguments import Parser, folder
 from plab.cli.command import command_line
 from plab.config.suite import suite_tasks
 from plab.errors import tell
-from plab.report.budgets import BUDGETS
+from plab.report.series import BUDGETS
 from plab.report.templates import asset, render
 from plab.submissions.board import board
 from plab.submissions.verifying import TOLERANCE

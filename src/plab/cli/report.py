@@ -23,10 +23,10 @@ from plab.errors import tell
 from plab.progress import show_progress
 from plab.render import RenderError, require_graphics
 from plab.report.collect import NAMES, Runs, collect, collect_ablation
-from plab.report.measurements import ACCURACY, SPEED, measured
 from plab.report.media import lacking, remove_earlier
 from plab.report.notebooks import NOTEBOOKS, execute, require_packages
 from plab.report.page import Page
+from plab.report.reference import ACCURACY, SPEED, measured
 from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError
 from plab.results.examples import EXAMPLES, measurements, resolve

@@ -1,4 +1,4 @@
-"""The runs that tables and curves are made of: finished, of the suite, and all of the same settings."""
+"""Finished runs that may be averaged: runs of the suite that share all settings but seed and variant."""
 
 from __future__ import annotations
 
@@ -13,26 +13,13 @@ from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import OBSERVED, Selection, one_protocol, require_possible
+from plab.config.selection import OBSERVED, Selection, SelectionError, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
 from plab.errors import PlabError
-from plab.report.methods import method, ordered
-from plab.report.splitting import SEED, split_rows
+from plab.report.methods import method, ordered, part
 from plab.results import Row, lookup, rows
 from plab.results.loading import readable_rows, sources_of
 from plab.results.locks import held
-
-__all__ = [
-    "KEYS",
-    "NAMES",
-    "Ablation",
-    "MixedRunsError",
-    "Runs",
-    "Setting",
-    "changed_settings",
-    "collect",
-    "collect_ablation",
-]
 
 NAMES = ("task", "variant", "method", "seed")
 
@@ -40,28 +27,14 @@ KEYS = ("method.family", "method.iterations", "method.episodes", "sim.horizon")
 """Configuration keys that the table of runs has as columns."""
 
 _SINGLE = ("seed_particles", *OBSERVED)
-"""What is in no section of a configuration and matters to a mean."""
+"""Top-level configuration keys that must agree within a mean."""
 
 _HARMLESS = (
-    "seed",
-    "results_dir",
-    "force",
-    "progress",
-    "logger",
-    "checkpoint_seconds",
-    "protocol.name",
-    "sim.device",
-    "sim.memory_mb",
-    "sim.deterministic",
-    "method.tensorboard",
-    "method.lr_by_task",
-    "method.contact_by_task",
-    "method.max_gradient_norm_by_numbers",
-    "method.torch_device",
-    "method.torch_threads",
-    # Acts where method.loss_terms.contact says so.
+    *("seed", "results_dir", "force", "progress", "logger", "checkpoint_seconds", "protocol.name"),
+    *("sim.device", "sim.memory_mb", "sim.deterministic", "method.torch_device", "method.torch_threads"),
+    *("method.lr_by_task", "method.contact_by_task", "method.max_gradient_norm_by_numbers"),
+    # Takes effect through method.loss_terms.contact.
     "protocol.contact",
-    # Empty, or older than it.
     "task.release",
 )
 """Keys in which the runs of one mean may differ."""
@@ -73,11 +46,11 @@ class MixedRunsError(PlabError, ValueError):
 
 @dataclass(frozen=True)
 class Setting:
-    """A setting that is not plab's own.
+    """A setting that differs from plab's own.
 
     Attributes:
-        key: The setting, dotted.
-        value: Its value.
+        key: Dotted key of the setting.
+        value: Value of the setting.
         whose: Methods, with tasks and variants as far as needed, whose runs have it; empty if all have.
     """
 
@@ -94,21 +67,20 @@ class Runs:
     """Finished runs, and which ones there should be.
 
     Attributes:
-        table: As :func:`plab.results.load` gives it, a row per run.
+        table: Table of :func:`plab.results.load`, a row per run.
         tasks: Tasks asked for.
         variants: Variants asked for.
         methods: Methods asked for, in the order of tables.
         seeds: Seeds asked for.
-        unfinished: Number of runs of theirs that are not finished, hence not in ``table``.
-        under_way: How many of them are being computed at this moment.
-        others: Number of finished runs that belong to nothing asked for.
+        unfinished: Number of runs asked for that are not finished, hence not in ``table``.
+        under_way: Number of runs among them that a process computes at this moment.
+        others: Number of finished runs that were not asked for.
         set_aside: Number of finished runs with more changes to plab's own settings than others of the same
-            task and method have.
+            task and method.
         unusual: Settings other than plab's own.
         protocol: Name of their protocol.
-        unreadable: What could not be read.
-        configs: Their configurations, in the order of ``table``.
-        source: Where they were found.
+        unreadable: Messages about files that could not be read.
+        configs: Configurations of the runs, in the order of ``table``.
     """
 
     table: pd.DataFrame
@@ -124,23 +96,38 @@ class Runs:
     protocol: str
     unreadable: list[str]
     configs: list[dict[str, Any]]
-    source: str | Path | Sequence[str | Path]
 
     @property
     def digest(self) -> str:
         """SHA-256, in hex, over the runs' configurations, evaluations and times, wherever their files are."""
-        lines = sorted(_fingerprint(row) for row in self.table.drop(columns="path").to_dict("records"))
+        records = self.table.drop(columns="path").to_dict("records")
+        lines = sorted(
+            json.dumps({name: value for name, value in row.items() if value == value}, sort_keys=True)
+            for row in records
+        )
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
+    @property
+    def present(self) -> list[str]:
+        """Methods that have runs, in the order of tables."""
+        names = set(self.table["method"])
+        return [name for name in self.methods if name in names]
+
+    @property
+    def expected(self) -> int:
+        """Number of runs of all tasks, variants and seeds asked for, by the methods that have runs."""
+        return len(self.tasks) * len(self.variants) * len(self.seeds) * len(self.present)
+
     def left_out(self) -> list[str]:
-        """Say which runs are not in ``table``, and why; nothing where all are."""
+        """Return sentences on runs that are not in ``table``, and why; none where all are."""
         counts = (
             (self.unfinished, "are not finished, hence not in them"),
             (self.others, "are of other tasks, variants, methods or seeds, hence not in them"),
             (self.set_aside, "try other settings than conf/ has, hence are not in them"),
-            (len(self.unreadable), "cannot be read: python -m plab.results check"),
         )
-        return [f"{count} run(s) {what}" for count, what in counts if count]
+        return [f"{count} run(s) {what}" for count, what in counts if count] + [
+            f"left out: {message}" for message in self.unreadable
+        ]
 
 
 @dataclass(frozen=True)
@@ -167,38 +154,36 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         source: Folder of results, archive, or several of them.
         chosen: Which runs; what it leaves open is the suite's tasks and variants, the paper's methods and
             seeds, and further methods and seeds that the results have.
-        split: Setting whose values are taken for methods of their own, see
-            :func:`plab.report.splitting.split_rows`; none if empty.
+        split: Setting whose values are treated as methods of their own: a dotted key, ``folder`` or ``seed``;
+            none if empty.
 
     Raises:
-        plab.report.splitting.SplitError: If there is nothing to split.
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
-        plab.config.selection.SelectionError: If there are runs of several protocols.
+        plab.config.selection.SelectionError: If there are runs of several protocols, or no runs differ in
+            ``split``.
         plab.config.ConfigError: If no run can be of the choice.
         plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
             can be read.
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
-    fitting = [row for row in _with_contact_terms(found) if chosen(row.values, row.config)]
+    fitting = [row for row in found if chosen(row.values, row.config)]
     asked = _asked(fitting, chosen)
     inside = [row for row in fitting if all(str(row.values[name]) in asked[name] for name in NAMES)]
     complete = [row for row in inside if row.values["status"] == "finished"]
     methods, seeds = asked["method"], asked["seed"]
     if split:
-        complete, names = split_rows(complete, split, sources_of(source))
+        complete, names = _split(complete, split, sources_of(source))
         methods = [name for whole in methods for name in names.get(whole, [whole])]
-        # Of each seed that is a method of its own there is one run.
-        seeds = seeds[:1] if split == SEED else seeds
+        # Each seed becomes a method of one run.
+        seeds = seeds[:1] if split == "seed" else seeds
     protocol = one_protocol(row.config for row in complete)
     finished, unusual = _prefer_usual(complete, split)
     _refuse_mixed(finished)
     values = [row.values | {key: lookup(row.config, key) for key in KEYS} for row in finished]
-    table = pd.DataFrame(
-        values, columns=None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
-    )
+    columns = None if finished else [*NAMES, "score", "config_hash", "path", *KEYS]
     return Runs(
-        table=table.astype({"seed": str}),
+        table=pd.DataFrame(values, columns=columns).astype({"seed": str}),
         tasks=asked["task"],
         variants=asked["variant"],
         methods=methods,
@@ -211,7 +196,6 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
         protocol=protocol,
         unreadable=[str(error) for error in unreadable],
         configs=[row.config for row in finished],
-        source=source,
     )
 
 
@@ -234,32 +218,84 @@ def collect_ablation(
     Args:
         source: Folder of results, archive, or several of them.
         chosen: Which runs.
-        key: The setting, dotted.
+        key: Dotted key of the setting.
 
     Returns:
-        Those in which it takes the most values; None where it never takes more than one.
+        The task, variant and method with the most values; None where the setting never varies.
 
     Raises:
         MixedRunsError: If they differ in more than that, or there are two of one seed.
     """
-    found = [row for row in rows(source)[0] if row.values["status"] == "finished"]
     groups: dict[tuple[str, ...], dict[Any, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in found:
+    for row in rows(source)[0]:
         value = lookup(row.config, key)
-        if chosen(row.values, row.config) and isinstance(value, str | int | float):
+        finished = row.values["status"] == "finished"
+        if finished and chosen(row.values, row.config) and isinstance(value, str | int | float):
             groups[tuple(str(row.values[name]) for name in NAMES[:3])][value].append(row)
-    if not groups:
-        return None
-    (task, variant, method), by_value = max(groups.items(), key=lambda item: len(item[1]))
+    (task, variant, method), by_value = max(
+        groups.items(), key=lambda item: len(item[1]), default=(("", "", ""), {})
+    )
     if len(by_value) < 2:
         return None
+    what = f"{task}-v{variant} {method}"
     for value, same in by_value.items():
-        _refuse_differing(f"{task}-v{variant} {method}, {key} = {value}", [row.config for row in same])
+        _refuse_differing(f"{what}, {key} = {value}", [row.config for row in same])
         _refuse_repeated(same)
-    every = [row.config for same in by_value.values() for row in same]
-    _refuse_differing(f"{task}-v{variant} {method}", every, apart=key)
+    _refuse_differing(what, [row.config for same in by_value.values() for row in same], apart=key)
     paths = {value: [row.path for row in same] for value, same in by_value.items()}
     return Ablation(task, variant, method, paths)
+
+
+def _split(found: Sequence[Row], key: str, places: Sequence[Path]) -> tuple[list[Row], dict[str, list[str]]]:
+    """Return runs renamed where their method has several values of a setting, and the new names by method."""
+    texts = [_split_value(row, key, places) for row in found]
+    seen: dict[str, set[str]] = defaultdict(set)
+    for row, text in zip(found, texts, strict=True):
+        seen[row.values["method"]].add(text)
+    several = [
+        (name, text) for name, own in seen.items() if len(own) > 1 for text in sorted(own, key=_by_number)
+    ]
+    if not several:
+        raise SelectionError(
+            f"no method has runs that differ in {key}: split by a key in which they do, such as method.lr, "
+            "or by folder or seed"
+        )
+    new = {
+        (name, text): part(name, key.rpartition(".")[2], text, place)
+        for place, (name, text) in enumerate(several)
+    }
+    renamed = [
+        replace(
+            row, values=row.values | {"method": new.get((row.values["method"], text), row.values["method"])}
+        )
+        for row, text in zip(found, texts, strict=True)
+    ]
+    names: dict[str, list[str]] = defaultdict(list)
+    for (name, _), own_name in new.items():
+        names[name].append(own_name)
+    return renamed, names
+
+
+def _split_value(row: Row, key: str, places: Sequence[Path]) -> str:
+    if key == "seed":
+        return str(row.values["seed"])
+    if key == "folder":
+        return next(str(place) for place in places if row.path.is_relative_to(place))
+    if "." not in key:
+        raise SelectionError(
+            f"cannot split by '{key}': give a dotted key such as method.lr, or folder or seed"
+        )
+    value = lookup(row.config, key)
+    if value is None or value != value:
+        return "none"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _by_number(text: str) -> tuple[float, str]:
+    try:
+        return float(text), text
+    except ValueError:
+        return float("inf"), text
 
 
 # --------------------------------------------------------------------------------------------------- settings
@@ -267,38 +303,16 @@ def collect_ablation(
 
 def _refuse_mixed(found: Sequence[Row]) -> None:
     """Refuse runs of one configuration, or of one task and method, that differ in what matters."""
-    groups: dict[tuple[str, str], list[Row]] = defaultdict(list)
+    groups: dict[tuple[str, str], dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in found:
-        groups[row.values["task"], row.values["method"]].append(row)
-    for (task, name), own in groups.items():
-        sections = ("protocol", "sim", "method")
-        _refuse_differing(f"{task} {name}", [{key: row.config[key] for key in sections} for row in own])
-        variants: dict[str, list[Row]] = defaultdict(list)
-        for row in own:
-            variants[row.values["variant"]].append(row)
+        groups[row.values["task"], row.values["method"]][row.values["variant"]].append(row)
+    for (task, name), variants in groups.items():
+        every = [row.config for own in variants.values() for row in own]
+        sections = [{key: config[key] for key in ("protocol", "sim", "method")} for config in every]
+        _refuse_differing(f"{task} {name}", sections)
         for variant, same in variants.items():
             _refuse_differing(f"{task}-v{variant} {name}", [row.config for row in same])
             _refuse_repeated(same)
-
-
-def _with_contact_terms(found: Sequence[Row]) -> list[Row]:
-    """Have runs from before the contact term had variants say which one they had."""
-    # Of thousands of runs most share their sections, which stay the same objects.
-    methods = {id(row.config["method"]): row.config["method"] for row in found}
-    known = {number: _with_contact_term(method) for number, method in methods.items()}
-    return [
-        replace(row, config={**row.config, "method": known[id(row.config["method"])]})
-        if "loss_terms" not in row.config["method"]
-        else row
-        for row in found
-    ]
-
-
-def _with_contact_term(method: dict[str, Any]) -> dict[str, Any]:
-    """Return the section of a method, with the contact term that there was if it is older than the choice."""
-    if "loss_terms" in method or "contact" not in method.get("loss_weights", {}):
-        return method
-    return method | {"loss_terms": {"contact": "nearest"}}
 
 
 def _refuse_differing(what: str, configs: Sequence[Mapping[str, Any]], apart: str = "") -> None:
@@ -323,19 +337,18 @@ def _refuse_repeated(found: Sequence[Row]) -> None:
 def _differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Return the dotted keys in which configurations differ, with the values that occur."""
     first = configs[0]
-    # Of thousands of runs most share their sections, as the same objects.
+    # Most sections of thousands of runs are equal and need not be flattened.
     unlike = {
         name
         for config in configs[1:]
         for name in config.keys() | first.keys()
-        if config.get(name) is not first.get(name) and config.get(name) != first.get(name)
+        if config.get(name) != first.get(name)
     }
-    seen: dict[str, dict[str, Any]] = defaultdict(dict)
     flat = [dict(_leaves({name: config[name] for name in config if name in unlike})) for config in configs]
-    for key in dict.fromkeys(key for leaves in flat for key in leaves):
-        for leaves in flat:
-            value = leaves.get(key)
-            seen[key].setdefault(json.dumps(value), value)
+    seen = {
+        key: {json.dumps(leaves.get(key)): leaves.get(key) for leaves in flat}
+        for key in dict.fromkeys(key for leaves in flat for key in leaves)
+    }
     return {key: list(values.values()) for key, values in seen.items() if len(values) > 1}
 
 
@@ -348,33 +361,36 @@ def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]
 
 
 def _prefer_usual(found: Sequence[Row], apart: str) -> tuple[list[Row], list[Setting]]:
-    """Of each task and method, keep the runs in plab's own settings, or in those with the fewest changes.
+    """Keep, of each task and method, the runs with the fewest changes to plab's own settings.
 
     Args:
         found: The runs.
-        apart: Key that is no such setting.
+        apart: Key that does not count as a change.
 
     Returns:
-        These runs, and their settings that are not those of plab's own files.
+        These runs, and their settings that are not plab's own.
     """
-    changes = [{key: value for key, value in changed.items() if key != apart} for changed in _changes(found)]
+    changes = [
+        {key: value for key, value in changed_settings(row.config).items() if key != apart} for row in found
+    ]
+    pairs = [(row.values["task"], row.values["method"]) for row in found]
     fewest: dict[tuple[str, str], int] = {}
-    for row, changed in zip(found, changes, strict=True):
-        fewest[_pair(row)] = min(len(changed), fewest.get(_pair(row), len(changed)))
+    for pair, changed in zip(pairs, changes, strict=True):
+        fewest[pair] = min(len(changed), fewest.get(pair, len(changed)))
     kept = []
     whose: dict[tuple[str, str], list[Row]] = defaultdict(list)
-    for row, changed in zip(found, changes, strict=True):
-        if len(changed) == fewest[_pair(row)]:
+    for row, pair, changed in zip(found, pairs, changes, strict=True):
+        if len(changed) == fewest[pair]:
             kept.append(row)
             for key, value in changed.items():
                 whose[key, json.dumps(value)].append(row)
     return kept, [
-        Setting(key, json.loads(text), _whose(own, kept)) for (key, text), own in sorted(whose.items())
+        Setting(key, json.loads(text), _described(own, kept)) for (key, text), own in sorted(whose.items())
     ]
 
 
-def _whose(own: Sequence[Row], every: Sequence[Row]) -> str:
-    """Say which runs of all these are, in as few words as tell them: nothing where they are all."""
+def _described(own: Sequence[Row], every: Sequence[Row]) -> str:
+    """Return the shortest description that tells some runs from all others; empty where they are all."""
     for names in ((), ("method",), ("method", "task"), ("method", "task", "variant")):
         kinds = {tuple(row.values[name] for name in names) for row in own}
         if sum(tuple(row.values[name] for name in names) in kinds for row in every) == len(own):
@@ -387,54 +403,45 @@ def _whose(own: Sequence[Row], every: Sequence[Row]) -> str:
     return ", ".join(texts[:3]) + (f" and {len(texts) - 3} more" if len(texts) > 3 else "")
 
 
-def _changes(found: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the :func:`changed_settings` of each run; of thousands most share their sections."""
-    known: dict[tuple[Any, ...], dict[str, Any]] = {}
-    changes = []
-    for row in found:
-        sections = (id(row.config[name]) for name in ("task", "method", "protocol", "sim"))
-        which = (*sections, row.values["variant"], *(row.config[name] for name in _SINGLE))
-        if which not in known:
-            known[which] = changed_settings(row.config)
-        changes.append(known[which])
-    return changes
-
-
-def _pair(row: Row) -> tuple[str, str]:
-    return row.values["task"], row.values["method"]
-
-
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return a run's settings that are not those of plab's own files, by dotted key.
 
     Args:
         config: The run's configuration.
     """
-    config = {**config, "method": _with_contact_term(config["method"])}
-    by_variant = {f"task.{key}" for key in _changed_by_variant(config)}
+    variants = config["task"].get("variants") or {}
+    by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])
     own = {key: lookup(config, key) for key in expected if key not in by_variant}
-    # None where the run is older than the setting: that it did without, as null says.
+    # None where the run is older than the setting.
     own = {key: None if value != value else value for key, value in own.items()}
     return {key: value for key, value in own.items() if value != expected[key]}
 
 
 @functools.cache
 def _expected(method: str, task: str, protocol: str) -> dict[str, Any]:
-    """Return what a method and a task have in plab's files under a protocol, by dotted key, but for what does
-    not matter."""
-    usual = _usual(method, protocol)
-    usual = usual | _usual_by_task(method, task, usual)
-    exact = usual["protocol.numbers"] == "release"
-    usual |= {f"task.{key}": value for key, value in _usual_task(task, exact).items()}
+    """Return the settings of plab's files for a method, a task and a protocol, by dotted key."""
+    usual = dict(_usual(method, protocol))
+    # Learning rate and contact weight may have values by task.
+    for key, section, choice in (
+        ("method.lr", "lr_by_task", "protocol.numbers"),
+        ("method.loss_weights.contact", "contact_by_task", "protocol.contact"),
+    ):
+        values = shipped_file("method", method).get(section, {}).get(usual[choice], {})
+        if (value := values.get(task, values.get("other"))) is not None:
+            usual[key] = value
+    own = shipped_file("task", task)
+    if usual["protocol.numbers"] == "release":
+        own = own | own.get("release", {})
+    # Bodies, manipulators, targets and variants may be changed at will.
+    usual |= {f"task.{key}": value for key, value in own.items() if not isinstance(value, dict)}
     return {key: value for key, value in usual.items() if key not in _HARMLESS}
 
 
 @functools.cache
 def _usual(method: str, protocol: str) -> dict[str, Any]:
-    """Return method, protocol and sim as plab's files have them; all but the method of one that plab does not
-    know, and plab's own protocol for one that it does not know."""
-    # Imported here: composing needs Hydra.
+    """Return method, protocol and sim of plab's files, without the method where plab does not know it."""
+    # Composing needs Hydra.
     from plab.config import choices, load_config
     from plab.results import config_dict
 
@@ -444,32 +451,3 @@ def _usual(method: str, protocol: str) -> dict[str, Any]:
     config = config_dict(load_config(words))
     names = ["protocol", "sim", *_SINGLE, *(["method"] if known else [])]
     return dict(_leaves({name: config[name] for name in names}))
-
-
-def _usual_by_task(method: str, task: str, usual: Mapping[str, Any]) -> dict[str, float]:
-    """Return learning rate and contact weight of a method that has some of its own for the task."""
-    places = (
-        ("method.lr", "lr_by_task", "protocol.numbers"),
-        ("method.loss_weights.contact", "contact_by_task", "protocol.contact"),
-    )
-    own = shipped_file("method", method)
-    tasks = {key: own.get(section, {}).get(usual[choice], {}) for key, section, choice in places}
-    found = {key: values.get(task, values.get("other")) for key, values in tasks.items()}
-    return {key: value for key, value in found.items() if value is not None}
-
-
-def _usual_task(task: str, exact: bool) -> dict[str, Any]:
-    """Return the numbers of a task that are no part of bodies, manipulators, target or variants, the
-    release's if they are to be ``exact``."""
-    own = shipped_file("task", task)
-    own = own | own.get("release", {}) if exact else own
-    return {key: value for key, value in own.items() if not isinstance(value, dict)}
-
-
-def _changed_by_variant(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    variants = config["task"].get("variants") or {}
-    return variants.get(str(config["variant"]), {})
-
-
-def _fingerprint(values: Mapping[str, Any]) -> str:
-    return json.dumps({name: value for name, value in values.items() if value == value}, sort_keys=True)

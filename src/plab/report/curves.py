@@ -1,48 +1,29 @@
-"""The figures: rewards and scores during the runs, final scores, and the suite as a whole."""
+"""Figures of runs: rewards and scores during the runs, final scores, and the suite as a whole."""
 
 from __future__ import annotations
 
 import textwrap
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 
 from plab.config.selection import lookup
-from plab.report.aggregate import improvement, interquartile_mean, performance_profile, shared_strata
+from plab.families import RL
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
-from plab.report.budgets import NOTES, at_budgets, strata_of
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis, single
-from plab.report.methods import RL, method
+from plab.report.formats import number
+from plab.report.methods import method
 from plab.report.reference import paper_table
-from plab.report.series import Rows, band
-from plab.report.table import number
-from plab.report.tables import ordered_tasks, settings_note
-
-__all__ = [
-    "Series",
-    "aggregates",
-    "agreement_plot",
-    "budget_curves",
-    "rewards",
-    "rl_scores",
-    "score_curves",
-    "yield_ablation",
-]
-
-Tables = Mapping[str, list[Rows]]
-"""Rows of runs by method."""
-
-Series = Sequence[tuple[dict[str, str], Rows]]
-"""What :func:`plab.report.series.load_series` gives."""
+from plab.report.series import Rows, Series, at_budgets, band, strata_of
+from plab.report.statistics import improvement, interquartile_mean, performance_profile, shared_strata
+from plab.report.tables import BUDGET_NOTES, demonstration_scores, ordered_tasks, settings_note
 
 _CLAMPED = "Values below zero count as zero, as in the paper."
 _SHADED = "Lines: mean over the runs; shaded: one standard deviation."
@@ -60,7 +41,9 @@ def _pick(series: Series, **which: str) -> dict[str, list[Rows]]:
     return found
 
 
-def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expected: int) -> bool:
+def _panel(
+    axes: Axes, runs: Runs, tables: Mapping[str, list[Rows]], axis: str, column: str, expected: int
+) -> bool:
     """Draw all methods' bands, and say in small print which lack runs; return whether there are any."""
     short = []
     for name in runs.methods:
@@ -68,7 +51,7 @@ def _panel(axes: Axes, runs: Runs, tables: Tables, axis: str, column: str, expec
         if drawn is not None:
             draw_band(axes, drawn, name, ceiling=1.0 if column == "score" else np.inf)
         count = 0 if drawn is None else drawn.count
-        if count < expected and name in set(runs.table["method"]):
+        if count < expected and name in runs.present:
             short.append(f"{method(name).label}\N{NO-BREAK SPACE}{count}/{expected}")
     axes.set_ylim(bottom=0.0, top=1.05 if column == "score" else None)
     small: dict[str, Any] = {"fontsize": 5, "color": "#666666", "ha": "center"}
@@ -155,7 +138,7 @@ def budget_curves(runs: Runs, series: Series) -> Drawing:
         panel.set_ylim(0.0, 1.05)
         log_axis(panel, "environment steps")
     _finish(figure, absent)
-    return Drawing("score_at_budget", figure, [*NOTES, *settings_note(runs)])
+    return Drawing("score_at_budget", figure, [*BUDGET_NOTES, *settings_note(runs)])
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
@@ -229,8 +212,7 @@ def rl_scores(runs: Runs) -> list[Drawing]:
     panel.axhline(1.0, color="#555555", linestyle="--", linewidth=1, label="theoretical limit")
     notes = ["Final scores, clamped to [0, 1]. Bars: mean over variants and seeds; dots: the runs."]
     if all(lookup(config, "targets.source") is None for config in runs.configs):
-        with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
-            known = pd.read_csv(file).groupby("task")["score"].mean()
+        known = demonstration_scores().groupby("task")["score"].mean()
         best = [known.get(task, np.nan) for task in tasks]
         line: dict[str, Any] = {"marker": "_", "s": 250, "color": "black", "zorder": 4}
         panel.scatter(range(len(tasks)), best, label="best actions known", **line)
@@ -307,10 +289,11 @@ def aggregates(runs: Runs) -> list[Drawing]:
     shared = shared_strata(runs)
     if not shared.keys:
         return []
-    methods, strata = list(shared.strata), shared.strata
     notes = [*shared.notes, *settings_note(runs)]
-    draw: tuple[Callable[..., Drawing], ...] = (_interquartile_means, _profiles, _improvements)
-    return [call(methods, strata, notes) for call in draw]
+    return [
+        draw(list(shared.strata), shared.strata, notes)
+        for draw in (_interquartile_means, _profiles, _improvements)
+    ]
 
 
 Strata = Mapping[str, Sequence[np.ndarray]]

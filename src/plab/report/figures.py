@@ -1,4 +1,4 @@
-"""How figures look, and how they become files."""
+"""Style, parts and files of figures."""
 
 from __future__ import annotations
 
@@ -20,20 +20,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from plab.report.methods import method
 from plab.report.series import Band
 
-__all__ = [
-    "Drawing",
-    "draw_band",
-    "fix_layout",
-    "grid",
-    "legend",
-    "legend_of_methods",
-    "log_axis",
-    "save",
-    "single",
-    "style",
-]
+PHASES = {"build": "#999999", "compile": "#E69F00", "optimise": "#0072B2", "evaluate": "#009E73"}
+"""Phases of a run, with their colours."""
 
-ENTRY = 0.72
+_ENTRY = 0.72
 """Width of a legend's entry [inch]."""
 
 _STYLE = {
@@ -57,7 +47,7 @@ _STYLE = {
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure and what is to be known about it.
+    """A figure with its notes.
 
     Attributes:
         name: Name of its files.
@@ -156,7 +146,7 @@ def legend_of_methods(figure: Figure, names: Sequence[str]) -> None:
     dots = [Line2D([], [], marker="o", linestyle="none", color=look.colour) for look in looks]
     if dots:
         labels = [look.label for look in looks]
-        rows = math.ceil(len(dots) * ENTRY / figure.get_figwidth())
+        rows = math.ceil(len(dots) * _ENTRY / figure.get_figwidth())
         columns = math.ceil(len(dots) / rows)
         figure.legend(dots, labels, loc="outside upper center", ncols=columns, handletextpad=0.1)
 

@@ -1,7 +1,4 @@
-"""Which runs the page of results shows in pictures and films, and where these are.
-
-Drawing is :mod:`plab.render`'s.
-"""
+"""Pictures and films of the page of results: which runs they show, and where they are."""
 
 from __future__ import annotations
 
@@ -16,8 +13,6 @@ from typing import Any
 
 from plab.report.collect import Runs
 
-__all__ = ["FOLDER", "Shown", "best_of_tasks", "best_runs", "lacking", "present", "remove_earlier"]
-
 FOLDER = "media"
 """Folder of pictures, below that of the page."""
 
@@ -29,7 +24,7 @@ class Shown:
     Attributes:
         task: Name of the task.
         variant: Name of the variant.
-        runs: The best run of each method: its row of the table of runs.
+        runs: Best run of each method: its row of the table of runs.
         drawn: Methods whose run has a picture.
         films: Methods whose run has a film.
     """
@@ -47,12 +42,16 @@ class Shown:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its pictures: other runs or films, other folder."""
-        # Runs done afresh have the same configuration, but other actions.
+        """Name of the folder of its pictures, which depends on the runs and films."""
+        # Repeated runs have the same configuration, but other actions.
         drawn = [self.runs[name] for name in sorted(self.drawn)]
         own = [[run["config_hash"], run["best_loss"]] for run in drawn]
         text = json.dumps([own, sorted(self.films)])
         return f"{self.name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+    def stem(self, method: str) -> str:
+        """Return the stem of the file names of a method's picture and film."""
+        return str(self.runs[method]["config_hash"])[:12]
 
 
 def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
@@ -64,7 +63,7 @@ def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
             picture, and the best of each task a film.
     """
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
-    # Of equal ones the first, whatever order the files were found in.
+    # Ties are broken by the hash, whatever order the files were found in.
     table = runs.table.sort_values(["score", "config_hash"], ascending=[False, True])
     for row in table.to_dict("records"):
         found[row["task"], row["variant"]].setdefault(row["method"], row)
@@ -104,43 +103,35 @@ def present(shown: Shown, out: Path) -> dict[str, str]:
         out: Folder of the page.
 
     Returns:
-        Paths relative to ``out`` by what they show: ``start``, ``target``, ``<method>``, ``<method> film``.
+        Paths relative to ``out`` by subject: ``start``, ``target``, ``<method>``, ``<method> film``.
     """
     folder = out / FOLDER / shown.folder
-    if not folder.is_dir():
-        return {}
     names = {"start": "start.webp", "target": "target.webp"}
-    names |= {method: f"{_stem(shown.runs[method])}.webp" for method in shown.drawn}
-    names |= {f"{method} film": f"{_stem(shown.runs[method])}.mp4" for method in shown.films}
+    names |= {method: f"{shown.stem(method)}.webp" for method in shown.drawn}
+    names |= {f"{method} film": f"{shown.stem(method)}.mp4" for method in shown.films}
     there = {what: folder / name for what, name in names.items()}
     return {what: path.relative_to(out).as_posix() for what, path in there.items() if path.is_file()}
 
 
 def lacking(shown: Sequence[Shown], out: Path) -> dict[Path, dict[str, tuple[Path, bool]]]:
-    """Return what is to be drawn: the folder of each configuration's pictures, and the runs that they show.
+    """Return the pictures to draw.
 
     Args:
         shown: The configurations.
         out: Folder of the page.
 
     Returns:
-        Result files and whether each has a film, by the names of the pictures, by folder; those whose folder
-        is not there.
+        Result files and whether each has a film, by the stems of the pictures' names, by folder; of folders
+        that do not exist.
     """
     folders = {out / FOLDER / one.folder: one for one in shown}
     return {
         folder: {
-            _stem(one.runs[name]): (Path(one.runs[name]["path"]), name in one.films)
-            for name in sorted(one.drawn)
+            one.stem(name): (Path(one.runs[name]["path"]), name in one.films) for name in sorted(one.drawn)
         }
         for folder, one in folders.items()
         if not folder.is_dir()
     }
-
-
-def _stem(run: Mapping[str, Any]) -> str:
-    """Return the name of a run's pictures, whatever its method is called."""
-    return str(run["config_hash"])[:12]
 
 
 def remove_earlier(shown: Sequence[Shown], out: Path) -> None:

@@ -6,9 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from plab.config.suite import PAPER_METHODS
-from plab.families import FAMILIES, GRADIENT, RL
-
-__all__ = ["GRADIENT", "RL", "Method", "method", "ordered", "part"]
+from plab.families import FAMILIES
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,6 @@ from typing import Any
 from plab.report.templates import asset, render
 from plab.results import ResultsError
 
-__all__ = ["NOTEBOOKS", "execute", "notebook_folder", "require_packages"]
-
 NOTEBOOKS = ("reproduction", "speed", "accuracy", "anatomy")
 """Names of the notebooks."""
 

@@ -1,17 +1,18 @@
-"""One static page for a folder of results: overview; curves, pictures, films and runs of each configuration.
+"""Static page of results: overview; curves, pictures, films and runs of each configuration.
 
 The page needs no server and no network. ``index.html`` holds style, script and the overview. The curves of a
-configuration are in a script of its own below ``data/``, which the page loads when they are asked for:
-browsers let a page from the file system load scripts, but no data. ``data/state.js`` says which page is
-there, so that one that is open finds out that it has been written again.
+configuration are in a script of its own below ``data/``, loaded on demand: browsers let a page from the file
+system load scripts, but no data. ``data/state.js`` names the current version, so that an open page notices
+that it has been written again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,83 +20,100 @@ import numpy as np
 import pandas as pd
 
 from plab.report.collect import Runs, changed_settings
-from plab.report.media import Shown, best_runs, present
+from plab.report.media import Shown, best_of_tasks, best_runs, present
 from plab.report.methods import Method, method
 from plab.report.series import AXES, Band, band, rows_on_axes
-from plab.report.summary import aggregates, compared, finite, gallery, incomplete, per_task, sentence
-from plab.report.tables import Cells, ordered_tasks, settings_note
+from plab.report.statistics import (
+    Interval,
+    Summary,
+    improvement,
+    interquartile_mean,
+    performance_profile,
+    shared_strata,
+)
+from plab.report.tables import Cells, difference, ordered_tasks, settings_note
 from plab.report.templates import asset, render
 from plab.results import read_iterations
 from plab.results.files import replace_file
 
-__all__ = ["Page"]
-
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
-"""What curves show, and below what values count as this, as in the paper's figures."""
+"""Columns of the curves, and the value below which their values are clamped, as in the paper's figures."""
 
 _POINTS = 160
-"""Points of a curve on the page, at most."""
+"""Maximum number of points of a curve."""
 
 _DIGITS = 4
 """Significant digits of the curves' numbers."""
 
+_THRESHOLDS = 51
+"""Thresholds of a performance profile."""
+
 _LOOK_EVERY = 3000
-"""How often a page that may be made again looks whether it has been [ms]."""
+"""Interval at which a live page checks whether it has been written again [ms]."""
 
 _SCRIPTS = ("theme.js", "tools.js", "chart.js", "summary.js", "overview.js", "configuration.js", "page.js")
 
 
 class Page:
-    """The page of some runs: what it says is worked out once, pictures join as they are drawn.
+    """Page of some runs: numbers are computed once, pictures join as they are drawn.
 
     Attributes:
         shown: Configurations and the runs of them that pictures show.
     """
 
     def __init__(self, runs: Runs, out: Path, origin: Mapping[str, Any], *, every_run: bool = False) -> None:
-        """Write curves and runs of each configuration to ``data/``, and work out the rest.
+        """Write curves and runs of each configuration to ``data/``, and compute the rest.
 
         Args:
             runs: Our runs.
             out: Folder to write to.
-            origin: What is said about where the page comes from: ``command``, ``digest``, ``plab``.
+            origin: Origin of the page: ``command``, ``digest``, ``plab``.
             every_run: As for :func:`plab.report.media.best_runs`.
         """
         self.shown = best_runs(runs, every_run=every_run)
         self._out, self._under_way = out, runs.under_way > 0
+        ours, theirs = Cells("ours", runs), Cells("paper", runs)
+        tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
         self._content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
-            "tasks": per_task(runs),
-            "gallery": gallery(self.shown),
-            "aggregates": aggregates(runs),
+            "tasks": [
+                {"task": task, "cells": _compared(runs, ours, theirs, (task,))}
+                for task in tasks
+                if task in with_runs
+            ],
+            "gallery": _gallery(self.shown),
+            "aggregates": _aggregates(runs),
             "axes": list(AXES),
             "columns": list(_COLUMNS),
             "every": _LOOK_EVERY,
         }
-        self._configurations = _overview(runs)
+        self._configurations: list[dict[str, Any]] = [
+            {"name": f"{task}-v{variant}", "task": task, "variant": variant}
+            | {"cells": _compared(runs, ours, theirs, (task, variant))}
+            for task in tasks
+            for variant in runs.variants
+        ]
         known = runs.table[["task", "variant", "method", "seed", "config_hash", "path"]].to_dict("records")
-        present = set(runs.table["method"])
-        cells = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
         self._values: dict[str, Any] = {
             "style": asset("page.css"),
             "script": "".join(map(asset, _SCRIPTS)),
             "methods": [method(name) for name in runs.methods],
             "origin": origin,
             "runs": sorted(known, key=lambda row: [str(value) for value in row.values()]),
-            "expected": cells * sum(name in present for name in runs.methods),
-            "sentence": sentence(runs),
-            "incomplete": incomplete(runs),
+            "expected": runs.expected,
+            "sentence": _sentence(runs),
+            "incomplete": _incomplete(runs),
             "notes": settings_note(runs),
             "left_out": runs.left_out(),
-            "tasks": len(set(runs.table["task"])),
-            "all_tasks": len(runs.tasks),
+            "tasks": len(with_runs),
+            "all_tasks": len(tasks),
         }
         self._write_details(runs)
 
     def _write_details(self, runs: Runs) -> None:
         folder = self._out / "data"
         folder.mkdir(parents=True, exist_ok=True)
-        # What a process that was killed has left.
+        # Left by a process that was killed.
         for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
             path.unlink()
         for one in self.shown:
@@ -106,7 +124,7 @@ class Page:
                 path.unlink()
 
     def write(self, *, drawing: bool = False) -> None:
-        """Write ``index.html`` with the pictures that are there.
+        """Write ``index.html`` with the pictures that there are.
 
         Args:
             drawing: Whether more pictures are being drawn. Then, or while runs are under way, the page loads
@@ -115,7 +133,6 @@ class Page:
         pictures = {one.name: present(one, self._out) for one in self.shown}
         configurations = [one | {"pictures": pictures.get(one["name"], {})} for one in self._configurations]
         content = self._content | {"configurations": configurations, "live": drawing or self._under_way}
-        # Of two pages of the same runs and pictures only one may still be in the making.
         state = hashlib.sha256(json.dumps([content, str(self._values)]).encode()).hexdigest()[:16]
         text = json.dumps(content | {"state": state}, separators=(",", ":"), allow_nan=False)
         # The only sign with which text could leave the script that it is in.
@@ -125,7 +142,7 @@ class Page:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file that is whole at any time, for a browser may read it."""
+    # Atomically, for a browser may read it at any time.
     replace_file(path, text.encode(), sync=False)
 
 
@@ -134,15 +151,95 @@ def _look(look: Method, place: int) -> dict[str, str]:
     return {"name": look.name, "label": look.label, "dashes": dashes, "css": f"m{place}"}
 
 
-def _overview(runs: Runs) -> list[dict[str, Any]]:
-    """Return our scores, the paper's and the difference of every configuration, by method."""
-    ours, theirs = Cells("ours", runs), Cells("paper", runs)
-    return [
-        {"name": f"{task}-v{variant}", "task": task, "variant": variant}
-        | {"cells": compared(runs, ours, theirs, (task, variant))}
-        for task in ordered_tasks(runs.tasks)
-        for variant in runs.variants
-    ]
+# --------------------------------------------------------------------------------------------------- overview
+
+
+def _finite(value: float) -> float | None:
+    """Return a number with four decimals, None for NaN."""
+    return None if math.isnan(value) else round(float(value), 4)
+
+
+def _summary(summary: Summary) -> dict[str, Any]:
+    return {"mean": _finite(summary.mean), "std": _finite(summary.std), "count": summary.count}
+
+
+def _ends(found: Interval) -> list[float | None]:
+    return [_finite(value) for value in (found.value, found.low, found.high)]
+
+
+def _compared(runs: Runs, ours: Cells, theirs: Cells, key: tuple[str, ...]) -> dict[str, Any]:
+    """Return our score of a task, or of one of its variants, the paper's and their difference, by method."""
+    cells = {}
+    for name in runs.methods:
+        mine = ours.cell(key, name)
+        cells[name] = {
+            "ours": _summary(mine.summary) | {"expected": mine.expected},
+            "paper": _summary(theirs.cell(key, name).summary),
+            "difference": _ends(difference(ours, theirs, runs.variants, key, name)),
+        }
+    return cells
+
+
+def _listed(texts: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
+def _plural(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def _sentence(runs: Runs) -> str:
+    """Return a sentence on the runs of the page."""
+    table = runs.table
+    configurations = len(table[["task", "variant"]].drop_duplicates())
+    tasks = sorted(set(table["task"]))
+    where = f"of {_plural(len(tasks), 'task')}" if len(tasks) > 1 else f"of {tasks[0]}"
+    return (
+        f"{_plural(len(table), 'run')} by {_listed([method(name).label for name in runs.present])} on "
+        f"{_plural(configurations, 'configuration')} {where}, scored from 0, where a task starts, to 1, "
+        "its target."
+    )
+
+
+def _incomplete(runs: Runs) -> list[str]:
+    """Return a sentence on methods that lack runs, and how many they have; nothing where all are complete."""
+    expected = len(runs.tasks) * len(runs.variants) * len(runs.seeds)
+    counts = {method(name).label: int((runs.table["method"] == name).sum()) for name in runs.present}
+    short = [f"{label} with {count}" for label, count in counts.items() if count < expected]
+    return [f"Incomplete are {_listed(short)} of {_plural(expected, 'run')} each."] if short else []
+
+
+def _gallery(shown: Sequence[Shown]) -> list[dict[str, Any]]:
+    """Return the best run of each task."""
+    best = best_of_tasks(shown)
+    listed = []
+    for task in ordered_tasks(list(best)):
+        one, name = best[task]
+        run = one.runs[name]
+        listed.append({"task": task, "name": one.name, "method": name, "seed": run["seed"]})
+        listed[-1]["score"] = _finite(run["score"])
+    return listed
+
+
+def _aggregates(runs: Runs) -> Mapping[str, Any]:
+    """Return interquartile means, performance profiles and probabilities of improvement, each with the ends
+    of its interval; and what they are taken over."""
+    shared = shared_strata(runs)
+    strata = shared.strata
+    thresholds = np.linspace(0.0, 1.0, _THRESHOLDS)
+    profiles = {name: performance_profile(own, thresholds) for name, own in strata.items()}
+    return {
+        "notes": shared.notes,
+        "mean": {name: _ends(interquartile_mean(own)) for name, own in strata.items()},
+        "profile": {
+            "x": thresholds.round(4).tolist(),
+            "methods": {name: [one.round(4).tolist() for one in own] for name, own in profiles.items()},
+        },
+        "better": {
+            one: {other: _ends(improvement(strata[one], strata[other])) for other in strata if other != one}
+            for one in strata
+        },
+    }
 
 
 # ---------------------------------------------------------------------------------------------- configuration
@@ -169,20 +266,13 @@ def _details(shown: Shown, runs: Runs) -> dict[str, Any]:
 
 
 def _run(row: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, Any]:
-    batch = row["batch"]
     return {
-        "seed": row["seed"],
-        "score": finite(row["score"]),
-        "iou": finite(row["iou"]),
-        "loss": finite(row["best_loss"]),
-        "iterations": int(row["iterations"]),
-        "best_iteration": int(row["best_iteration"]),
-        "seconds": finite(row["seconds"]),
-        "batch": None if pd.isna(batch) else int(batch),
-        "device": row["device"],
-        "started": row["started"],
+        **{name: _finite(row[name]) for name in ("score", "iou", "seconds")},
+        **{name: int(row[name]) for name in ("iterations", "best_iteration")},
+        **{name: row[name] for name in ("seed", "device", "started", "path")},
+        "loss": _finite(row["best_loss"]),
+        "batch": None if pd.isna(row["batch"]) else int(row["batch"]),
         "hash": row["config_hash"],
-        "path": row["path"],
         "command": _command(config),
     }
 
@@ -209,15 +299,14 @@ def _word(value: Any) -> str:
 
 
 def _curve(drawn: Band | None) -> list[list[float]] | None:
-    """Return where, mean and standard deviation, thinned out evenly for a logarithmic axis."""
+    """Return abscissae, means and standard deviations, thinned out evenly for a logarithmic axis."""
     if drawn is None:
         return None
     count = len(drawn.x)
     low, high = max(drawn.x[0], 1e-9), drawn.x[-1]
     at = np.searchsorted(drawn.x, np.geomspace(low, high, _POINTS)).clip(max=count - 1)
     chosen = np.unique(np.concatenate([at, np.linspace(0, count - 1, _POINTS // 2).astype(int)]))
-    return [_rounded(values[chosen]) for values in (drawn.x, drawn.mean, drawn.std)]
-
-
-def _rounded(values: np.ndarray) -> list[float]:
-    return [float(f"{value:.{_DIGITS}g}") for value in values]
+    return [
+        [float(f"{value:.{_DIGITS}g}") for value in values[chosen]]
+        for values in (drawn.x, drawn.mean, drawn.std)
+    ]

@@ -1,7 +1,8 @@
-"""What happened during the runs: their iterations on common axes, and means over runs."""
+"""Iterations of runs on common axes: means over runs, scores at equal budgets."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,19 +13,24 @@ import pandas as pd
 
 from plab.families import SOLVED, known_family
 from plab.report.collect import Runs
-from plab.results import BUDGETS, read_curves, read_iterations
-
-__all__ = ["AXES", "Band", "Rows", "band", "load_rows", "load_series", "rows_on_axes"]
+from plab.report.statistics import Interval, stratified_mean, summarise
+from plab.results import BUDGETS as SIMULATED
+from plab.results import read_curves, read_iterations
 
 AXES = ("episodes", "seconds", "substeps")
-"""What curves are drawn against: episodes, wall time [s], simulated substeps."""
+"""Axes of curves: episodes, wall time [s], simulated substeps."""
 
+BUDGETS = (1e3, 1e4, 1e5, 1e6)
+"""Budgets at which methods are compared [environment steps]."""
 
 Rows = Mapping[str, np.ndarray]
-"""Columns of a run's rows: not a pandas table, of which thousands take long to make."""
+"""Columns of a run's iterations: not a pandas table, of which thousands take long to make."""
+
+Series = Sequence[tuple[dict[str, str], Rows]]
+"""Task, variant, method and seed of each run, and its iterations."""
 
 _POINTS = 400
-"""Points of a curve, at most."""
+"""Maximum number of points of a curve."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,7 @@ class Band:
     """Mean and spread of some runs' curves.
 
     Attributes:
-        x: Where, increasing, shape [point].
+        x: Abscissae, increasing, shape [point].
         mean: Mean over the runs, shape [point].
         std: Standard deviation over the runs, as a population, shape [point].
         count: Number of runs.
@@ -51,17 +57,13 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
         runs: The runs.
 
     Returns:
-        For each run what it is (task, variant, method, seed) and its rows, with the columns of
-        docs/results.md and some changes: ``seconds`` is the wall time since the start of the first row,
-        ``simulated`` the simulated environment steps, ``substeps`` the simulated substeps, all at the end of
-        the row; ``best_score`` is the score of the best actions so far. ``episodes`` counts the row's own,
-        too, so that it starts at 1.
+        Task, variant, method and seed of each run, and its iterations, with the columns of docs/results.md
+        and some changes: ``seconds`` is the wall time since the start of the first row, ``simulated`` the
+        simulated environment steps, ``substeps`` the simulated substeps, all at the end of the row;
+        ``best_score`` is the score of the best actions so far; ``episodes`` counts the row's own, too, so
+        that it starts at 1.
     """
-    columns = ("task", "variant", "method", "seed")
-    names = [
-        dict(zip(columns, map(str, own), strict=True))
-        for own in runs.table[list(columns)].itertuples(index=False, name=None)
-    ]
+    names = runs.table[["task", "variant", "method", "seed"]].astype(str).to_dict("records")
     found = map(rows_on_axes, runs.configs, read_curves(runs.table["path"]))
     return list(zip(names, found, strict=True))
 
@@ -75,7 +77,7 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> 
     """Return the iterations of a run that has been read as :func:`load_series` does."""
     rows = {str(name): np.asarray(iterations[name]) for name in iterations}
     sim, known = config["sim"], known_family(config["method"]["family"])
-    simulated = np.sum([rows[name] for name in BUDGETS], axis=0)
+    simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
     if known is not None and known.ranking == "score":
         best = np.maximum.accumulate(rows["score"])
     else:
@@ -93,14 +95,14 @@ def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> 
 
 
 def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None = 0.0) -> Band | None:
-    """Return mean and spread of a column over runs, between where all have begun and the first one ends; a
+    """Return mean and spread of a column over runs, from where all have begun to where the first one ends; a
     run that is solved keeps its score.
 
     Args:
-        tables: Rows of each run.
+        tables: Iterations of each run.
         axis: One of :data:`AXES`.
-        column: What to take.
-        floor: Lower values of a run count as this, as in the paper's figures; None: they stay.
+        column: Column of the values.
+        floor: Lower values of a run count as this, as in the paper's figures; None keeps them.
 
     Returns:
         The band on the union of the runs' points, between which their values are interpolated; None without
@@ -119,7 +121,31 @@ def band(tables: Sequence[Rows], axis: str, column: str, *, floor: float | None 
     if not len(x):
         return None
     if len(x) > _POINTS:
-        # As many as can be seen, evenly spread on a logarithmic axis.
+        # Evenly spread on a logarithmic axis.
         x = x[np.unique(np.searchsorted(x, np.geomspace(x[0], x[-1], _POINTS)).clip(max=len(x) - 1))]
     values = np.stack([np.interp(x, own, y if floor is None else np.maximum(y, floor)) for own, y in curves])
     return Band(x, values.mean(axis=0), values.std(axis=0), len(curves))
+
+
+# ---------------------------------------------------------------------------------------------- equal budgets
+
+
+def scores_at(table: Rows, budgets: np.ndarray, column: str = "best_score") -> np.ndarray:
+    """Return a column of a run at some budgets [environment steps], NaN before its first row."""
+    row = np.searchsorted(np.asarray(table["simulated"], float), budgets, side="right") - 1
+    return np.where(row < 0, np.nan, np.asarray(table[column], float)[row])
+
+
+def strata_of(series: Series, task: str) -> Mapping[str, list[list[Rows]]]:
+    """Return the iterations of a task's runs by method, those of one variant in a list."""
+    found: dict[str, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
+    for names, table in series:
+        if names["task"] == task and len(table["simulated"]):
+            found[names["method"]][names["variant"]].append(table)
+    return {name: list(variants.values()) for name, variants in found.items()}
+
+
+def at_budgets(strata: Sequence[Sequence[Rows]], budgets: np.ndarray) -> list[Interval]:
+    """Return the mean score of some runs, by variant in ``strata``, at each budget."""
+    values = [np.stack([scores_at(table, budgets) for table in runs]) for runs in strata]
+    return [stratified_mean([summarise(own[:, k]) for own in values]) for k in range(len(budgets))]

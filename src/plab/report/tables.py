@@ -1,4 +1,4 @@
-"""The tables of scores: IoU per task and per configuration, solvability."""
+"""Tables of results: scores per task and configuration, solvability, equal budgets, times per step."""
 
 from __future__ import annotations
 
@@ -13,22 +13,13 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from plab.config.suite import SUITE_VARIANTS
+from plab.families import GRADIENT, RL
 from plab.report.collect import Runs
-from plab.report.methods import GRADIENT, RL, method
-from plab.report.reference import PAPER_SEED_COUNT, paper_table
+from plab.report.formats import NOTHING, Table, mean_and_std, number
+from plab.report.methods import method
+from plab.report.reference import PAPER_SEED_COUNT, origin, paper_table
+from plab.report.series import BUDGETS, Series, at_budgets, scores_at, strata_of
 from plab.report.statistics import CONFIDENCE, Interval, Summary, stratified_difference, summarise
-from plab.report.table import NOTHING, Table, mean_and_std, number
-
-__all__ = [
-    "INTERVAL",
-    "difference",
-    "ends",
-    "iou_per_configuration",
-    "iou_per_task",
-    "ordered_tasks",
-    "settings_note",
-    "solvability",
-]
 
 _INCOMPLETE = "A cell with fewer runs than expected says how many it holds; it is never bold, nor its rivals."
 _BOLD = "Bold: best RL method and best gradient method."
@@ -37,6 +28,8 @@ _DIFFERENCE = (
     f"{CONFIDENCE:.0%} interval of Welch's t, its variance estimated within variants on both sides; no "
     "interval where a variant has one run."
 )
+INTERVAL = f"{CONFIDENCE:.0%} interval"
+"""Heading of intervals."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +37,8 @@ class Cell:
     """A number of a table.
 
     Attributes:
-        summary: What the runs gave.
-        expected: How many runs there should be.
+        summary: Mean, spread and number of the runs.
+        expected: How many runs there should be; 0 in the paper's tables.
     """
 
     summary: Summary
@@ -65,12 +58,18 @@ class Cell:
         text = mean_and_std(self.summary)
         return text if self.complete else f"{text} ({count})"
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Values by column of a CSV file."""
+        values = {"mean": self.summary.mean, "std": self.summary.std, "runs": self.summary.count}
+        return values | ({"expected": self.expected} if self.expected else {})
+
 
 class Cells:
     """Scores by task, variant and method, of our runs or of the paper's.
 
     Attributes:
-        source: Where the numbers come from, ``ours`` or ``paper``.
+        source: Origin of the numbers, ``ours`` or ``paper``.
     """
 
     def __init__(self, source: str, runs: Runs) -> None:
@@ -81,16 +80,14 @@ class Cells:
             runs: Our runs; also says what is asked for.
         """
         self.source, self._runs = source, runs
-        self._scores: dict[tuple[str, str, str], np.ndarray] = {}
-        if source == "ours":
-            for key, own in runs.table.groupby(["task", "variant", "method"]):
-                self._scores[key] = own["score"].to_numpy(float)
+        groups = runs.table.groupby(["task", "variant", "method"])["score"] if source == "ours" else ()
+        self._scores = {key: own.to_numpy(float) for key, own in groups}
 
     def cell(self, key: tuple[str, ...], name: str) -> Cell:
         """Return the cell of a task and variant, or of a task over all variants, and a method."""
-        task, *variant = key
         if self.source == "paper":
             return Cell(_printed((*key, name)), 0)
+        task, *variant = key
         variants = variant or self._runs.variants
         scores: list[ArrayLike] = [self._scores.get((task, one, name), []) for one in variants]
         return Cell(summarise(np.concatenate(scores)), len(variants) * len(self._runs.seeds))
@@ -111,10 +108,35 @@ def _numbers_of_paper(name: str) -> Mapping[tuple[str, ...], tuple[float, float]
     return {tuple(key): (mean, std) for *key, mean, std in rows}
 
 
+def _in_paper(name: str) -> bool:
+    return any(key[-1] == (method(name).of or name) for key in _numbers_of_paper("iou_per_task"))
+
+
 def ordered_tasks(tasks: Sequence[str]) -> list[str]:
     """Return tasks in the paper's order, others after them."""
     papers = list(dict.fromkeys(paper_table("iou_per_configuration")["task"]))
     return sorted(tasks, key=lambda task: (papers.index(task) if task in papers else len(papers), task))
+
+
+def settings_note(runs: Runs) -> list[str]:
+    """Return sentences on protocol and settings where these are not plab's own."""
+    protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
+    if not runs.unusual:
+        return protocol
+    shown = list(map(str, runs.unusual[:6]))
+    more = len(runs.unusual) - len(shown)
+    other = "the protocol's own" if protocol else "plab's own"
+    return [
+        *protocol,
+        f"Settings other than {other}: {'; '.join(shown)}{f'; and {more} more' if more else ''}.",
+    ]
+
+
+def ends(interval: Interval, decimals: int = 2) -> str:
+    """Write the ends of an interval, a dash if there are none."""
+    if np.isnan(interval.low):
+        return NOTHING
+    return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
 
 
 # -------------------------------------------------------------------------------------------- incremental IoU
@@ -146,94 +168,62 @@ def difference(
     )
 
 
-_OWNER = {"ours": "plab", "paper": "the paper"}
-
-
 def _iou_tables(runs: Runs, unit: str, what: str, keys: list[tuple[str, ...]]) -> list[Table]:
     """Return the three forms of a table of scores.
 
     Args:
         runs: Our runs.
-        unit: What there is a row per: ``task`` or ``configuration``.
+        unit: Unit of a row: ``task`` or ``configuration``.
         what: What means and spreads are taken over.
-        keys: What a row is about: task, or task and variant.
+        keys: Task, or task and variant, of each row.
     """
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
-    names = ("task", "variant")[: 1 if unit == "task" else 2]
-    notes = [f"Mean ± standard deviation {what}.", _BOLD]
-    sources = {form: Cells(form, runs) for form in _OWNER}
+    columns = ("task", "variant")[: 1 if unit == "task" else 2]
+    ours, paper = Cells("ours", runs), Cells("paper", runs)
+    printed = [m for m in runs.methods if _in_paper(m)]
     made = []
-    for form, more in (("ours", [_INCOMPLETE, *settings_note(runs)]), ("paper", [])):
-        methods = runs.methods if form == "ours" else [m for m in runs.methods if _in_paper(m)]
-        grid = [[sources[form].cell(key, m) for m in methods] for key in keys]
-        cells, data = _laid_out(grid, form, names, keys, methods)
-        bold = np.array([[False] * len(names) + _best(line, methods) for line in grid])
-        heading = f"{title}, {_OWNER[form]}"
-        made.append(Table(name, form, heading, cells, data, bold, notes + more, len(keys) > 40))
-    compared, data = _compared(runs, names, keys, sources["ours"], sources["paper"])
-    notes = [_DIFFERENCE, *settings_note(runs)]
-    return [*made, Table(name, "comparison", f"{title}, compared", compared, data, None, notes, True)]
-
-
-def _laid_out(
-    grid: list[list[Cell]],
-    form: str,
-    names: tuple[str, ...],
-    keys: list[tuple[str, ...]],
-    methods: Sequence[str],
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return a table's texts, a row per key, and its numbers, a row per key and method."""
-    cells = pd.DataFrame(
-        [[cell.text for cell in line] for line in grid], columns=[method(m).label for m in methods]
-    )
-    if form == "paper":
-        cells = cells.replace("0/0", NOTHING)
-    for position, column in enumerate(names):
-        cells.insert(position, column, [key[position] for key in keys])
-    data = [
-        dict(zip(names, key, strict=True)) | {"method": m} | _numbers(cell, form)
-        for key, line in zip(keys, grid, strict=True)
-        for m, cell in zip(methods, line, strict=True)
-    ]
-    return cells, pd.DataFrame(data)
-
-
-def _compared(
-    runs: Runs, names: tuple[str, ...], keys: list[tuple[str, ...]], ours: Cells, paper: Cells
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return our scores beside the paper's, as texts and as numbers."""
-    cells, data = [], []
+    for cells, owner, methods, more in (
+        (ours, "plab", runs.methods, [_INCOMPLETE, *settings_note(runs)]),
+        (paper, "the paper", printed, []),
+    ):
+        grid = [[cells.cell(key, m) for m in methods] for key in keys]
+        shown = pd.DataFrame([[cell.text for cell in line] for line in grid], columns=_labels(methods))
+        shown = shown.replace("0/0", NOTHING)
+        for position, column in enumerate(columns):
+            shown.insert(position, column, [key[position] for key in keys])
+        data = [
+            dict(zip(columns, key, strict=True)) | {"method": m} | cell.numbers
+            for key, line in zip(keys, grid, strict=True)
+            for m, cell in zip(methods, line, strict=True)
+        ]
+        bold = np.array([[False] * len(columns) + _best(line, methods) for line in grid])
+        notes = [f"Mean ± standard deviation {what}.", _BOLD, *more]
+        heading = f"{title}, {owner}"
+        made.append(
+            Table(name, cells.source, heading, shown, pd.DataFrame(data), bold, notes, len(keys) > 40)
+        )
+    compared, data = [], []
     for key in keys:
-        where = dict(zip(names, key, strict=True))
-        for m in filter(_in_paper, runs.methods):
+        where = dict(zip(columns, key, strict=True))
+        for m in printed:
             mine, theirs = ours.cell(key, m), paper.cell(key, m)
             gap = difference(ours, paper, runs.variants, key, m)
-            shown = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
-            cells.append(where | {"method": method(m).label} | shown | {INTERVAL: ends(gap)})
-            printed = {f"paper_{k}": v for k, v in _numbers(theirs, "paper").items()}
+            texts = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
+            compared.append(where | {"method": method(m).label} | texts | {INTERVAL: ends(gap)})
+            own = {f"paper_{k}": v for k, v in theirs.numbers.items()}
             gaps: dict[str, Any] = {"difference": gap.value, "low": gap.low, "high": gap.high}
-            data.append(where | {"method": m} | _numbers(mine, "ours") | printed | gaps)
-    return pd.DataFrame(cells), pd.DataFrame(data)
+            data.append(where | {"method": m} | mine.numbers | own | gaps)
+    notes = [_DIFFERENCE, *settings_note(runs)]
+    shown, title = pd.DataFrame(compared), f"{title}, compared"
+    return [*made, Table(name, "comparison", title, shown, pd.DataFrame(data), None, notes, True)]
 
 
-INTERVAL = f"{CONFIDENCE:.0%} interval"
-"""Heading of intervals."""
-
-
-def ends(interval: Interval, decimals: int = 2) -> str:
-    """Write the ends of an interval, a dash if there are none."""
-    if np.isnan(interval.low):
-        return NOTHING
-    return f"[{number(interval.low, decimals, sign=True)}, {number(interval.high, decimals, sign=True)}]"
-
-
-def _numbers(cell: Cell, form: str) -> dict[str, float]:
-    values = {"mean": cell.summary.mean, "std": cell.summary.std, "runs": cell.summary.count}
-    return values | ({"expected": cell.expected} if form == "ours" else {})
+def _labels(methods: Sequence[str]) -> list[str]:
+    return [method(name).label for name in methods]
 
 
 def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
-    """Say which cells are the best of their kind of method, as printed; none where one is incomplete."""
+    """Return which cells are the best of their kind of method, as printed; none where one is incomplete."""
     best = [False] * len(line)
     for kind in (RL, GRADIENT):
         rivals = [
@@ -249,94 +239,220 @@ def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
     return best
 
 
-def _in_paper(name: str) -> bool:
-    return any(key[-1] == (method(name).of or name) for key in _numbers_of_paper("iou_per_task"))
-
-
-def settings_note(runs: Runs) -> list[str]:
-    """Say how the runs were made where that is not plab's own way."""
-    protocol = [] if runs.protocol == "plab" else [f"Protocol: {runs.protocol}."]
-    if not runs.unusual:
-        return protocol
-    shown = list(map(str, runs.unusual[:6]))
-    more = len(runs.unusual) - len(shown)
-    other = "the protocol's own" if protocol else "plab's own"
-    return [
-        *protocol,
-        f"Settings other than {other}: {'; '.join(shown)}{f'; and {more} more' if more else ''}.",
-    ]
-
-
 # ------------------------------------------------------------------------------------------------ solvability
-
-
-def solvability(runs: Runs) -> list[Table]:
-    """Return what the reference demonstrations reach beside the best method of the paper."""
-    with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
-        known = pd.read_csv(file, dtype={"variant": str}).set_index(["task", "variant"])["score"]
-    paper = paper_table("iou_per_configuration")
-    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
-    rows = []
-    for key in _configurations(runs):
-        score = float(known.get(key, np.nan))
-        theirs = summarise([])
-        if key in best.index:
-            theirs = Summary(
-                float(best.loc[key, "iou_mean"]), float(best.loc[key, "iou_std"]), PAPER_SEED_COUNT
-            )
-        # A replay has no spread: all of the interval is the paper's.
-        gap = stratified_difference([Summary(score, 0.0, 0 if np.isnan(score) else 2)], [theirs])
-        name = best.loc[key, "method"] if theirs.count else ""
-        rows.append(
-            {"task": key[0], "variant": key[1], "score": score, "paper_method": name}
-            | {"paper_mean": theirs.mean, "paper_std": theirs.std}
-            | {"difference": gap.value, "low": gap.low, "high": gap.high}
-        )
-    data = pd.DataFrame(rows)
-    return [
-        _solvability_grid(data, "ours", "score", "What the reference demonstrations reach", []),
-        _solvability_grid(
-            data, "paper", "paper_mean", "What the best method of the paper reaches", ["Mean over seeds."]
-        ),
-        _solvability_compared(data),
-    ]
-
 
 _DEMONSTRATIONS = "Normalised incremental IoU of the best actions known, replayed in the hard contact model."
 
 
-def _solvability_grid(data: pd.DataFrame, form: str, column: str, title: str, notes: list[str]) -> Table:
-    grid = data.pivot(index="task", columns="variant", values=column).loc[list(dict.fromkeys(data["task"]))]
-    cells = grid.map(number).rename(columns=lambda variant: f"variant {variant}").reset_index()
-    cells.columns.name = None
-    columns = ["task", "variant", column, *(["paper_method"] if form == "paper" else [])]
-    own = [_DEMONSTRATIONS] if form == "ours" else notes
-    return Table("solvability", form, title, cells, data[columns], notes=own)
-
-
-def _solvability_compared(data: pd.DataFrame) -> Table:
-    cells = [
-        {
-            "task": row.task,
-            "variant": row.variant,
-            "demonstration": number(row.score),
-            "paper, best method": _printed_best(row),
-            "difference": number(row.difference, sign=True),
-            INTERVAL: ends(Interval(row.difference, row.low, row.high)),
-        }
-        for row in data.itertuples()
-    ]
+def solvability(runs: Runs) -> list[Table]:
+    """Return what the reference demonstrations reach beside the best method of the paper."""
+    known = demonstration_scores().set_index(["task", "variant"])["score"]
+    paper = paper_table("iou_per_configuration")
+    best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
+    rows, cells = [], []
+    for key in _configurations(runs):
+        score = float(known.get(key, np.nan))
+        theirs, name, printed = summarise([]), "", NOTHING
+        if key in best.index:
+            name = best.loc[key, "method"]
+            mean, std = float(best.loc[key, "iou_mean"]), float(best.loc[key, "iou_std"])
+            theirs = Summary(mean, std, PAPER_SEED_COUNT)
+            printed = f"{mean_and_std(theirs)} ({method(name).label})"
+        # A replay has no spread: all of the interval is the paper's.
+        gap = stratified_difference([Summary(score, 0.0, 0 if np.isnan(score) else 2)], [theirs])
+        which = {"task": key[0], "variant": key[1]}
+        rows.append(
+            which
+            | {"score": score, "paper_method": name, "paper_mean": theirs.mean, "paper_std": theirs.std}
+            | {"difference": gap.value, "low": gap.low, "high": gap.high}
+        )
+        shown = {"demonstration": number(score), "paper, best method": printed}
+        cells.append(which | shown | {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)})
+    data = pd.DataFrame(rows)
     notes = [
         _DEMONSTRATIONS,
         "Our targets are made from their parameters or by scripts, the paper's are files, so the two columns "
         "judge somewhat different goals. The interval is Student's t over the paper's seeds.",
     ]
-    title = "Demonstrations beside the best method of the paper"
-    return Table("solvability", "comparison", title, pd.DataFrame(cells), data, None, notes, True)
+    title, theirs_title = (
+        "What the reference demonstrations reach",
+        "What the best method of the paper reaches",
+    )
+    compared = "Demonstrations beside the best method of the paper"
+    return [
+        _solvability_grid(data, "ours", "score", title, _DEMONSTRATIONS),
+        _solvability_grid(data, "paper", "paper_mean", theirs_title, "Mean over seeds."),
+        Table("solvability", "comparison", compared, pd.DataFrame(cells), data, None, notes, True),
+    ]
 
 
-def _printed_best(row: Any) -> str:
-    if not row.paper_method:
-        return NOTHING
-    printed = Summary(row.paper_mean, row.paper_std, PAPER_SEED_COUNT)
-    return f"{mean_and_std(printed)} ({method(row.paper_method).label})"
+def demonstration_scores() -> pd.DataFrame:
+    """Return the scores of the reference demonstrations, columns task, variant and score."""
+    with (files("plab.demonstrations") / "scores.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file, dtype={"variant": str})
+
+
+def _solvability_grid(data: pd.DataFrame, form: str, column: str, title: str, note: str) -> Table:
+    grid = data.pivot(index="task", columns="variant", values=column).loc[list(dict.fromkeys(data["task"]))]
+    cells = grid.map(number).rename(columns=lambda variant: f"variant {variant}").reset_index()
+    cells.columns.name = None
+    columns = ["task", "variant", column, *(["paper_method"] if form == "paper" else [])]
+    return Table("solvability", form, title, cells, data[columns], notes=[note])
+
+
+# ---------------------------------------------------------------------------------------------- equal budgets
+
+BUDGET_NOTES = [
+    "Score of the best actions found within a budget of simulated environment steps, those with a gradient "
+    "counted like those without. Rows of planners and RL methods are of the hard contact model, those of "
+    "gradient methods of that of their rollouts.",
+    f"Mean over the variants; {CONFIDENCE:.0%} interval of Student's t, its variance estimated over the "
+    "seeds of each variant: none where a variant has one run.",
+    "A run that has ended keeps its score. A method has no score before all of its runs have a row.",
+]
+
+
+def score_at_budget(runs: Runs, series: Series) -> list[Table]:
+    """Return the table of scores at equal budgets, a row per task and method."""
+    budgets, rows, cells = np.array(BUDGETS), [], []
+    for task in ordered_tasks(runs.tasks):
+        strata = strata_of(series, task)
+        for name in (one for one in runs.methods if one in strata):
+            tables = [table for own in strata[name] for table in own]
+            spent = np.mean([scores_at(table, budgets, "seconds") for table in tables], axis=0)
+            what, texts = {"task": task, "method": name, "runs": len(tables)}, {}
+            for budget, one, seconds in zip(budgets, at_budgets(strata[name], budgets), spent, strict=True):
+                interval = "" if np.isnan(one.low) else f" [{number(one.low)}, {number(one.high)}]"
+                texts[f"{budget:,.0f} steps"] = number(one.value) + interval
+                rows.append(what | {"steps": budget, "score": one.value, "low": one.low, "high": one.high})
+                rows[-1]["seconds"] = seconds
+            cells.append({"task": task, "method": method(name).label, "runs": str(len(tables)), **texts})
+    columns = ["task", "method", "runs", *(f"{budget:,.0f} steps" for budget in budgets)]
+    shown = pd.DataFrame(cells, columns=columns)
+    data = pd.DataFrame(rows, columns=["task", "method", "runs", "steps", "score", "low", "high", "seconds"])
+    notes = [*BUDGET_NOTES, *settings_note(runs)]
+    return [Table("score_at_budget", "ours", "Score at equal budgets", shown, data, notes=notes, long=True)]
+
+
+# ----------------------------------------------------------------------------------------------------- timing
+
+_BENCHMARK = (
+    ("forward_ms", "forward", "forward_ms"),
+    ("gradient_ms", "forward + backward", "forward_backward_ms"),
+)
+"""Column of the benchmark's file, what it measures, and the paper's column."""
+
+_TIMES = (
+    "Milliseconds per environment step of one environment, mean ± standard deviation, measured by "
+    "the runs themselves, without building and compiling; runs computed in one batch, of which each has its "
+    "share, count once (in brackets: how many measurements). "
+    "Gradient methods: forward, backward, measures, update. RL: simulation, loss and learning, without "
+    "evaluations."
+)
+
+
+def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
+    """Return times per environment step and task: ours, the paper's, and the two compared.
+
+    Args:
+        runs: Our runs.
+        benchmark: What ``python -m plab.bench.speed --paper --csv`` measured, or None.
+    """
+    tasks, steps, paper = (
+        ordered_tasks(runs.tasks),
+        _step_times(runs),
+        paper_table("timing").set_index("task"),
+    )
+    cells, data, compared = [], [], []
+    for task in tasks:
+        own = steps[steps["task"] == task]
+        for device in sorted(set(own["device"])) or [NOTHING]:
+            shown = {"task": task, "device": device}
+            for kind, title in (("gradient", "gradient methods [ms]"), ("training", "RL [ms]")):
+                chosen = own[(own["device"] == device) & (own["kind"] == kind)]
+                # Runs of one batch have equal shares of the same time: one measurement.
+                ms = np.unique(chosen["ms"].to_numpy(float).round(9))
+                mine = summarise(ms)
+                shown[title] = _measured(mine)
+                numbers = {"ms": mine.mean, "std": mine.std, "measurements": mine.count}
+                data.append({"task": task, "device": device, "kind": kind} | numbers)
+                if kind == "gradient" and task in paper.index and len(ms):
+                    printed = float(paper.loc[task, "forward_backward_ms"])
+                    compared.append(_time_row(task, f"runs, {device}", "forward + backward", ms, printed))
+            cells.append(shown)
+        for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
+            where = [row["device"], *([row["precision"]] if "precision" in row else [])]
+            where = f"benchmark, {', '.join(where)}, batch {row['batch']}"
+            for column, kind, name in _BENCHMARK:
+                compared.append(
+                    _time_row(task, where, kind, np.array([row[column]]), float(paper.loc[task, name]))
+                )
+    theirs = paper.loc[[task for task in tasks if task in paper.index]].reset_index()
+    printed_cells = {"task": theirs["task"], "forward [ms]": theirs["forward_ms"].map(number)}
+    printed_cells["forward + backward [ms]"] = theirs["forward_backward_ms"].map(number)
+    title, notes = "Time per environment step", [_TIMES, *settings_note(runs)]
+    shown, numbers = pd.DataFrame(cells), pd.DataFrame(data)
+    papers = ["On a GTX 1080 Ti."]
+    return [
+        Table("timing", "ours", f"{title}, plab", shown, numbers, notes=notes),
+        Table("timing", "paper", f"{title}, the paper", pd.DataFrame(printed_cells), theirs, notes=papers),
+        _compared_times(compared, [*origin(benchmark), *settings_note(runs)]),
+    ]
+
+
+def _step_times(runs: Runs) -> pd.DataFrame:
+    """Return task, device, kind and milliseconds per environment step of each run."""
+    table = runs.table
+    if table.empty:
+        return pd.DataFrame(columns=["task", "device", "kind", "ms"])
+    family, horizon = table["method.family"], table["sim.horizon"].astype(float)
+    kind = family.map({"trajectory": "gradient", "rl": "training"})
+    # A run's first iteration counts as compilation.
+    steps = np.where(kind == "gradient", table["iterations"] - 1, table["method.episodes"]) * horizon
+    optimise = table.get("seconds_optimise", pd.Series(np.nan, table.index))
+    ms = 1e3 * optimise / np.where(steps > 0, steps, np.nan)
+    device = [
+        f"{device}, {batch:.0f} runs at once" if batch > 1 else device
+        for device, batch in zip(table["device"], table["batch"], strict=True)
+    ]
+    return pd.DataFrame({"task": table["task"], "device": device, "kind": kind, "ms": ms}).dropna()
+
+
+def _time_row(task: str, where: str, kind: str, ms: np.ndarray, theirs: float) -> dict[str, Any]:
+    # The paper gives no spread: all of the interval is ours.
+    gap = stratified_difference([summarise(ms)], [Summary(theirs, 0.0, 2)])
+    mean = float(ms.mean())
+    return {
+        **{"task": task, "measured": where, "what": kind, "measurements": len(ms)},
+        **{"ms": mean, "std": float(ms.std()), "paper_ms": theirs},
+        **{"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": theirs / mean},
+    }
+
+
+def _measured(ms: Summary) -> str:
+    return f"{mean_and_std(ms)} ({ms.count})" if ms.count else NOTHING
+
+
+def _compared_times(rows: Sequence[dict[str, Any]], more: list[str]) -> Table:
+    columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
+    cells = [
+        (
+            *(row[name] for name in ("task", "what", "measured")),
+            _measured(Summary(row["ms"], row["std"], row["measurements"])),
+            number(row["paper_ms"]),
+            number(row["difference"], sign=True),
+            ends(Interval(row["difference"], row["low"], row["high"])),
+            number(row["ratio"], 1),
+        )
+        for row in rows
+    ]
+    notes = [
+        _TIMES,
+        "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
+        "measurements, for the paper gives no spread.",
+        *more,
+    ]
+    data = pd.DataFrame(rows, columns=None if rows else ["task", "measured", "what", "measurements", "ms"])
+    shown = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
+    title = "Time per environment step, compared"
+    return Table("timing", "comparison", title, shown, data, None, notes, True)

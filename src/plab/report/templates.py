@@ -7,8 +7,6 @@ from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-__all__ = ["asset", "render"]
-
 _OWN = "plab.report"
 
 

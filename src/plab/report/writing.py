@@ -1,4 +1,4 @@
-"""All tables and all figures, written with what they were made from."""
+"""Files of all tables and all figures, with their origin."""
 
 from __future__ import annotations
 
@@ -10,18 +10,14 @@ import pandas as pd
 
 import plab
 from plab.report.agreement import agreement
-from plab.report.budgets import score_at_budget
 from plab.report.collect import Ablation, Runs
+from plab.report.formats import Table, write_index, write_table
 from plab.report.hyperparameters import hyperparameters
 from plab.report.series import load_rows, load_series
-from plab.report.table import Table, write_index, write_table
-from plab.report.tables import iou_per_configuration, iou_per_task, solvability
-from plab.report.times import timing
+from plab.report.tables import iou_per_configuration, iou_per_task, score_at_budget, solvability, timing
 
 if TYPE_CHECKING:
     from plab.report.figures import Drawing
-
-__all__ = ["origin", "write_curves", "write_tables"]
 
 
 def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | None = None) -> list[Table]:
@@ -30,22 +26,21 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
     Args:
         runs: Our runs.
         out: Folder to write to.
-        command: What is given as the command that makes them.
+        command: Command that makes them, for their footers.
         benchmark: What ``python -m plab.bench.speed --paper --csv`` measured, or None.
 
     Returns:
         The tables.
     """
-    groups = (
-        iou_per_task(runs),
-        iou_per_configuration(runs),
-        agreement(runs),
-        timing(runs, benchmark),
-        solvability(runs),
-        score_at_budget(runs, load_series(runs)),
-        hyperparameters(),
-    )
-    tables = [table for group in groups for table in group]
+    tables = [
+        *iou_per_task(runs),
+        *iou_per_configuration(runs),
+        *agreement(runs),
+        *timing(runs, benchmark),
+        *solvability(runs),
+        *score_at_budget(runs, load_series(runs)),
+        *hyperparameters(),
+    ]
     from_runs = origin(runs, command, deep=True)
     from_paper = {"command": command, "footer": [f"Made by: {command}"]}
     _write_runs(runs, out)
@@ -65,23 +60,15 @@ def write_curves(
         runs: Our runs.
         ablation: Runs that differ in the yield stress, or None.
         out: Folder to write to.
-        command: What is given as the command that makes them.
+        command: Command that makes them, for their metadata.
         errors: What ``python -m plab.bench.accuracy`` measured, or None.
 
     Returns:
         The figures.
     """
-    # Imported here: tables and the page need neither Matplotlib nor SciPy's statistics.
-    from plab.report.costs import work_precision
-    from plab.report.curves import (
-        aggregates,
-        agreement_plot,
-        budget_curves,
-        rewards,
-        rl_scores,
-        score_curves,
-        yield_ablation,
-    )
+    # Tables and the page need no Matplotlib.
+    from plab.report import curves
+    from plab.report.accuracy import work_precision
     from plab.report.figures import save, style
 
     drawings: list[Drawing] = []
@@ -89,25 +76,26 @@ def write_curves(
         if len(runs.table):
             series = load_series(runs)
             drawings += [
-                *rewards(runs, series),
-                *score_curves(runs, series),
-                budget_curves(runs, series),
-                *rl_scores(runs),
-                *agreement_plot(runs),
-                *aggregates(runs),
+                *curves.rewards(runs, series),
+                *curves.score_curves(runs, series),
+                curves.budget_curves(runs, series),
+                *curves.rl_scores(runs),
+                *curves.agreement_plot(runs),
+                *curves.aggregates(runs),
             ]
         if ablation is not None:
             groups = {value: [load_rows(path) for path in paths] for value, paths in ablation.paths.items()}
-            drawings += yield_ablation(groups, f"{ablation.task}-v{ablation.variant}", ablation.method)
-        if errors is not None:
-            drawings += [drawing for drawing in [work_precision(errors)] if drawing is not None]
+            what = f"{ablation.task}-v{ablation.variant}"
+            drawings += curves.yield_ablation(groups, what, ablation.method)
+        if errors is not None and (drawing := work_precision(errors)) is not None:
+            drawings.append(drawing)
         _write_runs(runs, out)
         save(drawings, out, origin(runs, command, deep=False))
     return drawings
 
 
 def origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
-    """Return what is said about where tables or figures come from; ``deep``: for files in a subfolder."""
+    """Return the origin of tables or figures; ``deep``: for files in a subfolder."""
     digest = runs.digest
     footer = [f"Made by: {command}", f"From {len(runs.table)} run(s), SHA-256 over them {digest}"]
     return {
@@ -115,16 +103,14 @@ def origin(runs: Runs, command: str, *, deep: bool) -> dict[str, Any]:
         "command": command,
         "plab": plab.__version__,
         "digest": digest,
-        "unfinished": runs.unfinished,
-        "others": runs.others,
-        "set_aside": runs.set_aside,
+        **{name: getattr(runs, name) for name in ("unfinished", "others", "set_aside")},
         "unusual": [vars(setting) for setting in runs.unusual],
         "runs": "../runs.json" if deep else "runs.json",
     }
 
 
 def _write_runs(runs: Runs, out: Path) -> None:
-    """Write which files the runs come from, once for all tables or figures."""
+    """Write the list of the runs' files, once for all tables or figures."""
     known = runs.table[["path", "config_hash"]].to_dict("records") if len(runs.table) else []
     out.mkdir(parents=True, exist_ok=True)
     (out / "runs.json").write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8", newline="\n")

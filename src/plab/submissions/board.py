@@ -12,9 +12,10 @@ from typing import Any
 
 from plab.config import Config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.report.budgets import BUDGETS
-from plab.report.methods import GRADIENT, method
+from plab.families import GRADIENT
+from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
+from plab.report.series import BUDGETS
 from plab.results import ResultsError, Row, config_dict
 from plab.results.examples import example_archive
 from plab.results.loading import readable_rows

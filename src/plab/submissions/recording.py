@@ -19,7 +19,7 @@ from plab.config import Config
 from plab.envs.core import EpisodeBatch
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
-from plab.report.budgets import BUDGETS
+from plab.report.series import BUDGETS
 from plab.results import ResultsError
 from plab.submissions.files import encode, write
 from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, SubmissionError, configuration_of
@@ -170,7 +170,7 @@ def record(env: Any, folder: str | Path) -> Any:
     """Record what an agent reaches, for ``python -m plab.submit``.
 
     Of each configuration a file in ``folder`` holds the actions of the best episode within each budget of
-    :data:`plab.report.budgets.BUDGETS` and of the best one of all, with the environment steps simulated until
+    :data:`plab.report.series.BUDGETS` and of the best one of all, with the environment steps simulated until
     then. All environments of one configuration in a process share it. It is written whenever an episode is
     better.
 

@@ -1,4 +1,4 @@
-"""What the report notebooks in ``reports/`` have in common: finding runs, showing tables and figures."""
+"""Functions for the cells of the report notebooks in ``reports/``: find runs, show tables and figures."""
 
 from __future__ import annotations
 
@@ -13,21 +13,16 @@ from IPython.display import HTML, Image, Markdown, display
 from plab.config.selection import select
 from plab.report.collect import NAMES, Runs, collect
 from plab.report.figures import Drawing, fix_layout, style
-from plab.report.measurements import Benchmark, measured
-from plab.report.table import Table, aligned
+from plab.report.formats import Table, aligned
+from plab.report.reference import Benchmark, measured
 from plab.results import ResultsError
 from plab.results.examples import measurements, resolve
 
-__all__ = ["benchmark", "gather", "say", "show_figure", "show_origin", "show_table"]
-
 _DPI = 180
+
 _COLOURS = {
-    "same": "same",
-    "higher": "good",
-    "lower": "bad",
-    "undecided": "unsure",
-    "too": "unsure",
-    "no": "nothing",
+    **{"same": "same", "higher": "good", "lower": "bad"},
+    **{"undecided": "unsure", "too": "unsure", "no": "nothing"},
 }
 """Class of a cell by the first word of its verdict."""
 
@@ -67,26 +62,20 @@ def say(text: str) -> None:
 
 def show_table(table: Table | pd.DataFrame, notes: Sequence[str] = ()) -> None:
     """Show a table of the report, or cells of text; verdicts are coloured."""
-    cells = table.cells if isinstance(table, Table) else table
-    notes = table.notes if isinstance(table, Table) else notes
-    bold = table.bold if isinstance(table, Table) else None
-    sides = ["number" if side == "r" else "" for side in aligned(cells)]
-    head = "".join(
-        f'<th class="{side}">{escape(str(name))}</th>'
-        for name, side in zip(cells.columns, sides, strict=True)
-    )
-    body = "".join(
-        "<tr>"
-        + "".join(_cell(text, bold is not None and bold[r, c], sides[c]) for c, text in enumerate(line))
-        + "</tr>"
-        for r, line in enumerate(cells.to_numpy(dtype=str))
-    )
+    whole = table if isinstance(table, Table) else Table("", "", "", table, table, notes=list(notes))
+    sides = ["number" if side == "r" else "" for side in aligned(whole.cells)]
+    names = zip(whole.cells.columns, sides, strict=True)
+    head = "".join(f'<th class="{side}">{escape(str(name))}</th>' for name, side in names)
+    body = ""
+    for r, line in enumerate(whole.cells.to_numpy(dtype=str)):
+        bold = [whole.bold is not None and whole.bold[r, c] for c in range(len(line))]
+        body += f"<tr>{''.join(map(_cell, line, bold, sides))}</tr>"
     html = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    display(HTML(html + f'<p class="note">{escape(" ".join(notes))}</p>'))
+    display(HTML(html + f'<p class="note">{escape(" ".join(whole.notes))}</p>'))
 
 
 def _cell(text: str, bold: bool, side: str) -> str:
-    kind = f"{_COLOURS.get(text.split(' ')[0], '') if text else ''} {side}".strip()
+    kind = f"{_COLOURS.get(text.split(' ')[0], '')} {side}".strip()
     shown = f"<b>{escape(text)}</b>" if bold else escape(text)
     return f'<td class="{kind}">{shown}</td>' if kind else f"<td>{shown}</td>"
 
@@ -106,7 +95,7 @@ def show_figure(drawing: Drawing | None) -> None:
 
 
 def benchmark(folder: str, which: Benchmark) -> pd.DataFrame | None:
-    """Return what a benchmark measured, or say what makes its file.
+    """Return the rows of a benchmark, or say what makes its file.
 
     Args:
         folder: Folder of the benchmarks' files; ``example`` is that which comes with plab.

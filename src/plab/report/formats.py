@@ -1,4 +1,4 @@
-"""A table for readers and one for programs, written as LaTeX, Markdown and CSV."""
+"""Formats of tables and numbers: LaTeX, Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ import numpy as np
 import pandas as pd
 
 from plab.report.statistics import Summary
-
-__all__ = ["MINUS", "NOTHING", "Table", "aligned", "mean_and_std", "number", "write_index", "write_table"]
-
 
 NOTHING = "\N{EN DASH}"
 """Stands where there is no number."""
