@@ -297,7 +297,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Compare settings with references, print, write the table and the diagrams."""
     import pandas as pd
 
-    from plab.report.costs import diagrams
+    from plab.report.accuracy import diagrams
     from plab.report.figures import save, style
 
     options = _options(argv)
