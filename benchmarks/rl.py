@@ -1,15 +1,14 @@
 """Where the time of reinforcement learning goes, and how it grows with the number of environments.
 
     python benchmarks/rl.py task=Move --methods ppo sac --envs 1 16
-    python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256 --agents 1
+    python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256
     python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --methods sac --agents 15 45
 
 prints a row per method and number of environments: transitions per second, and the milliseconds that each
 part takes per step of all environments; each is waited for before the next one begins. What runs is the
 training of plab.run, an update after every batch of episodes for ppo, in minibatches of the profile's size.
-With --agents it is populations, as in sweeps and wherever networks are on CUDA: the transitions per second
-are those of all agents together and of a training that waits for nothing, evaluations and states of
-checkpoints included, without their files.
+The transitions per second are those of all agents together and of a training that waits for nothing,
+evaluations and states of checkpoints included, without their files.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from __future__ import annotations
 import argparse
 import gc
 import itertools
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -29,20 +27,16 @@ from typing import Any
 
 import taichi as ti
 import torch
-from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.logger import Logger
 
 from plab.cli.tables import measure_table
 from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.families import FAMILIES
-from plab.runners.environments import torch_settings
-from plab.runners.population.agents import OffPolicyAgents
-from plab.runners.population.population import Population, population_settings
-from plab.runners.rl_trainer import Trainer
+from plab.runners.agents import OffPolicyAgents
+from plab.runners.rl import Population, population_settings
 
-__all__ = ["COLUMNS", "PARTS", "POPULATION", "measure", "measure_population", "rows"]
+__all__ = ["COLUMNS", "PARTS", "measure", "rows"]
 
 SIMULATOR_PARTS = (("step", "simulate"), ("measure", "judge"), ("observe", "observe"), ("poses", "observe"))
 """Methods of the simulator, and the parts that they are of."""
@@ -50,65 +44,24 @@ SIMULATOR_PARTS = (("step", "simulate"), ("measure", "judge"), ("observe", "obse
 PARTS = ("simulate", "judge", "observe", "policy", "update", "rest")
 """Simulator's step; loss and IoU; observations and their copy from the device; actions; learning."""
 
-POPULATION = (
+COLUMNS = (
     *("task", "device", "method", "agents", "num_envs", "steps_per_s", *(f"{p}_ms" for p in PARTS)),
     *("evaluate_s", "state_s", "agent_mb"),
 )
-"""Columns of populations: seconds of an evaluation of all, and of making all states; memory per agent, on
+"""Columns of the table: seconds of an evaluation of all, and of making all states; memory per agent, on
 CUDA what torch has at most, on the CPU its replay buffer."""
-
-COLUMNS = ("task", "device", "method", "num_envs", "threads", "steps_per_s", *(f"{p}_ms" for p in PARTS))
 
 
 def rows(
-    overrides: Sequence[str], trainings: Iterable[tuple[int | None, int, str]], batches: int
+    overrides: Sequence[str], trainings: Iterable[tuple[int, int, str]], batches: int
 ) -> Iterator[dict[str, object]]:
-    """Measure batches of trainings, given by the number of agents, None without a population, the number of
-    environments and the method; yield a row of :data:`POPULATION` or :data:`COLUMNS` for each."""
+    """Measure batches of trainings, given by the numbers of agents and of environments and the method; yield
+    a row of :data:`COLUMNS` for each."""
     for agents, num_envs, method in trainings:
-        cfg = _config(overrides, method, num_envs, batches, whole=agents is not None)
-        yield measure(cfg, batches) if agents is None else measure_population(cfg, agents, batches)
+        yield measure(_config(overrides, method, num_envs), agents, batches)
 
 
-def measure(cfg: Config, batches: int) -> dict[str, object]:
-    """Train for some batches of episodes and return a row of the table.
-
-    Args:
-        cfg: The configuration, of a reinforcement-learning method.
-        batches: Batches of episodes to time, after one that compiles the kernels.
-    """
-    seconds: dict[str, float] = defaultdict(float)
-    method, steps = cfg.method_as(RlConfig), batches * cfg.sim.horizon
-    with tempfile.TemporaryDirectory() as folder, torch_settings(method.torch_threads):
-        batch = EpisodeBatch([cfg] * method.num_envs, contact=method.contact)
-        trainer = Trainer(cfg, batch, Path(folder) / "replay", None)
-        trainer.model.set_logger(Logger(folder=None, output_formats=[]))
-        trainer.advance(CallbackList([]))
-        simulator, model = batch.problem.simulator, trainer.model
-        parts: list[tuple[Any, str, str]] = [(simulator, name, part) for name, part in SIMULATOR_PARTS]
-        parts += [(model, "train", "update"), (model, "predict", "policy")]
-        if getattr(model, "replay_buffer", None) is None:
-            # That of the off-policy methods is called by predict, which is timed already.
-            parts.append((model.policy, "forward", "policy"))
-        with _timing(parts, seconds):
-            start = time.perf_counter()
-            for _ in range(batches):
-                trainer.advance(CallbackList([]))
-            total = time.perf_counter() - start
-        trainer.close()
-        batch.close()
-    seconds["rest"] = total - sum(seconds.values())
-    return {
-        "task": cfg.task.name,
-        "device": f"{cfg.sim.device}/{method.torch_device}",
-        "method": method.name,
-        "num_envs": method.num_envs,
-        "threads": method.torch_threads,
-        "steps_per_s": round(steps * method.num_envs / total, 1),
-    } | {f"{part}_ms": round(seconds[part] / steps * 1e3, 2) for part in PARTS}
-
-
-def measure_population(cfg: Config, agents: int, batches: int) -> dict[str, object]:
+def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
     """Train a population for some batches of episodes, twice, and return a row of the table.
 
     Args:
@@ -195,12 +148,10 @@ def _synchronise() -> None:
         torch.cuda.synchronize()
 
 
-def _config(overrides: Sequence[str], method: str, num_envs: int, batches: int, *, whole: bool) -> Config:
-    """Return a training of a few batches of episodes, or of all, each followed by its share of updates."""
+def _config(overrides: Sequence[str], method: str, num_envs: int) -> Config:
+    """Return a training in which each batch of episodes is followed by its share of updates."""
     cfg = load_config([*overrides, f"method={method}", f"method.num_envs={num_envs}"])
     own = cfg.method_as(RlConfig)
-    if not whole:
-        own.episodes = num_envs * (batches + 1)
     if isinstance(own, OffPolicyConfig):
         # Learning begins with the batch that is timed.
         own.learning_starts = num_envs * cfg.sim.horizon
@@ -222,13 +173,12 @@ def main() -> None:
     methods = tuple(FAMILIES["rl"].rules)
     parser.add_argument("--methods", nargs="+", choices=methods, default=["ppo", "sac"], help="methods")
     parser.add_argument("--envs", type=int, nargs="+", default=[1, 16], help="numbers of environments")
-    parser.add_argument("--agents", type=int, nargs="+", help="numbers of agents of populations")
+    parser.add_argument("--agents", type=int, nargs="+", default=[1], help="numbers of agents")
     parser.add_argument("--batches", type=int, default=2, help="batches of episodes to time")
     parser.add_argument("--csv", type=Path, help="file to write the rows to")
     options = parser.parse_intermixed_args()
-    columns = POPULATION if options.agents else COLUMNS
-    trainings = itertools.product(options.agents or (None,), options.envs, options.methods)
-    measure_table(columns, rows(options.overrides, trainings, options.batches), options.csv)
+    trainings = itertools.product(options.agents, options.envs, options.methods)
+    measure_table(COLUMNS, rows(options.overrides, trainings, options.batches), options.csv)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,7 @@ from plab.config.selection import OBSERVED
 from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
-from plab.runners.environments import shared_batches
-from plab.runners.policy import Policy, load_policy
+from plab.runners.policy import Policy, load_policy, shared_batches
 from plab.runners.simulator_cache import SimulatorCache
 
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")

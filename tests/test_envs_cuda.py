@@ -11,7 +11,7 @@ from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem
-from plab.runners.population.graphs import CapturedUpdate
+from plab.runners.networks import CapturedUpdate
 from suite import make_not_finite
 
 COARSE = ["sim.grid_size=32", "sim.particles_scale=0.03", "sim.horizon=4", "sim.substeps=5"]

@@ -1,12 +1,11 @@
-"""Learning without a simulator: agents beside Stable-Baselines3, replay buffers, states as arrays."""
+"""Learning without a simulator: agents beside Stable-Baselines3, replay buffers, batches."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import deque
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,25 +15,21 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer as PlainBuffer
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from torch.distributions import normal
 
-import synthetic
-from plab.config import Config, load_config
-from plab.families import family
-from plab.results import read, write
-from plab.runners.environments import torch_settings
-from plab.runners.model_state import model_arrays, restore_model
-from plab.runners.population.agents import Agents
-from plab.runners.population.draws import Block
-from plab.runners.population.replay import ReplayBuffer, Sizes
-from plab.runners.replay import EpisodeReplay
-from plab.runners.rl_models import Spaces, model_kind
-from plab.runners.rl_trainer import scaled
+from plab.config import Config, OffPolicyConfig, load_config
+from plab.runners.agents import Agents, Block
+from plab.runners.policy import CLIP, Spaces, first_policy, torch_settings
+from plab.runners.replay import ReplayBuffer, Sizes
+from plab.runners.rl import agents_of
+from plab.runners.sb3 import off_policy
 from plab.sweep.plan import plan
 
 # ------------------------------------------------------------------------------- beside Stable-Baselines3
@@ -82,8 +77,7 @@ def learner(name: str, device: str = "cpu") -> tuple[Agents, list[Config]]:
     words = ["task=Move", f"sim.horizon={HORIZON}", f"method.num_envs={ENVS}", "method.episodes=16"]
     words += ["method.hidden=[8,8]", *LEARNERS[name]]
     cfgs = [load_config([*words, f"seed={seed}"]) for seed in range(3)]
-    kind = family("rl").agents(cfgs[0].method.algorithm)
-    return kind(cfgs, SPACES, torch.device(device)), cfgs
+    return agents_of(cfgs[0].method)(cfgs, SPACES, torch.device(device)), cfgs
 
 
 def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> dict[str, list[Any]]:
@@ -118,14 +112,67 @@ def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
         agents.learn(reward, last, now, over=over)
 
 
+class Observed(RunningMeanStd):
+    """Statistics of the observations of the very first start and of some transitions."""
+
+    def __init__(self, transitions: float) -> None:
+        super().__init__(shape=(OBSERVED,))
+        self._transitions = transitions
+
+    def update(self, arr: np.ndarray) -> None:
+        # The start's rows are no transitions, and a count begins a little above 0.
+        if self.count < self._transitions + 1.0:
+            super().update(arr)
+
+
+class Decay:
+    """A learning rate of which ``remaining`` says how much is left."""
+
+    def __init__(self, lr: float) -> None:
+        self.lr, self.remaining = lr, 1.0
+
+    def __call__(self, _: float) -> float:
+        return self.lr * self.remaining
+
+
 def library(cfg: Config, observations: np.ndarray, rewards: np.ndarray) -> BaseAlgorithm:
-    """Stable-Baselines3's model, as a single run would have it."""
-    truncates = getattr(cfg.method, "bootstrap", True)
+    """Stable-Baselines3's model with the method's numbers and first policy."""
+    m: Any = cfg.method
+    truncates = getattr(m, "bootstrap", True)
     env: VecEnv = DummyVecEnv(
         [lambda n=n: Script(observations[:, n], rewards[:, n].astype(float), truncates) for n in range(ENVS)]
     )
-    env = scaled(cfg, env) or env
-    model = model_kind("rl", cfg.method.algorithm).make(cfg.method, env, cfg.seed)
+    if isinstance(m, OffPolicyConfig):
+        kind, arguments = SAC, off_policy(m)
+        if m.algorithm == "td3":
+            noise = NormalActionNoise(np.zeros(ACTIONS), np.full(ACTIONS, m.exploration_noise))
+            smoothing = {"target_policy_noise": m.target_noise, "target_noise_clip": m.target_noise_clip}
+            kind, arguments = TD3, arguments | smoothing
+            arguments |= {"action_noise": noise, "policy_delay": m.policy_delay}
+    else:
+        if m.normalise:
+            env = VecNormalize(env, gamma=m.gamma, clip_obs=CLIP, clip_reward=CLIP)
+            few = m.statistics_episodes
+            env.obs_rms = Observed(math.inf if few is None else few * HORIZON)
+        steps = math.ceil(m.steps_per_update / ENVS)
+        options = {"net_arch": [*m.hidden], "activation_fn": torch.nn.Tanh}
+        kind = PPO
+        arguments = {
+            "learning_rate": Decay(m.lr) if m.lr_decay else m.lr,
+            "gamma": m.gamma,
+            "n_steps": steps,
+            "batch_size": math.ceil(steps * ENVS / m.minibatches),
+            "n_epochs": m.epochs,
+            "gae_lambda": m.gae_lambda,
+            "clip_range": m.clip_range,
+            "clip_range_vf": m.value_clip_range,
+            "vf_coef": m.value_coefficient,
+            "ent_coef": m.entropy_coefficient / (ACTIONS if m.entropy_mean else 1),
+            "max_grad_norm": m.max_gradient_norm,
+            "policy_kwargs": options | {"optimizer_kwargs": {"eps": m.adam_eps}},
+        }
+    model = kind("MlpPolicy", env, seed=cfg.seed, device="cpu", **arguments)
+    model.policy.load_state_dict(first_policy(m, SPACES, cfg.seed).state_dict())
     model.set_logger(Logger(folder=None, output_formats=[]))
     return model
 
@@ -271,97 +318,6 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
     check(again, 36)
     add(again, 36)
     check(again, 37)
-
-
-@pytest.mark.parametrize("buffer_size", [10_000, 24])
-def test_replay_buffer_of_a_single_run_samples_what_a_plain_one_does(tmp_path, buffer_size: int) -> None:
-    """The same transitions as Stable-Baselines3's buffer, which keeps next observations of their own."""
-    steps, envs, horizon = 40, 2, 4
-    sizes = {"horizon": horizon, "total_steps": steps, "spare_steps": horizon, "added": 0}
-    own = EpisodeReplay(buffer_size, *SPACES, n_envs=envs, path=str(tmp_path / "replay"), **sizes)
-    plain = PlainBuffer(min(buffer_size, steps * envs), *SPACES, "cpu", n_envs=envs)
-    rng = np.random.default_rng(0)
-    state = rng.normal(size=(envs, OBSERVED)).astype(np.float32)
-    for step in range(steps):
-        after, fresh = rng.normal(size=(2, envs, OBSERVED)).astype(np.float32)
-        action, reward = rng.normal(size=(envs, ACTIONS)), rng.normal(size=envs)
-        over = (step + 1) % horizon == 0
-        ends = np.full(envs, over), [{"TimeLimit.truncated": over}] * envs
-        for buffer in (own, plain):
-            buffer.add(state, after, action, reward, *ends)
-        state = fresh if over else after
-    assert own.size() == plain.size()
-    samples = [[np.asarray(part) for part in buffer.sample(4000)[:5]] for buffer in (own, plain)]
-    drawn, expected = (distinct(np.concatenate(parts, axis=1)) for parts in samples)
-    # Every transition is drawn, and nothing else.
-    assert len(drawn) == plain.size() * envs and np.array_equal(drawn, expected)
-
-
-# -------------------------------------------------------------------------------------- states as arrays
-
-
-def make_model(name: str, seed: int) -> BaseAlgorithm:
-    """An untrained model in an environment of Gymnasium's own."""
-    method = load_config(["task=Move", "method.hidden=[4]", *LEARNERS[name]]).method
-    env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])
-    return model_kind(method.family, method.algorithm).make(method, env, seed)
-
-
-def leaves(state: Any, place: str = "") -> dict[str, np.ndarray]:
-    """The arrays and numbers of a state by their places."""
-    if not isinstance(state, dict):
-        return {place: np.asarray(state)}
-    parts = (leaves(value, f"{place}/{name}") for name, value in state.items())
-    return {name: array for part in parts for name, array in part.items()}
-
-
-def assert_same_state(one: Any, other: Any) -> None:
-    """Assert that two states agree, bit for bit."""
-    first, second = leaves(one), leaves(other)
-    assert first.keys() == second.keys()
-    for name, array in first.items():
-        assert array.dtype == second[name].dtype and np.array_equal(array, second[name]), name
-
-
-@pytest.mark.parametrize("name", ["sac", "td3", "ppo"])
-def test_a_model_is_what_its_state_says(tmp_path: Path, name: str) -> None:
-    """There and back through a result file; the state is no window on the model."""
-    trained = make_model(name, 0)
-    trained.learn(30)
-    state, saved = model_arrays(trained), synthetic.run(tmp_path)
-    saved.resume = {"model": state}
-    write(saved, tmp_path / "run.partial.h5")
-    back = read(tmp_path / "run.partial.h5").resume["model"]
-    assert_same_state(state, back)
-    model = make_model(name, 1)
-    first, policy = model_arrays(model)["networks"]["policy"], state["networks"]["policy"]
-    assert all(not np.array_equal(first[key], policy[key]) for key in policy if key.endswith("weight"))
-    restore_model(model, back)
-    assert_same_state(model_arrays(model), state)
-    before = copy.deepcopy(back)
-    model.env.reset()
-    model.learn(20, reset_num_timesteps=False)
-    assert_same_state(back, before)
-    assert model.num_timesteps > 30
-
-
-def test_a_state_of_something_else_is_refused() -> None:
-    trained = make_model("td3", 0)
-    trained.learn(30)
-    state = model_arrays(trained)
-    weight = state["networks"]["policy"]["actor.mu.0.weight"]
-    for place, message, value in (
-        ("networks/policy/actor.mu.0.weight", r"weight has shape", weight[:1, :1]),
-        ("networks/policy/actor.mu.0.weight", "weight holds float64", weight.astype(np.float64)),
-        ("networks/policy/other.weight", r"other\.weight", np.zeros(3)),
-        ("optimizers/actor.optimizer/99", "parameter 99", {}),
-        ("values/_last_obs", "_last_obs has shape", np.zeros((1, 9), np.float32)),
-    ):
-        changed = copy.deepcopy(state)
-        *parents, last = place.split("/")
-        reduce(dict.__getitem__, parents, changed)[last] = value
-        with pytest.raises(ValueError, match=message):
-            restore_model(make_model("td3", 1), changed)
 
 
 # --------------------------------------------------------------------------------------------- who joins

@@ -8,32 +8,28 @@ import re
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from gymnasium.spaces import Box
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from plab.config import Config, load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
-from plab.families import FAMILIES, family
+from plab.families import FAMILIES
 from plab.objective import scores
 from plab.outcomes import Outcome
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
-from plab.runners import Job, RunError, _runner, rl, run_batch, run_config
+from plab.runners import RunError, run_batch, run_config, sb3
 from plab.runners.common import episode_columns
-from plab.runners.environments import evaluation, shared_batches
-from plab.runners.policy import load_policy, policy_path
-from plab.runners.population.population import Population
-from plab.runners.population.runner import PopulationRunner
-from plab.runners.rl import RlRunner
-from plab.runners.rl_models import LinearDecay, cycle_steps
-from plab.runners.rl_trainer import Trainer
+from plab.runners.policy import Spaces, evaluation, first_policy, load_policy, policy_path, shared_batches
+from plab.runners.rl import Population, agents_of
+from plab.runners.sb3 import Sb3Runner
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
 
@@ -76,6 +72,9 @@ OWN = [name for name in METHODS if name != "tqc"]
 
 RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3"))
 """A population: different in seed, material and scene."""
+
+STEPS = {"tqc": (sb3._Watch, "_on_step")}
+"""What makes a step of training, where it is not a population."""
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])
 
@@ -132,26 +131,19 @@ def batches_of(*cfgs: Config) -> list[EpisodeBatch]:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, RunResult]:
-    """An uninterrupted single run of each method, by Stable-Baselines3."""
-    folder = tmp_path_factory.mktemp("single")
-    return {method: run(make_config(folder, method)) for method in METHODS}
-
-
-@pytest.fixture(scope="module")
 def lone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[RunResult]]:
-    """Uninterrupted runs, each as a population of one."""
-    known = {method: configs(tmp_path_factory.mktemp("alone"), method) for method in OWN}
-    assert {status for cfgs in known.values() for cfg in cfgs for status in statuses([cfg])} == {"finished"}
-    return {method: [read(result_path(cfg)) for cfg in cfgs] for method, cfgs in known.items()}
+    """Uninterrupted single runs."""
+    folders = {method: tmp_path_factory.mktemp(method) for method in METHODS}
+    known = {method: [run(cfg) for cfg in configs(folders[method], method)] for method in OWN}
+    return known | {"tqc": [run(make_config(folders["tqc"], "tqc"))]}
 
 
 # ---------------------------------------------------------------- whole runs
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_rows_evaluation_and_policy_of_a_whole_run(finished: dict[str, RunResult], method: str) -> None:
-    result = finished[method]
+def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
+    result = lone[method][0]
     rows = result.iterations
     assert set(COLUMNS) | {"iteration", "episodes", "steps", "train_reward", "seconds"} <= set(rows.columns)
     assert rows["iteration"].tolist() == list(range(len(rows)))
@@ -174,10 +166,11 @@ def test_rows_evaluation_and_policy_of_a_whole_run(finished: dict[str, RunResult
     assert result.best_actions.shape == (HORIZON, 6) and np.abs(result.best_actions).max() <= 1
     for name in COLUMNS:
         assert result.evaluation[name] == pytest.approx(rows[name][best], rel=1e-5, abs=1e-6), name
-    # An episode of the kept policy is that of the last row, bit for bit.
+    # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
     _, judge = batches_of(make_config(result.path.parents[2], method))
-    done = evaluation(judge, load_policy(result.path))
-    assert {name: done.measures[name] for name in COLUMNS} == rows.iloc[-1][[*COLUMNS]].to_dict()
+    done, last = evaluation(judge, load_policy(result.path)), rows.iloc[-1]
+    for name, value in done.measures.items():
+        assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
 
 
 @pytest.mark.parametrize(
@@ -192,60 +185,37 @@ def test_a_population_is_that_many_populations_of_one(tmp_path: Path, lone, meth
         assert set(got.wall_time) == {"build", "compile", "optimise", "evaluate"}
         assert np.isfinite(got.iterations[1:].to_numpy()).all()
         events = EventAccumulator(str(got.path.with_suffix(".tensorboard"))).Reload()
-        names = family("rl").agents(method).LOSSES
+        names = agents_of(cfg.method).LOSSES
         losses.append([events.Scalars(f"train/{name}")[-1].value for name in names])
     assert np.isfinite(losses).all() and losses[0] != losses[1] != losses[2]
     assert len({tuple(result.iterations["loss"]) for result in results}) == 3
     assert_nothing_else_is_left(*results)
 
 
-@pytest.mark.parametrize("method", OWN)
-def test_a_population_begins_and_counts_as_a_single_run_does(finished, lone, method) -> None:
-    """The same first policy, the same rows, other random numbers."""
-    single, alone = finished[method], lone[method][0]
-    assert "population" not in single.provenance and alone.provenance["population"]
-    assert set(single.iterations) == set(alone.iterations)
-    counts = ["iteration", "episodes", "steps"]
-    pd.testing.assert_frame_equal(single.iterations[counts], alone.iterations[counts])
-    first = [result.iterations.iloc[0].drop("seconds") for result in (single, alone)]
-    pd.testing.assert_series_equal(*first, rtol=1e-4)
-    assert not np.allclose(single.iterations["loss"][1:], alone.iterations["loss"][1:], rtol=1e-9)
-    # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
-    _, judge = batches_of(make_config(alone.path.parents[2], method))
-    done, last = evaluation(judge, load_policy(alone.path)), alone.iterations.iloc[-1]
-    for name, value in done.measures.items():
-        assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
-
-
 # ---------------------------------------------------------------- models
 
-
-def trainer_of(cfg: Config, folder: Path) -> Trainer:
-    return Trainer(cfg, batches_of(cfg)[0], folder / "replay", None)
+SPACES = Spaces(Box(-1.0, 1.0, (40,), np.float32), Box(-1.0, 1.0, (6,), np.float32))
 
 
-def test_profiles_and_overrides_reach_the_model(tmp_path: Path) -> None:
+def test_profiles_and_overrides_reach_the_method(tmp_path: Path) -> None:
     values = {
         ("sac", "paper"): {"tau": 3e-4, "learning_starts": 1000, "batch_size": 256},
         ("sac", "release"): {"tau": 0.005, "learning_starts": 2500, "gradient_steps": -1},
-        ("td3", "release"): {"learning_starts": 2500, "policy_delay": 2, "target_policy_noise": 0.2},
-        ("ppo", "paper"): {"n_steps": 1024, "batch_size": 64, "ent_coef": 0.0, "vf_coef": 0.5},
-        # Of six components the mean entropy is a sixth of the sum.
-        ("ppo", "release"): {"n_steps": 1250, "batch_size": 79, "ent_coef": 0.01 / 6, "vf_coef": 0.25},
+        ("td3", "release"): {"learning_starts": 2500, "policy_delay": 2, "target_noise": 0.2},
+        ("ppo", "paper"): {"entropy_coefficient": 0.0, "value_coefficient": 0.5, "bootstrap": True},
+        ("ppo", "release"): {"entropy_coefficient": 0.01, "value_coefficient": 0.25, "bootstrap": False},
     }
     for (method, profile), expected in values.items():
-        words = [f"method={method}", f"method.profile={profile}"]
-        model = trainer_of(load_config([*COARSE, *words]), tmp_path).model
-        assert {name: getattr(model, name) for name in expected} == expected, (method, profile)
-    cfg = load_config([*COARSE, "method=sac", "method.profile=paper", "method.tau=0.25"])
-    model = trainer_of(cfg, tmp_path).model
-    assert (model.tau, model.learning_starts) == (0.25, 1000)
+        own = load_config(["task=Move", f"method={method}", f"method.profile={profile}"]).method
+        assert {name: getattr(own, name) for name in expected} == expected, (method, profile)
+    own = load_config(["task=Move", "method=sac", "method.profile=paper", "method.tau=0.25"]).method
+    assert (own.tau, own.learning_starts) == (0.25, 1000)
     algorithms = {make_config(tmp_path, method).method.algorithm for method in METHODS}
     assert algorithms == {*FAMILIES["rl"].rules, "tqc"}
 
 
-def test_sac_begins_with_the_weights_of_the_authors_code(tmp_path: Path) -> None:
-    policy = trainer_of(load_config([*COARSE, "method=sac"]), tmp_path).model.policy
+def test_sac_begins_with_the_weights_of_the_authors_code() -> None:
+    policy = first_policy(load_config([*COARSE, "method=sac"]).method, SPACES)
     for part in (policy.actor, policy.critic):
         for layer in (m for m in part.modules() if isinstance(m, torch.nn.Linear)):
             bound = math.sqrt(6.0 / sum(layer.weight.shape))
@@ -255,29 +225,24 @@ def test_sac_begins_with_the_weights_of_the_authors_code(tmp_path: Path) -> None
     assert all(torch.equal(own[name], target[name]) for name in own)
 
 
-def test_ppo_begins_and_ends_episodes_as_the_profile_says(tmp_path: Path) -> None:
-    profiles = {"paper": (0.01, 1.0, True), "release": (1.0, math.sqrt(2.0), False)}
-    for profile, (policy_gain, value_gain, truncates) in profiles.items():
-        model = trainer_of(load_config([*COARSE, "method=ppo", f"method.profile={profile}"]), tmp_path).model
+def test_ppo_begins_as_the_profile_says() -> None:
+    profiles = {"paper": (0.01, 1.0), "release": (1.0, math.sqrt(2.0))}
+    for profile, (policy_gain, value_gain) in profiles.items():
+        policy = first_policy(
+            load_config([*COARSE, "method=ppo", f"method.profile={profile}"]).method, SPACES
+        )
         # The rows are orthogonal, and as long as the gain.
-        for layer, gain in ((model.policy.action_net, policy_gain), (model.policy.value_net, value_gain)):
+        for layer, gain in ((policy.action_net, policy_gain), (policy.value_net, value_gain)):
             weight = layer.weight.detach()
             expected = gain**2 * torch.eye(len(weight))
             torch.testing.assert_close(weight @ weight.T, expected, rtol=1e-4, atol=1e-6)
-        model.env.reset()
-        for _ in range(HORIZON):
-            *_, infos = model.env.step(np.zeros((2, 6)))
-        assert [info["TimeLimit.truncated"] for info in infos] == [truncates] * 2
 
 
-def test_learning_rate_and_length_of_a_cycle(tmp_path: Path) -> None:
-    """The rate falls to 0 over the run; a cycle is an update of ppo, or a batch of episodes of the others."""
-    decay = LinearDecay(0.5)
-    assert decay(0.0) == 0.5
-    decay.remaining = 0.25
-    assert decay(1.0) == 0.125
-    assert cycle_steps(make_config(tmp_path, "sac").method, HORIZON) == 8
-    assert cycle_steps(make_config(tmp_path, "ppo", "method.steps_per_update=11").method, HORIZON) == 12
+def test_length_of_a_cycle(tmp_path: Path) -> None:
+    """A cycle is an update of ppo, or a batch of episodes of the others."""
+    for words, steps in ((("sac",), 8), (("ppo", "method.steps_per_update=11"), 12)):
+        method = make_config(tmp_path, *words).method
+        assert agents_of(method).cycle_steps(method, HORIZON) == steps
 
 
 # ---------------------------------------------------------------- interruptions
@@ -288,13 +253,13 @@ def test_learning_rate_and_length_of_a_cycle(tmp_path: Path) -> None:
     # Steps of two environments; evaluations come after 12 and 24, of ppo after 15 and 30.
     [*((method, 20, 2) for method in METHODS), ("sac", 7, 1), ("td3", 27, 3)],
 )
-def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, finished, method, step, rows) -> None:
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, lone, method, step, rows) -> None:
     cfg = make_config(tmp_path, method)
-    with stopped_at(step, Trainer, "note_step"):
+    with stopped_at(step, *STEPS.get(method, (Population, "_step"))):
         run_config(cfg, CACHE)
     assert len(partial(cfg).iterations) == rows
     run(cfg)
-    resumed = assert_same_run(cfg, finished[method])
+    resumed = assert_same_run(cfg, lone[method][0])
     assert resumed.provenance["resumed"] == 1
     assert_nothing_else_is_left(resumed)
 
@@ -333,21 +298,21 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -
         pd.testing.assert_series_equal(read(result_path(cfg)).iterations["loss"], want.iterations["loss"])
 
 
-def test_the_replay_buffer_of_a_single_run(tmp_path, finished) -> None:
+def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
     """Needed to go on with the training, not before the final evaluation."""
-    cfg = make_config(tmp_path, "sac")
+    cfg = make_config(tmp_path, "tqc")
     lost = result_path(cfg).with_suffix(".replay")
-    with stopped_at(20, Trainer, "note_step"):
+    with stopped_at(20, *STEPS["tqc"]):
         run_config(cfg, CACHE)
     lost.unlink()
     with pytest.raises(ResultsError, match=rf"{re.escape(str(lost))}.*force=true"):
         run_config(cfg, CACHE)
     assert len(partial(cfg).iterations) == 2
-    with stopped_at(0, RlRunner, "judge"):
+    with stopped_at(0, Sb3Runner, "judge"):
         run_config(replace(cfg, force=True), CACHE)
     assert not lost.exists()
     run(cfg)
-    assert_same_run(cfg, finished["sac"])
+    assert_same_run(cfg, lone["tqc"][0])
 
 
 def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
@@ -366,8 +331,7 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
 # ---------------------------------------------------------------- failures
 
 
-@pytest.mark.parametrize("method", ["sac", "ppo"])
-def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, method, monkeypatch, caplog) -> None:
+def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, monkeypatch, caplog) -> None:
     intact, calls = PlabVecEnv.step_wait, itertools.count()
 
     def step_wait(self: PlabVecEnv) -> Any:
@@ -376,7 +340,7 @@ def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, method, monkeypa
         return intact(self)
 
     monkeypatch.setattr(PlabVecEnv, "step_wait", step_wait)
-    result = run(make_config(tmp_path, method))
+    result = run(make_config(tmp_path, "tqc"))
     assert result.provenance["broken_episodes"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
     assert len(caplog.records) == 1
@@ -399,16 +363,16 @@ def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) 
     monkeypatch.setattr(module, "evaluation", evaluated)
 
 
-def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, finished, monkeypatch) -> None:
+def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, lone, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        break_evaluation(patch, rl, 0)
+        break_evaluation(patch, sb3, 0)
         with pytest.raises(RunError, match="iteration 0: environment step 1, substep 1"):
-            run_config(make_config(tmp_path / "first", "ppo"), CACHE)
-    break_evaluation(monkeypatch, rl, 2)
-    result = run(make_config(tmp_path, "ppo"))
+            run_config(make_config(tmp_path / "first", "tqc"), CACHE)
+    break_evaluation(monkeypatch, sb3, 2)
+    result = run(make_config(tmp_path, "tqc"))
     assert result.provenance["broken_evaluations"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
-    rows, whole = result.iterations["loss"], finished["ppo"].iterations["loss"]
+    rows, whole = result.iterations["loss"], lone["tqc"][0].iterations["loss"]
     assert rows.drop(2).equals(whole.drop(2)) and rows[2] != whole[2]
     assert result.best_iteration == whole.drop(2).idxmin()
 
@@ -458,8 +422,8 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
     cfgs = configs(tmp_path, "sac")
     intact = Population.train
 
-    def train(self: Population, episodes: int) -> None:
-        intact(self, episodes)
+    def train(self: Population, episodes: int, report: Any) -> None:
+        intact(self, episodes, report)
         if self.episodes == 12:
             with torch.no_grad():
                 for parameter in self.stacks[-1].networks.parameters():
@@ -488,19 +452,6 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
 # ---------------------------------------------------------------- CUDA
 
 
-def test_a_single_run_is_a_population_of_one_where_its_networks_are_on_cuda(tmp_path: Path) -> None:
-    def carries_out(method: str, device: str, population: bool | None = None) -> type:
-        cfg = make_config(tmp_path, method, f"method.torch_device={device}")
-        begun = None if population is None else {"steps": 0}
-        result = SimpleNamespace(resume=begun, provenance={"population": population})
-        return _runner(Job(cfg, SimpleNamespace(result=result)), in_sweep=False)
-
-    assert carries_out("sac", "cpu") is RlRunner and carries_out("sac", "cuda") is PopulationRunner
-    # Whoever has begun goes on.
-    assert carries_out("ppo", "cuda", False) is RlRunner
-    assert carries_out("ppo", "cpu", True) is PopulationRunner
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("method", OWN)
 def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch, method) -> None:
@@ -519,7 +470,7 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
     # The simulator stays on the CPU.
     single = make_config(tmp_path / "single", method, "method.torch_device=cuda")
     run_config(single)
-    assert read(result_path(single)).provenance["population"]
+    assert read(result_path(single)).status == "finished"
 
 
 # ---------------------------------------------------------------- learning

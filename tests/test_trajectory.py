@@ -21,8 +21,8 @@ from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import RunError, apg, run_config, trajectory
 from plab.runners.common import measures, shared_problem, simulator_key
-from plab.runners.environments import shared_batches
 from plab.runners.loggers import RunLog
+from plab.runners.policy import shared_batches
 from plab.runners.simulator_cache import SimulatorCache
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator

@@ -34,7 +34,7 @@ WHY = "iteration 3: environment step 1: the loss is not finite"
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the runners of all families."""
     for name, family in FAMILIES.items():
-        monkeypatch.setitem(FAMILIES, name, replace(family, runner=ToyRunner, population=ToyRunner))
+        monkeypatch.setitem(FAMILIES, name, replace(family, runner=ToyRunner))
 
 
 @cache

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from plab.config import ConfigError, OffPolicyConfig
 from plab.families import FAMILIES, Rule
-from plab.runners.rl_models import ModelKind, off_policy
+from plab.runners.sb3 import ModelKind, off_policy
 
 __all__ = ["FAMILY", "TqcConfig"]
 
@@ -54,7 +54,7 @@ def arguments(method: TqcConfig, env: VecEnv) -> dict[str, Any]:
 
 
 FAMILY = replace(
-    FAMILIES["rl"],
+    FAMILIES["sb3"],
     label="truncated quantile critics",
     config=TqcConfig,
     rules={"tqc": Rule(ModelKind(TQC, arguments))},

@@ -35,7 +35,6 @@ SOLVED = 1.0
 """The highest score there is."""
 
 _TYPES = "plab.config"
-_AGENTS = "plab.runners.population"
 _PLANNERS = "plab.runners.planners"
 
 Kind = TypeVar("Kind")
@@ -63,13 +62,10 @@ class Rule:
     Attributes:
         what: It, or its ``module:NAME``; of which kind it is, is up to the family's runner.
         config: Type of the section ``method``, or its ``module:NAME``; None: the family's.
-        agents: What learns in a population, many agents at once, or its ``module:NAME``; see
-            :attr:`Family.population`.
     """
 
     what: Any
     config: type | str | None = None
-    agents: type | str | None = None
 
 
 @dataclass(frozen=True)
@@ -86,8 +82,8 @@ class Family:
         ranking: What the best actions of a run are chosen by: ``loss``, the lowest, or ``score``, the highest
             (and of several the one of lowest loss).
         batching: Whether runs can share a simulator; else each runs alone.
-        population: Runner of the runs of a sweep whose rule has ``agents``, or its ``module:NAME``: they
-            share a simulator if they have the same section ``method``. ``runner`` carries out the others.
+        in_step: Whether those that share one must have the same section ``method``, as agents that learn in
+            step with each other.
         rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
         contact: Contact model in which rows are measured, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
@@ -101,7 +97,7 @@ class Family:
     may_be_nan: tuple[str, ...] = ()
     ranking: str = "loss"
     batching: bool = False
-    population: type | str | None = None
+    in_step: bool = False
     rules: Mapping[str, Rule] = field(default_factory=dict)
     contact: str | None = None
     kind: str = ""
@@ -116,20 +112,6 @@ class Family:
         """
         return _loaded(self.rules[name].what, kind)
 
-    def agents(self, name: str) -> type:
-        """Return the agents of a rule.
-
-        Raises:
-            plab.config.ConfigError: If they cannot be imported.
-            KeyError: If there is no such rule.
-        """
-        return _loaded(self.rules[name].agents, type)
-
-    def joins_populations(self, method: Any) -> bool:
-        """Whether a sweep's runs with this section ``method`` are agents of a population."""
-        rule = self.rules.get(getattr(method, "algorithm", ""))
-        return rule is not None and rule.agents is not None
-
     def config_type(self, rule: str | None = None) -> type:
         """Return the type of the section ``method``, of a rule that has one of its own that.
 
@@ -139,13 +121,13 @@ class Family:
         own = self.rules[rule].config if rule is not None and rule in self.rules else None
         return _loaded(own or self.config, type)
 
-    def runner_type(self, *, population: bool = False) -> type:
-        """Return the runner, or that of populations.
+    def runner_type(self) -> type:
+        """Return the runner.
 
         Raises:
             plab.config.ConfigError: If it cannot be imported.
         """
-        return _loaded(self.population if population else self.runner, type)
+        return _loaded(self.runner, type)
 
 
 def _loaded(what: Any, kind: type[Kind]) -> Kind:
@@ -198,14 +180,15 @@ FAMILIES: dict[str, Family] = {
         label="a policy that learns from rewards",
         config=f"{_TYPES}:RlConfig",
         runner="plab.runners.rl:RlRunner",
-        population="plab.runners.population.runner:PopulationRunner",
         columns=("train_reward", "train_score"),
         # No episode of training may have ended.
         may_be_nan=("train_reward", "train_score"),
+        batching=True,
+        in_step=True,
         rules={
-            "sac": Rule("plab.runners.rl_models:SAC", f"{_TYPES}:SacConfig", f"{_AGENTS}.sac:SacAgents"),
-            "td3": Rule("plab.runners.rl_models:TD3", f"{_TYPES}:Td3Config", f"{_AGENTS}.td3:Td3Agents"),
-            "ppo": Rule("plab.runners.rl_models:PPO", f"{_TYPES}:PpoConfig", f"{_AGENTS}.ppo:PpoAgents"),
+            "sac": Rule("plab.runners.sac:SacAgents", f"{_TYPES}:SacConfig"),
+            "td3": Rule("plab.runners.td3:Td3Agents", f"{_TYPES}:Td3Config"),
+            "ppo": Rule("plab.runners.ppo:PpoAgents", f"{_TYPES}:PpoConfig"),
         },
         contact="hard",
         kind=RL,
@@ -214,6 +197,15 @@ FAMILIES: dict[str, Family] = {
             "td3": Appearance("TD3", "#56B4E9", "--"),
             "ppo": Appearance("PPO", "#009E73", "-."),
         },
+    ),
+    "sb3": Family(
+        label="a learning algorithm with the interface of Stable-Baselines3",
+        config=f"{_TYPES}:RlConfig",
+        runner="plab.runners.sb3:Sb3Runner",
+        columns=("train_reward", "train_score"),
+        may_be_nan=("train_reward", "train_score"),
+        contact="hard",
+        kind=RL,
     ),
     "apg": Family(
         label="a policy, trained through the simulator's gradient",
@@ -229,7 +221,7 @@ FAMILIES: dict[str, Family] = {
         runner="plab.runners.pods:PodsRunner",
         columns=("train_reward", "train_score", "plan_reward", "plan_score"),
         may_be_nan=("train_reward", "train_score", "plan_reward", "plan_score"),
-        rules={"pods": Rule("plab.runners.pods:PODS", f"{_TYPES}:PodsConfig")},
+        rules={"pods": Rule("plab.runners.pods:PodsTraining", f"{_TYPES}:PodsConfig")},
         contact="hard",
         kind=GRADIENT,
         methods={"pods": Appearance("PODS", "#999933", "--")},
@@ -240,7 +232,7 @@ FAMILIES: dict[str, Family] = {
         runner="plab.runners.shac:ShacRunner",
         columns=("train_reward", "train_score"),
         may_be_nan=("train_reward", "train_score"),
-        rules={"shac": Rule("plab.runners.shac:SHAC", f"{_TYPES}:ShacConfig")},
+        rules={"shac": Rule("plab.runners.shac:ShacTraining", f"{_TYPES}:ShacConfig")},
         contact="hard",
         kind=GRADIENT,
         methods={"shac": Appearance("SHAC", "#DDAA33", ":")},

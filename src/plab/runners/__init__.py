@@ -10,7 +10,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
 
 from plab.config import Config
 from plab.errors import TRACEBACK, ConfigError, traceback_wanted
@@ -42,7 +41,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
     job = Job(cfg, RunFile(cfg))
     before = job.run.finished
     if not before:
-        _carry_out_all([job], "", cache or SimulatorCache(), in_sweep=False)
+        _carry_out([job], "", cache or SimulatorCache())
     if job.error is not None:
         raise job.error
     print(f"{'finished before' if before else 'finished'}: {job.told}, {job.run.path}")
@@ -73,7 +72,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
             ended[number] = outcome(cfg, "refused", message=str(error))
     before = {number for number, job in jobs.items() if job.run.finished}
     todo = [job for number, job in jobs.items() if number not in before]
-    _carry_out_all(todo, note, cache or SimulatorCache(), in_sweep=True)
+    _carry_out(todo, note, cache or SimulatorCache())
     _print_bugs(todo)
     for number, job in jobs.items():
         ended[number] = one = _outcome(job, "before" if number in before else "finished")
@@ -102,67 +101,57 @@ def _print_bugs(jobs: Sequence[Job]) -> None:
             traceback.print_exception(error)
 
 
-def _carry_out_all(jobs: Sequence[Job], note: str, cache: SimulatorCache, *, in_sweep: bool) -> None:
-    """Run jobs to their ends, those together that one runner can carry out together."""
-    parties: dict[Any, list[Job]] = {}
+def _carry_out(jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
+    """Run jobs of one family to their ends; afterwards each has finished or has an error, and holds no
+    lock."""
+    party: Sequence[Job] = ()
     try:
-        for number, job in enumerate(jobs):
+        parties = _parties(jobs)
+        while parties:
+            party = parties.pop(0)
             try:
-                own = family(job.cfg.method.family)
-                kind = _runner(job, in_sweep=in_sweep)
-                # What a runner that does everything itself goes on from only it knows.
-                if kind.run is Runner.run and (fault := resume_fault(job.run.result)):
-                    what = f"{job.run.partial_path} cannot be gone on from: {fault}"
-                    raise ResultsError(f"{what}; start afresh with force=true")
-                shares = own.batching or kind is not own.runner_type()
-                parties.setdefault((kind, None if shares else number), []).append(job)
+                _runner_type(party[0])(party, note, cache).run()
+            except TogetherError:
+                half = len(party) // 2
+                parties[:0] = [party[:half], party[half:]]
+            except BrokenPipeError:
+                raise
             except Exception as error:
-                job.fail(error)
-        for (kind, _), together in parties.items():
-            _carry_out(together, kind, note, cache)
-    finally:
-        for job in jobs:
-            job.run.release()
-
-
-def _carry_out(jobs: Sequence[Job], kind: type[Runner], note: str, cache: SimulatorCache) -> None:
-    """Run jobs to their ends; afterwards each has finished or has an error, and holds no lock."""
-    halves: list[Sequence[Job]] = []
-    try:
-        kind(jobs, note, cache).run()
+                for job in party:
+                    if job.open:
+                        job.fail(error)
     except (KeyboardInterrupt, BrokenPipeError):
         # Nobody waits for it any more.
-        for job in jobs:
+        for job in party:
             if job.open:
                 # The others are to be closed even if this one's file cannot be written.
                 with suppress(ResultsError):
                     job.run.close("stopped", "interrupted")
         raise
-    except TogetherError:
-        halves = [jobs[: len(jobs) // 2], jobs[len(jobs) // 2 :]]
-    except Exception as error:
-        for job in jobs:
-            if job.open:
-                job.fail(error)
     finally:
-        if not halves:
-            for job in jobs:
-                job.run.release()
-    # Not in the handler: there the error still refers to the simulator that was too large.
-    for half in halves:
-        _carry_out(half, kind, note, cache)
+        for job in jobs:
+            job.run.release()
 
 
-def _runner(job: Job, *, in_sweep: bool) -> type[Runner]:
-    """Return who carries out a run: whoever has begun it goes on."""
-    name, result = job.cfg.method.family, job.run.result
-    own = family(name)
-    # On CUDA a population of one is the faster way for a single run, too.
-    many = in_sweep or getattr(job.cfg.method, "torch_device", "cpu") == "cuda"
-    population = many and own.joins_populations(job.cfg.method)
-    if result.resume is not None:
-        population = bool(result.provenance.get("population", False))
-    kind = own.runner_type(population=population)
+def _parties(jobs: Sequence[Job]) -> list[Sequence[Job]]:
+    """Return the jobs that run together; those that cannot run are refused."""
+    able = []
+    for job in jobs:
+        try:
+            # What a runner that does everything itself goes on from only it knows.
+            if _runner_type(job).run is Runner.run and (fault := resume_fault(job.run.result)):
+                what = f"{job.run.partial_path} cannot be gone on from: {fault}"
+                raise ResultsError(f"{what}; start afresh with force=true")
+            able.append(job)
+        except Exception as error:
+            job.fail(error)
+    together = able and family(able[0].cfg.method.family).batching
+    return [able] if together else [[job] for job in able]
+
+
+def _runner_type(job: Job) -> type[Runner]:
+    name = job.cfg.method.family
+    kind = family(name).runner_type()
     if not issubclass(kind, Runner):
         raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
     return kind

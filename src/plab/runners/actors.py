@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,20 +13,28 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-from plab.config import ActorConfig, Config, ConfigError, PolicyConfig, drawn_configs
+from plab.config import ActorConfig, Config, ConfigError, drawn_configs
 from plab.envs.core import EpisodeBatch
 from plab.problem import fits
-from plab.runners.environments import PolicyRunner, evaluation, shared_batches
 from plab.runners.jobs import RunError
-from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
-from plab.runners.policy import Policy, save_policy
-from plab.runners.rl import check_torch_device
-from plab.runners.rl_models import CLIP, ModelKind, Spaces
+from plab.runners.policy import (
+    CLIP,
+    Policy,
+    PolicyRunner,
+    Spaces,
+    evaluation,
+    first_policy,
+    module_arrays,
+    optimizer_arrays,
+    restore_module,
+    restore_optimizer,
+    save_policy,
+    shared_batches,
+)
 from plab.runners.runner import Step, Track
 
 __all__ = [
     "DEVIATION_MIN",
-    "ActorKind",
     "ActorPolicy",
     "ActorRunner",
     "ActorTraining",
@@ -79,34 +86,10 @@ def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
         group["lr"] = rate
 
 
-def _no_arguments(*_: Any) -> dict[str, Any]:
-    raise ConfigError("this is no algorithm of Stable-Baselines3")
-
-
-@dataclass(frozen=True)
-class ActorKind(ModelKind):
-    """How a configuration becomes a policy.
-
-    Attributes:
-        network: Makes the policy from its spaces and the section ``method``.
-    """
-
-    model: Any = None
-    arguments: Any = _no_arguments
-    network: Callable[[Spaces, Any], BasePolicy] = field(kw_only=True)
-
-    def policy(self, method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
-        """Return the policy that training begins with, on the CPU; random numbers stay as they are."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            return self.network(spaces, method)
-
-
 class ActorTraining(ABC):
     """A policy, its optimiser, and the episodes from which it learns.
 
     Attributes:
-        actor: How the policy is made.
         policy: The policy.
         statistics: Moments of the observations, by which they are scaled.
         episodes: Episodes of training so far.
@@ -115,7 +98,6 @@ class ActorTraining(ABC):
         broken: When and why episodes broke off since they were last asked for.
     """
 
-    actor: ClassVar[ActorKind]
     round_episodes = 1, 1
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
@@ -125,7 +107,7 @@ class ActorTraining(ABC):
         self._cfg, self._method, self._batch = cfg, method, batch
         self._device = torch.device(method.torch_device)
         self._spaces = Spaces(batch.observation_space, batch.action_space)
-        self.policy: Any = self.actor.policy(method, self._spaces, seed).to(self._device)
+        self.policy: Any = first_policy(method, self._spaces, seed).to(self._device)
         self._optimizer = torch.optim.Adam(self.policy.parameters(), lr=method.lr)
         self._generator = torch.Generator(self._device).manual_seed(seed)
         self.statistics = RunningMeanStd(shape=batch.observation_space.shape)
@@ -134,6 +116,11 @@ class ActorTraining(ABC):
         self.total_episodes = math.ceil(method.episodes / whole) * whole
         self.broken: list[str] = []
         self._measured: dict[str, list[float]] = {}
+
+    @staticmethod
+    def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
+        """Return the policy that training begins with, on the CPU."""
+        return ActorPolicy(spaces, method)
 
     @abstractmethod
     def train(self) -> None:
@@ -181,14 +168,12 @@ class ActorTraining(ABC):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; ValueError if it is that of other networks."""
+        """Return to a :meth:`state`; RuntimeError if it is that of other networks."""
         for name, module in self._modules().items():
             restore_module(module, state[name])
         for name, one in self._optimizers().items():
             restore_optimizer(one, state[name])
         known = state["statistics"]
-        if known["mean"].shape != self.statistics.mean.shape or known["var"].shape != known["mean"].shape:
-            raise ValueError(f"its statistics have shape {list(known['mean'].shape)}")
         self.statistics.mean, self.statistics.var = known["mean"].copy(), known["var"].copy()
         self.statistics.count = float(known["count"])
         self._generator.set_state(torch.from_numpy(np.array(state["generator"], np.uint8)))
@@ -219,7 +204,7 @@ class ActorRunner(PolicyRunner):
     def build(self) -> None:
         """Make the environments of the training, and the one in the hard contact model that judges."""
         cfg, method = self.tracks[0].cfg, self.method
-        check_torch_device(method)
+        self.require_torch_device()
         if method.torch_device != cfg.sim.device:
             raise ConfigError(
                 f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
@@ -249,12 +234,10 @@ class ActorRunner(PolicyRunner):
             due = before + self.method.evaluate_every
             while training.episodes < due and training.episodes < training.total_episodes:
                 training.train()
-            broken, training.broken = training.broken, []
-            if why := self.note_broken(track, broken, training.episodes - before):
-                raise RunError(f"iteration {track.iteration}: {why}")
             self.enter("evaluate")
         done = evaluation(self._evaluation, training.predictor())
-        if why := self.note_evaluation(track, done.failure):
+        broken, training.broken = training.broken, []
+        if why := self.unusable(track, broken, training.episodes - before, done.failure):
             raise RunError(f"iteration {track.iteration}: {why}")
         trained = (training.episodes - before) * horizon
         every, differentiated = training.round_episodes

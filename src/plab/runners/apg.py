@@ -16,8 +16,14 @@ import torch
 
 from plab.autograd import policy_gradient
 from plab.config import ApgConfig
-from plab.runners.environments import PolicyRunner, shared_batches
-from plab.runners.model_state import module_arrays, optimizer_arrays, restore_module, restore_optimizer
+from plab.runners.policy import (
+    PolicyRunner,
+    module_arrays,
+    optimizer_arrays,
+    restore_module,
+    restore_optimizer,
+    shared_batches,
+)
 from plab.runners.runner import Step, Track
 
 __all__ = ["ApgRunner", "PolicyTraining"]
@@ -91,9 +97,7 @@ class PolicyTraining:
         return {"policy": module_arrays(self.policy), "optimizer": optimizer_arrays(self._optimizer)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; ValueError if it is that of another network, or was pickled."""
-        if "training" in state:
-            raise ValueError("its network is pickled, as by earlier versions of plab")
+        """Return to a :meth:`state`; RuntimeError if it is that of another network."""
         restore_module(self.policy, state["policy"])
         restore_optimizer(self._optimizer, state["optimizer"])
 

@@ -25,19 +25,13 @@ import torch
 from plab.config import Config, PodsConfig
 from plab.envs.core import EpisodeBatch
 from plab.envs.observations import level_entries
-from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, set_rate, training_scenes
+from plab.runners.actors import ActorRunner, ActorTraining, set_rate, training_scenes
 
-__all__ = ["PODS", "PodsRunner", "PodsTraining"]
-
-
-PODS = ActorKind(network=ActorPolicy)
-"""What reads a policy's file; the name that ``method.algorithm`` gives it is in :mod:`plab.families`."""
+__all__ = ["PodsRunner", "PodsTraining"]
 
 
 class PodsTraining(ActorTraining):
     """A policy and the rounds of episodes from which it learns."""
-
-    actor = PODS
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
@@ -141,7 +135,7 @@ class PodsTraining(ActorTraining):
         return super().state() | {"rounds": rounds}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; ValueError if it is that of other networks."""
+        """Return to a :meth:`state`; RuntimeError if it is that of other networks."""
         super().restore(state)
         kept = [state["rounds"][str(k)] for k in range(len(state["rounds"]))]
         parts = [[torch.from_numpy(np.array(one[name])) for name in ("seen", "wanted")] for one in kept]

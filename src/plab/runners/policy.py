@@ -1,8 +1,8 @@
-"""Trained policies: kept in a file beside the result, and taken from there.
+"""Policies: runners that train them in environments, episodes of a policy, and the file that keeps one.
 
-The file is an ``.npz`` of arrays alone: the networks' parameters by their names, the bounds of observations
-and actions, and a header in JSON with the section ``method`` of the run, from which the networks are made
-anew. Reading it unpickles and imports nothing.
+The file beside a result, ``<name>.policy.npz``, is arrays alone: the networks' parameters by their names, the
+bounds of observations and actions, and a header in JSON with the section ``method`` of the run, from which
+the networks are made anew. Reading it unpickles and imports nothing.
 """
 
 from __future__ import annotations
@@ -10,29 +10,57 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import logging
 import math
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict, fields
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
+import torch
 from gymnasium.spaces import Box
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import get_device
+from torch.optim import Optimizer
 
-from plab.config import ConfigError, PolicyConfig
+from plab.config import Config, ConfigError, MethodConfig, PolicyConfig, build_scene
+from plab.config.selection import OBSERVED
+from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES, family
 from plab.files import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.files import replace_file
-from plab.runners.model_state import module_arrays, restore_module
-from plab.runners.rl_models import CLIP, Spaces, model_kind
+from plab.runners.common import LAST, episode_columns, simulator_key
+from plab.runners.runner import Runner, Track
+from plab.runners.simulator_cache import SimulatorCache
 
-__all__ = ["Policy", "load_policy", "policy_path", "save_policy"]
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+
+__all__ = [
+    "CLIP",
+    "Evaluation",
+    "Policy",
+    "PolicyRunner",
+    "Spaces",
+    "evaluation",
+    "first_policy",
+    "load_policy",
+    "module_arrays",
+    "optimizer_arrays",
+    "policy_path",
+    "restore_module",
+    "restore_optimizer",
+    "save_policy",
+    "shared_batches",
+    "torch_settings",
+]
+
+CLIP = 10.0
+"""Largest observation and reward, in units of their running standard deviations."""
 
 EPSILON = 1e-8
 """Added to variances of observations, as Stable-Baselines3 does."""
@@ -40,7 +68,183 @@ EPSILON = 1e-8
 _FORMAT = "plab-policy 1"
 
 _PARAMETER = "policy/"
-"""What the names of the networks' parameters begin with."""
+"""Prefix of the names of the networks' parameters."""
+
+_log = logging.getLogger(__name__)
+
+
+class Spaces(NamedTuple):
+    """Spaces of an observation and of an action."""
+
+    observation_space: Box
+    action_space: Box
+
+
+# ------------------------------------------------------------------------------------- runners, episodes
+
+
+class PolicyRunner(Runner):
+    """Trains policies; a subclass says of which ``kind`` the section ``method`` is."""
+
+    kind: ClassVar[type[MethodConfig]]
+
+    @property
+    def method(self) -> Any:
+        """The section ``method`` that the runs have in common."""
+        return self.tracks[0].cfg.method_as(self.kind)
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self.method.torch_threads)
+
+    def require_torch_device(self) -> None:
+        """Raise ConfigError, before anything is built, if torch does not have the device."""
+        if self.method.torch_device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
+            )
+
+    def unusable(self, track: Track, broken: Sequence[str], episodes: int, failure: str) -> str:
+        """Count episodes that broke off in the result's provenance, and warn of them.
+
+        Args:
+            track: The run.
+            broken: When and why episodes of training broke off; their environments rested until their end.
+            episodes: Episodes of training that ended meanwhile.
+            failure: When and why the evaluation broke off, which is the best of none; empty if it did not.
+
+        Returns:
+            Why the run cannot go on: all episodes of training broke off, or the evaluation did and the run
+            has no other actions yet. Otherwise an empty text.
+        """
+        if broken and len(broken) >= episodes:
+            return f"all {episodes} episodes of training broke off, the first in {broken[0]}"
+        if failure and track.best_actions is None:
+            return failure
+        provenance = track.job.run.result.provenance
+        for name, texts in (("episodes", broken), ("evaluations", [failure] if failure else [])):
+            if texts:
+                provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
+                _log.warning(
+                    "%s: iteration %d: %d %s broke off and rested until their end, the first in %s",
+                    *(track.job.run.path, track.iteration, len(texts), name, texts[0]),
+                )
+        return ""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an episode of a deterministic policy gave: values of
+    :func:`plab.runners.common.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
+    not; from then on it rests as :meth:`plab.envs.core.EpisodeBatch.step` has it."""
+
+    measures: dict[str, float]
+    actions: np.ndarray
+    failure: str
+
+
+def evaluation(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> Evaluation:
+    """Run an episode of a policy, observations, shape [1, entry], to actions, shape [1, A], in a batch of
+    one."""
+    observation, _ = batch.reset()
+    sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
+    actions, failure = [], ""
+    for _ in range(batch.horizon):
+        actions.append(policy(observation))
+        step = batch.step(actions[-1], strict=False)
+        failure = failure or step.failures.get(0, "")
+        observation, values = step.observation, step.info | {"reward": step.reward}
+        for name in sums:
+            sums[name] += float(values[name][0])
+    last = {name: float(values[name][0]) for name in LAST}
+    return Evaluation(sums | last, np.concatenate(actions), failure)
+
+
+def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
+    """Return batches of environments, in their initial states, those kept from the last run if they can be
+    of these scenes; each is of some configurations, which the environments have in turn, a number of
+    environments and a contact model."""
+
+    def build() -> list[EpisodeBatch]:
+        return [
+            EpisodeBatch([cfgs[k % len(cfgs)] for k in range(size)], contact=contact)
+            for cfgs, size, contact in kinds
+        ]
+
+    def start_again(batches: list[EpisodeBatch]) -> None:
+        for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
+            batch.renew([cfgs[k % len(cfgs)] for k in range(batch.size)])
+            batch.reset()
+            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
+
+    key: list[Hashable] = []
+    for (cfg, *_), size, contact in kinds:
+        key += [simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, size, contact]
+        key += [getattr(cfg, name) for name in OBSERVED]
+    return cache.get(tuple(key), build, check=start_again)
+
+
+@contextmanager
+def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
+    """Let torch use some CPU threads, on CUDA TF32's products, of factors with 11 significant bits, if
+    ``tf32``, and not check distributions' arguments, inside the ``with`` block. The checks cost a tenth of
+    an update; states and losses are checked for NaN anyway."""
+    before, checks = torch.get_num_threads(), torch.distributions.Distribution._validate_args
+    precision = torch.get_float32_matmul_precision()
+    torch.set_num_threads(threads)
+    if tf32:
+        torch.set_float32_matmul_precision("high")
+    torch.distributions.Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        torch.set_float32_matmul_precision(precision)
+        torch.distributions.Distribution.set_default_validate_args(checks)
+
+
+# ------------------------------------------------------------------------------------- states as arrays
+
+
+def module_arrays(module: torch.nn.Module) -> dict[str, np.ndarray]:
+    """Return copies of a module's parameters and buffers by their names."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in module.state_dict().items()}
+
+
+def restore_module(module: torch.nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
+    """Give a module the parameters of :func:`module_arrays`; RuntimeError if they are another module's."""
+    module.load_state_dict({name: torch.tensor(np.asarray(array)) for name, array in arrays.items()})
+
+
+def optimizer_arrays(optimizer: Optimizer) -> dict[str, dict[str, np.ndarray]]:
+    """Return copies of what an optimiser keeps of its parameters, by their numbers; rates are left out."""
+    states = optimizer.state_dict()["state"]
+    return {str(k): {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in states.items()}
+
+
+def restore_optimizer(optimizer: Optimizer, arrays: Mapping[str, Mapping[str, np.ndarray]]) -> None:
+    """Give an optimiser what :func:`optimizer_arrays` has of the same parameters."""
+    states = {
+        int(k): {name: torch.tensor(np.asarray(v)) for name, v in own.items()} for k, own in arrays.items()
+    }
+    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+# ------------------------------------------------------------------------------------- policies and files
+
+
+def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
+    """Return the policy with which a training begins, on the CPU; random numbers stay as they are.
+
+    The algorithm's rule in its family says how: it is an object with ``make_policy(method, spaces)``.
+
+    Raises:
+        plab.config.ConfigError: If the rule cannot be imported.
+    """
+    rule = family(method.family).rule(method.algorithm, object)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return cast(Any, rule).make_policy(method, spaces)
 
 
 class Policy:
@@ -128,69 +332,42 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
             f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
         ) from error
     # What the device answers says nothing about the file.
-    policy.network = policy.network.to(get_device(device))
+    policy.network = policy.network.to(device)
     return policy
 
 
 def _policy(path: Path) -> Policy:
     arrays = read_arrays(path)
-    if "header" not in arrays and "policy" in arrays:
-        raise ValueError("it is pickled, as by earlier versions of plab, and not read any more")
     header = json.loads(str(arrays["header"][()]))
     if header["format"] != _FORMAT:
         raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
     method = _method(header["method"], path)
-    spaces = Spaces(*(_space(arrays, name) for name in ("observation", "action")))
+    spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
     own = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}
-    _require_room(method, spaces, parameters)
-    network = model_kind(method.family, method.algorithm).policy(method, spaces)
+    # Before networks of that size are made.
+    widths = [spaces[0].shape[0], *getattr(method, "hidden", ()), spaces[1].shape[0]]
+    needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
+    there = sum(values.size for values in parameters.values())
+    if needed > there:
+        raise ValueError(f"it has {there} parameters, its networks at least {needed}")
+    network = first_policy(method, spaces)
     restore_module(network, parameters)
-    moments = [arrays.get(name) for name in ("mean", "variance")]
-    for values in moments:
-        if values is not None and values.shape != spaces.observation_space.shape:
-            raise ValueError(f"its statistics have shape {list(values.shape)}")
-    return Policy(network, *moments)
+    return Policy(network, arrays.get("mean"), arrays.get("variance"))
 
 
 def _method(section: Any, path: Path) -> PolicyConfig:
     """Return the section ``method`` that a policy's header holds, of the type of its family."""
-    name = section["family"]
-    if not isinstance(name, str):
-        raise ValueError("its method has no family")
+    name = str(section["family"])
     # A file does not choose what is imported.
     if name not in FAMILIES and (module := name.partition(":")[0]) not in sys.modules:
         raise ResultsError(f"{path}: its method is {name!r:.80}, outside plab: import {module!r:.80} before")
-    if "${" in json.dumps(section):
-        raise ValueError("its method refers to something else")
     try:
         kind = family(name).config_type(section["algorithm"])
-        # Of files older than `logger`, and of those of shac that had profiles without any in them.
-        gone = {"tensorboard", "profile", "profiles"} - {one.name for one in fields(kind)}
-        known = {key: value for key, value in section.items() if key not in gone}
-        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), known))
+        method = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), section))
         cast(PolicyConfig, method).check("method")
     except ConfigError as error:
         raise ResultsError(f"{path}: {one_line(error)}") from error
     except OmegaConfBaseException as error:
         raise ValueError(f"its method is none: {(error.msg or str(error)).splitlines()[0]}") from error
-    if not isinstance(method, PolicyConfig):
-        raise ValueError(f"policies are no part of {name}")
-    return method
-
-
-def _space(arrays: Mapping[str, np.ndarray], name: str) -> Box:
-    low, high = arrays[f"{name}_low"], arrays[f"{name}_high"]
-    if low.ndim != 1 or low.shape != high.shape or not (low <= high).all():
-        raise ValueError(f"the bounds of its {name}s are none")
-    return Box(low, high, dtype=np.float32)
-
-
-def _require_room(method: PolicyConfig, spaces: Spaces, parameters: Mapping[str, np.ndarray]) -> None:
-    """See that networks of this size can be what the file holds, before they are made."""
-    sizes = [space.shape[0] for space in spaces]
-    widths = [sizes[0], *getattr(method, "hidden", ()), sizes[1]]
-    needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
-    there = sum(values.size for values in parameters.values())
-    if needed > there:
-        raise ValueError(f"it has {there} parameters, its networks at least {needed}")
+    return cast(PolicyConfig, method)

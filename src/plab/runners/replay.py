@@ -1,157 +1,163 @@
-"""A replay buffer in a file beside the result: it outlives the process, and no checkpoint has to copy it."""
+"""Replay buffers of many agents on their device, and the files in which they outlive the process."""
 
 from __future__ import annotations
 
-import os
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
+from torch import Tensor
 
+from plab.config import OffPolicyConfig
 from plab.results import ResultsError
+from plab.results.files import cause
 
-__all__ = ["EpisodeReplay"]
+__all__ = ["ReplayBuffer", "Samples", "Sizes", "require_file"]
 
 
-class EpisodeReplay(ReplayBuffer):
-    """Replay buffer of episodes that are all equally long and end by truncation only.
+class Sizes(NamedTuple):
+    """Of an agent's episodes: environments N, steps T of an episode, entries of an observation, components
+    of an action."""
 
-    An episode's next observation is the observation that follows, so that each is stored once: half of what
-    Stable-Baselines3's buffer takes. Transitions are only ever appended, and overwritten when they are older
-    than anything that a checkpoint can ask for: a process that resumes finds the buffer as the checkpoint
-    knew it. What was appended after the checkpoint is appended again.
+    envs: int
+    horizon: int
+    observed: int
+    actions: int
+
+    @property
+    def entries(self) -> int:
+        """Numbers, all float32, of one episode in all N environments."""
+        return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
+
+    def capacity(self, method: OffPolicyConfig, total_steps: int) -> int:
+        """Return how many episodes of N environments a buffer holds, in a training of so many transitions."""
+        window = max(method.buffer_size // self.envs, 1)
+        # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
+        return min(math.ceil(total_steps / self.envs / self.horizon), math.ceil(window / self.horizon) + 1)
+
+
+class Samples(NamedTuple):
+    """Transitions to learn from, each of shape [agent, row, ...]; rewards have no third axis."""
+
+    observations: Tensor
+    actions: Tensor
+    next_observations: Tensor
+    rewards: Tensor
+
+
+class ReplayBuffer:
+    """The transitions of K agents that stand at the same step; each observation is stored once.
 
     Attributes:
-        added: Steps of all environments that were added, the overwritten ones included.
+        added: Steps of all N environments that were added, the overwritten ones included.
     """
 
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: Box,
-        action_space: Box,
-        device: torch.device | str = "cpu",
-        n_envs: int = 1,
-        optimize_memory_usage: bool = False,
-        *,
-        path: str,
-        horizon: int,
-        total_steps: int,
-        spare_steps: int,
-        added: int,
-    ) -> None:
-        """Create the file, or open the one of an earlier process.
+    def __init__(self, agents: int, sizes: Sizes, capacity: int, window: int, device: torch.device) -> None:
+        """Make room for ``capacity`` episodes of each agent; of the steps of N environments the last
+        ``window`` can be sampled."""
+        self.added = 0
+        self._agents, self._sizes, self._capacity, self._window = agents, sizes, capacity, window
+        n, horizon = sizes.envs, sizes.horizon
+        shape = agents, capacity
+        self._observations = torch.empty((*shape, horizon + 1, n, sizes.observed), device=device)
+        self._actions = torch.empty((*shape, horizon, n, sizes.actions), device=device)
+        self._rewards = torch.empty((*shape, horizon, n), device=device)
+        # Where recorded updates find how much there is: first step that can be sampled, and how many can.
+        self._first = torch.zeros((), dtype=torch.int64, device=device)
+        self._count = torch.ones((), dtype=torch.int64, device=device)
+        self._agent = torch.arange(agents, device=device).unsqueeze(1)
+        # Episodes of N environments that each agent's file holds.
+        self._written = [0] * agents
 
-        Args:
-            buffer_size: Transitions that can be sampled, the latest ones.
-            observation_space: Space of one environment's observation.
-            action_space: Space of one environment's action.
-            device: Where the samples go.
-            n_envs: Number of environments.
-            optimize_memory_usage: Stable-Baselines3's own way to store observations once; must be False.
-            path: The file.
-            horizon: Steps T of an episode.
-            total_steps: Steps of all environments that will ever be added, a multiple of T.
-            spare_steps: Most steps of all environments between two checkpoints.
-            added: Steps added by earlier processes; 0 creates the file.
+    def add(self, observations: Tensor, actions: Tensor, rewards: Tensor, next_observations: Tensor) -> None:
+        """Append one step of all environments; arguments of shape [agent, env, ...]."""
+        episode, step = divmod(self.added, self._sizes.horizon)
+        slot = episode % self._capacity
+        if step == 0:
+            self._observations[:, slot, 0] = observations
+        self._observations[:, slot, step + 1] = next_observations
+        self._actions[:, slot, step] = actions
+        self._rewards[:, slot, step] = rewards
+        self._count_to(self.added + 1)
 
-        Raises:
-            ResultsError: If the file cannot be created, the disk has no room for it, or that of the earlier
-                process is gone.
-        """
-        # The base class allocates arrays of its own, here of one row each.
-        super().__init__(n_envs, observation_space, action_space, device, n_envs, optimize_memory_usage)
+    def _count_to(self, added: int) -> None:
         self.added = added
-        self._horizon = horizon
-        self._window = max(buffer_size // n_envs, 1)
-        episodes = -(-min(total_steps, self._window + spare_steps) // horizon)
-        self._capacity = episodes * horizon
-        shapes = {
-            "observations": (episodes * (horizon + 1), n_envs, *self.obs_shape),
-            "actions": (self._capacity, n_envs, self.action_dim),
-            "rewards": (self._capacity, n_envs),
-        }
-        size = 4 * sum(int(np.prod(shape)) for shape in shapes.values())
-        _require_file(Path(path), size, create=added == 0)
-        self._file = np.memmap(path, np.float32, "r+")
-        # One array after the other.
-        start = 0
-        for name, shape in shapes.items():
-            part = self._file[start : start + int(np.prod(shape))]
-            # A plain array: indexing a memmap costs more.
-            setattr(self, name, np.asarray(part).reshape(shape))
-            start += part.size
+        self._first.fill_(added - self.count)
+        self._count.fill_(max(self.count, 1))
 
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Append one step of all environments; ``done`` and ``infos`` say nothing new."""
-        place = self.added % self._capacity
-        first = place + place // self._horizon
-        self.observations[first] = obs
-        self.observations[first + 1] = next_obs
-        self.actions[place] = action
-        self.rewards[place] = reward
-        self.added += 1
-
-    def size(self) -> int:
-        """Return how many steps of all environments can be sampled."""
+    @property
+    def count(self) -> int:
+        """Steps of all N environments that can be sampled."""
         return min(self.added, self._window)
 
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Draw transitions uniformly; observations and rewards are scaled by the statistics of ``env``."""
-        steps = np.random.randint(self.added - self.size(), self.added, size=batch_size)  # noqa: NPY002
-        return self._get_samples(steps % self._capacity, env)
-
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        envs = np.random.randint(0, self.n_envs, size=len(batch_inds))  # noqa: NPY002
-        first = batch_inds + batch_inds // self._horizon
-        data = (
-            self._normalize_obs(self.observations[first, envs], env),
-            self.actions[batch_inds, envs],
-            self._normalize_obs(self.observations[first + 1, envs], env),
-            # Truncation is no end: the value of the next observation always counts.
-            np.zeros((len(batch_inds), 1), np.float32),
-            self._normalize_reward(self.rewards[batch_inds, envs].reshape(-1, 1), env),
+    def sample(self, numbers: Tensor) -> Samples:
+        """Take transitions, uniformly from those that can be sampled, by large random integers, shape
+        [agent, row]."""
+        n, horizon = self._sizes.envs, self._sizes.horizon
+        env, steps = numbers % n, self._first + numbers // n % self._count
+        episode = self._agent * self._capacity + steps // horizon % self._capacity
+        step = steps % horizon
+        first = ((episode * (horizon + 1) + step) * n + env).reshape(-1)
+        place = ((episode * horizon + step) * n + env).reshape(-1)
+        observations = self._observations.view(-1, self._sizes.observed)
+        shape = *numbers.shape, -1
+        return Samples(
+            observations.index_select(0, first).view(shape),
+            self._actions.view(-1, self._sizes.actions).index_select(0, place).view(shape),
+            observations.index_select(0, first + n).view(shape),
+            self._rewards.view(-1).index_select(0, place).view(numbers.shape),
         )
-        return ReplayBufferSamples(*(self.to_torch(cast(np.ndarray, array)) for array in data))
 
-    def flush(self) -> None:
-        """Wait until the disk has everything that was added; ResultsError if it does not take it."""
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all agents' buffers."""
+        return 4 * self._agents * self._capacity * self._sizes.entries
+
+    def write(self, agent: int, path: Path) -> None:
+        """Append an agent's new episodes to its file, so that any checkpoint finds there what it knew;
+        ResultsError if that fails."""
+        since, last = self._written[agent], self.added // self._sizes.horizon
         try:
-            self._file.flush()
+            with path.open("r+b" if since else "wb") as file:
+                file.seek(since * self._sizes.entries * 4)
+                for episode in range(since, last):
+                    for part in self._parts(agent, episode):
+                        file.write(part.cpu().numpy().data)
         except OSError as error:
-            raise ResultsError(
-                f"cannot write the replay buffer {self._file.filename}: {error.strerror or error}"
-            ) from error
+            size = 4 * (last - since) * self._sizes.entries
+            raise ResultsError(f"cannot write the replay buffer {path}: {cause(error, size)}") from error
+        self._written[agent] = last
+
+    def read(self, paths: Sequence[Path], added: int) -> None:
+        """Take what the agents' files hold of steps of N environments, in whole episodes; ResultsError if
+        that fails."""
+        self._count_to(added)
+        last = added // self._sizes.horizon
+        self._written = [last] * self._agents
+        for agent, path in enumerate(paths):
+            try:
+                self._read(agent, path, range(max(0, last - self._capacity), last))
+            except (OSError, ValueError) as error:
+                raise ResultsError(f"cannot read the replay buffer {path}: {error}") from error
+
+    def _read(self, agent: int, path: Path, episodes: range) -> None:
+        with path.open("rb") as file:
+            file.seek(episodes.start * self._sizes.entries * 4)
+            for episode in episodes:
+                for part in self._parts(agent, episode):
+                    numbers = np.fromfile(file, np.float32, part.numel())
+                    part.copy_(torch.from_numpy(numbers).view(part.shape))
+
+    def _parts(self, agent: int, episode: int) -> list[Tensor]:
+        """Return an episode's places in the buffers, in the order in which they are in the file."""
+        tables = self._observations, self._actions, self._rewards
+        return [table[agent, episode % self._capacity] for table in tables]
 
 
-def _require_file(path: Path, size: int, *, create: bool) -> None:
-    """Create a file of a given size with all its room reserved, or check that it is there."""
-    if not create:
-        if not path.exists() or path.stat().st_size != size:
-            raise ResultsError(f"{path}, the replay buffer of the run, is gone: start afresh with force=true")
-        return
-    try:
-        path.unlink(missing_ok=True)
-        with path.open("wb") as file:
-            # Without room for a page, writing to the mapped file would kill the process without a word.
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(file.fileno(), 0, size)
-            else:
-                file.truncate(size)
-    except OSError as error:
-        path.unlink(missing_ok=True)
-        need = f"{size / 1e9:.1f} GB for the replay buffer"
-        raise ResultsError(f"cannot reserve {need} at {path}: {error.strerror or error}") from error
+def require_file(path: Path, sizes: Sizes, episodes: int) -> None:
+    """Raise ResultsError unless an agent's file holds some episodes of N environments."""
+    if episodes and (not path.exists() or path.stat().st_size < episodes * sizes.entries * 4):
+        raise ResultsError(f"{path}, the replay buffer of the run, is gone: start afresh with force=true")

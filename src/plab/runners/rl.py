@@ -1,184 +1,422 @@
-"""Reinforcement learning with Stable-Baselines3: ``sac``, ``td3``, ``ppo``.
+"""Reinforcement learning: ``sac``, ``td3`` and ``ppo``, one agent or many at once.
 
-A run alternates between training, for some episodes, and one episode of the deterministic policy, which gives
-a row of the results and comes with a checkpoint. To reproduce a result:
+The runs of a sweep that have the same section ``method`` are a population: agents and their environments in
+one simulator, with a file for each. A run alternates between training, for some episodes, and one episode of
+the deterministic policy, which gives a row of the results. To reproduce a result:
 
     python -m plab.run task=Torus variant=1 method=ppo seed=0
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor
 
-from plab.config import ConfigError, PolicyConfig, RlConfig
-from plab.progress import Report
+from plab.config import Config, OffPolicyConfig, RlConfig
+from plab.envs.core import Transition
+from plab.envs.observations import spaces
+from plab.envs.tensors import TensorEnv
+from plab.families import family
+from plab.problem import build_scenes
+from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.environments import PolicyRunner, evaluation, shared_batches
+from plab.runners.agents import Agents, OffPolicyAgents
+from plab.runners.common import LAST, episode_columns
 from plab.runners.jobs import RunError
-from plab.runners.loggers import RunLog
-from plab.runners.model_state import restore_policy
-from plab.runners.policy import save_policy
-from plab.runners.rl_models import Spaces, model_kind, total_steps
-from plab.runners.rl_trainer import Trainer
+from plab.runners.policy import (
+    Evaluation,
+    PolicyRunner,
+    Spaces,
+    save_policy,
+    shared_batches,
+    torch_settings,
+)
+from plab.runners.replay import Sizes, require_file
 from plab.runners.runner import Step, Track
 
-__all__ = ["RlRunner", "check_torch_device"]
+__all__ = ["Population", "RlRunner", "agents_of", "population_settings"]
+
+NOT_FINITE = "the policy's actions are not finite"
+
+
+def agents_of(method: RlConfig) -> type[Agents]:
+    """Return the agents that learn by a method's algorithm; ConfigError if they cannot be imported."""
+    return family(method.family).rule(method.algorithm, type)
+
+
+def population_settings(method: RlConfig) -> AbstractContextManager[None]:
+    """Return torch's settings for a population: on CUDA products of matrices are TF32's.
+
+    The first layers, of 1,200 entries and more, are what takes the time of an update on a GPU.
+    """
+    return torch_settings(method.torch_threads, tf32=method.torch_device == "cuda")
+
+
+class Population:
+    """Agents that stand at the same step, with environments that may be more than theirs.
+
+    On CUDA the agents' parameters are stacked. On the CPU each agent is a stack of its own: there libraries
+    choose their kernels by shape, and an agent would not have the bits that it has alone.
+
+    Attributes:
+        stacks: The agents.
+        episodes: Complete episodes of each agent so far.
+    """
+
+    def __init__(
+        self,
+        cfgs: Sequence[Config],
+        numbers: Sequence[int],
+        training: TensorEnv,
+        evaluation: TensorEnv,
+        states: Sequence[Mapping[str, Any] | None],
+    ) -> None:
+        """Build the agents, of configurations alike in ``method``, new or from one of :meth:`states` each;
+        those with a replay buffer have to read it afterwards. Their ``numbers`` are among those for whom
+        there are environments: of the training N each, of the evaluation one."""
+        method = cfgs[0].method_as(RlConfig)
+        self._training, self._evaluation = training, evaluation
+        self._device = torch.device(method.torch_device)
+        self._numbers = torch.tensor(numbers, device=self._device)
+        # Whether there are no environments but theirs.
+        self._alone = len(cfgs) == evaluation.batch.size
+        self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
+        kind, batch = agents_of(method), training.batch
+        self._cycle = kind.cycle_steps(method, self._horizon)
+        self._total = kind.training_steps(method, self._horizon)
+        size = len(cfgs) if self._device.type == "cuda" else 1
+        spaces = Spaces(batch.observation_space, batch.action_space)
+        parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
+        self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
+        self._lost = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
+        self._broken: dict[int, list[str]] = {}
+        self._ended_since = 0
+        self._episode_actions: list[Tensor] = []
+        self._ended: list[Tensor] = []
+        self._start(states)
+
+    @property
+    def steps(self) -> int:
+        """Transitions of each agent so far."""
+        return self.stacks[0].steps
+
+    @property
+    def episodes(self) -> int:
+        """Complete episodes of each agent so far."""
+        return self.steps // self._horizon
+
+    def place(self, agent: int) -> tuple[Agents, int]:
+        """Return the stack that an agent is in, and its number there."""
+        stack, number = divmod(agent, self.stacks[0].count)
+        return self.stacks[stack], number
+
+    def train(self, episodes: int, report: Callable[[], None] = lambda: None) -> None:
+        """Train until each agent has done some episodes, or all its transitions; ``report`` is called when
+        a batch of episodes has ended."""
+        if self.steps == 0:
+            for stack, part in zip(self.stacks, self._split(self._observations), strict=True):
+                stack.begin(part)
+        while self.episodes < episodes and self.steps < self._total:
+            for _ in range(self._cycle // self._envs):
+                self._step()
+                if self.steps % (self._envs * self._horizon) == 0:
+                    report()
+
+    def evaluate(self) -> list[Evaluation]:
+        """Run an episode of each agent's deterministic policy."""
+        columns = episode_columns(self._evaluation.batch.problem.term_names)
+        observations = self._own(self._evaluation.reset(), 1)
+        sums: dict[str, Tensor] = {}
+        actions: list[Tensor] = []
+        failures: dict[int, str] = {}
+        for _ in range(self._horizon):
+            parts = zip(self.stacks, self._split(observations), strict=True)
+            actions.append(torch.cat([stack.decide(part) for stack, part in parts]))
+            done = self._advance(self._evaluation, actions[-1])
+            failures = dict(done.failures) | failures
+            values = done.info | {"reward": done.reward}
+            sums = {n: values[n] if n in LAST or n not in sums else sums[n] + values[n] for n in columns}
+            observations = self._own(done.observation, 1)
+        # From the device at once.
+        rows = torch.stack([sums[name] for name in columns]).cpu().numpy()
+        ran = torch.stack(actions, dim=1).squeeze(2)
+        self._lost |= ~ran.isfinite().all(2).all(1)
+        evaluations = []
+        for own, k in zip(ran.cpu().numpy(), self._numbers.tolist(), strict=True):
+            measures = dict(zip(columns, rows[:, k].tolist(), strict=True))
+            evaluations.append(Evaluation(measures, own, failures.get(k, "")))
+        return evaluations
+
+    def take_statistics(self) -> list[dict[str, float]]:
+        """Return each agent's means over the episodes that ended since the last call, NaN if none has."""
+        names = ("train_reward", "train_score")
+        if not self._ended:
+            return [dict.fromkeys(names, np.nan) for _ in range(len(self._numbers))]
+        # By episode, measure, agent and environment; summed agent by agent, for the same bits in any company.
+        ended = torch.stack(self._ended).cpu().numpy()
+        self._ended = []
+        agents = range(ended.shape[2])
+        return [{n: float(np.mean(ended[:, i, k].copy())) for i, n in enumerate(names)} for k in agents]
+
+    def take_losses(self) -> list[dict[str, float]]:
+        """Return each agent's mean losses over the updates since the last call, if they are kept."""
+        return [losses for stack in self.stacks for losses in stack.take_losses()]
+
+    def lost(self) -> dict[int, str]:
+        """Return why agents cannot go on, by their numbers: their networks are not finite."""
+        numbers = self._numbers.tolist()
+        return {numbers[place]: NOT_FINITE for place in torch.nonzero(self._lost).flatten().tolist()}
+
+    def take_broken(self) -> tuple[dict[int, list[str]], int]:
+        """Return when and why episodes of training broke off that ended since the last call, by the agents'
+        numbers, and how many of each agent ended."""
+        taken = self._broken, self._ended_since
+        self._broken, self._ended_since = {}, 0
+        return taken
+
+    def states(self) -> list[dict[str, Any]]:
+        """Return each agent's state: all that further training depends on, except a replay buffer."""
+        states = [state for stack in self.stacks for state in stack.states()]
+        shape = (0, len(states), self._envs, self.stacks[0].sizes.actions)
+        acted = torch.stack(self._episode_actions) if self._episode_actions else torch.zeros(shape)
+        for k, state in enumerate(states):
+            state["episode_actions"] = acted[:, k].cpu().numpy()
+        return states
+
+    def _start(self, states: Sequence[Mapping[str, Any] | None]) -> None:
+        """Put agents and environments where they were."""
+        observations = self._own(self._training.reset(), self._envs)
+        self._reward = torch.zeros((len(states), self._envs), dtype=torch.float64, device=self._device)
+        if known := [state for state in states if state is not None]:
+            for place in range(0, len(known), self.stacks[0].count):
+                stack, _ = self.place(place)
+                stack.restore(known[place : place + stack.count])
+            acted = np.stack([state["episode_actions"] for state in known], axis=1)
+            for actions in torch.from_numpy(acted).to(self._device):
+                observations = self._own(self._advance_training(actions).observation, self._envs)
+        self._observations = observations
+
+    def _step(self) -> None:
+        """Make one step of all environments, and what the agents learn from it."""
+        parts = zip(self.stacks, self._split(self._observations), strict=True)
+        done = self._advance_training(torch.cat([stack.act(part) for stack, part in parts]))
+        last = self._own(done.observation, self._envs)
+        observations = self._own(self._training.reset(), self._envs) if done.truncated else last
+        rewards = self._own(done.reward, self._envs).squeeze(2).float()
+        gained = (self._split(part) for part in (rewards, last, observations))
+        for stack, *part in zip(self.stacks, *gained, strict=True):
+            stack.learn(*part, over=done.truncated)
+        self._observations = observations
+
+    def _advance_training(self, actions: Tensor) -> Transition:
+        """Advance the environments of the training, and note what an episode adds up to."""
+        done = self._advance(self._training, actions)
+        self._reward += self._own(done.reward, self._envs).squeeze(2)
+        self._episode_actions.append(actions)
+        if done.truncated:
+            # Networks that are not finite stay so: once an episode is soon enough.
+            self._lost |= ~actions.isfinite().all(2).all(1)
+            self._ended_since += self._envs
+            for env, text in done.failures.items():
+                self._broken.setdefault(env // self._envs, []).append(text)
+            score = self._own(done.info["score"], self._envs).squeeze(2)
+            self._ended.append(torch.stack([self._reward, score]))
+            self._reward.zero_()
+            self._episode_actions = []
+        return done
+
+    def _advance(self, env: TensorEnv, actions: Tensor) -> Transition:
+        """Advance environments; those of agents that are not here rest."""
+        everyone = actions.double().nan_to_num()
+        if not self._alone:
+            own, size = everyone, env.batch.size // actions.shape[1]
+            everyone = own.new_zeros((size, *own.shape[1:])).index_copy_(0, self._numbers, own)
+        return env.step(everyone.flatten(0, 1), strict=False)
+
+    def _own(self, table: Tensor, envs: int) -> Tensor:
+        """Return the agents' rows of a table of all environments, shape [agent, env, entry or 1]."""
+        rows = table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
+        return rows if self._alone else rows.index_select(0, self._numbers)
+
+    def _split(self, table: Tensor) -> list[Tensor]:
+        return list(table.split([stack.count for stack in self.stacks]))
 
 
 class RlRunner(PolicyRunner):
-    """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy."""
+    """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
+
+    Runs that stand at different evaluations are trained one group after the other, until all are abreast.
+    """
 
     kind = RlConfig
-    _trainer: Trainer | None = None
-    _watch: _Watch | None = None
+    _population: Population | None = None
+    _members: Sequence[Track] = ()
+    _shown = ""
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its settings."""
+        return population_settings(self.method)
 
     def build(self) -> None:
-        """Make the environments of the training, and the one in the hard contact model that judges."""
-        cfgs = [self.tracks[0].cfg]
-        check_torch_device(self.method)
-        kinds = (cfgs, self.method.num_envs, self.method.contact), (cfgs, 1, "hard")
-        self._training, self._evaluation = shared_batches(self.cache, *kinds)
-        self.problem = self._evaluation.problem
+        """Make the environments of the training, and those in the hard contact model that judge."""
+        self.require_torch_device()
+        cfgs, method = [track.cfg for track in self.tracks], self.method
+        self._spaces = Spaces(*spaces(cfgs[0], build_scenes(cfgs)))
+        (observed,), (actions,) = (space.shape for space in self._spaces)
+        self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
+        self._total = agents_of(method).training_steps(method, self._sizes.horizon)
+        self._require_memory()
+        own = [cfg for cfg in cfgs for _ in range(method.num_envs)]
+        kinds = (own, len(own), method.contact), (cfgs, len(cfgs), "hard")
+        self._training, self._evaluation = map(TensorEnv, shared_batches(self.cache, *kinds))
+        self.problem = self._evaluation.batch.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the model, or take that of the last checkpoint, unless its training is over."""
-        self._replay_path = track.job.run.path.with_suffix(REPLAY_SUFFIX)
-        if state is None or int(state["steps"]) < total_steps(self.method, track.cfg.sim.horizon):
-            self._trainer = Trainer(track.cfg, self._training, self._replay_path, state)
-            outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
-            self._trainer.model.set_logger(Logger(folder=None, output_formats=outputs))
-        else:
+        """See that the replay buffer is there; the networks are made with those of the others."""
+        track.job.run.result.provenance["batch"] = len(self.tracks)
+        if state is not None:
             # Now, where what does not fit is answered.
-            self._policy(state)
+            agents_of(self.method).trained_policy(track.cfg, self._spaces, state)
+        if isinstance(self.method, OffPolicyConfig) and self.has_more(track):
+            try:
+                require_file(_replay_path(track), self._sizes, self._episodes(state) // self._sizes.envs)
+            except ResultsError as error:
+                track.job.fail(error)
 
     def has_more(self, track: Track) -> bool:
         """Whether there are steps to train for."""
-        return self._trainer is not None and self._trainer.steps < self._trainer.total_steps
+        state = track.job.run.result.resume
+        return state is None or int(state["steps"]) < self._total
 
-    def step(self, track: Track) -> Step:
-        """Train until the next evaluation is due, except before the first, and run the policy once."""
-        trainer = cast(Trainer, self._trainer)
-        before = trainer.steps
-        # The first episode, of the untrained policy, compiles the kernels.
-        if track.iteration > 0:
-            self._train(trainer, track)
-            if why := self.note_broken(track, *trainer.take_broken()):
-                raise RunError(f"iteration {track.iteration}: {why}")
-            self.enter("evaluate")
-        done = evaluation(self._evaluation, trainer.predict)
-        if why := self.note_evaluation(track, done.failure):
-            raise RunError(f"iteration {track.iteration}: {why}")
-        measured = done.measures | trainer.take_statistics()
-        simulated = trainer.steps - before + len(done.actions)
-        # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
-        counts = trainer.episodes, trainer.steps, simulated
-        return Step(measured, done.actions, trainer.state(), *counts, keep=True, whole=not done.failure)
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Train the runs that have come least far until their next evaluation is due, and evaluate them."""
+        start = time.perf_counter()
+        least = min(track.iteration for track in tracks)
+        members = [track for track in tracks if track.iteration == least]
+        population = self._population_of(members)
+        before = population.steps
+
+        def report() -> None:
+            pace = (population.steps - before) * len(members) / (time.perf_counter() - start)
+            others = self._least([track for track in tracks if track not in members], population.episodes)
+            self.report(min(population.episodes, others), f"{pace:.0f} steps/s {self._shown}")
+
+        # The first episode, of the untrained policies, compiles the kernels.
+        if least > 0:
+            self.enter("optimise", members)
+            columns = members[0].job.run.result.columns
+            population.train(int(columns["episodes"][-1]) + self.method.evaluate_every, report)
+            self.enter("evaluate", members)
+        evaluations, trained = population.evaluate(), population.take_statistics()
+        losses, states = population.take_losses(), population.states()
+        lost, (broken, ended) = population.lost(), population.take_broken()
+        share = (time.perf_counter() - start) / len(members)
+        for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
+            start = time.perf_counter()
+            unusable = self.unusable(track, broken.get(track.number, ()), ended, done.failure)
+            if why := lost.get(track.number) or unusable:
+                track.fail(why)
+                continue
+            try:
+                stack, number = population.place(place)
+                if isinstance(stack, OffPolicyAgents):
+                    stack.replay.write(number, _replay_path(track))
+                trained_by = {f"train/{name}": loss for name, loss in losses[place].items()}
+                track.log.write(trained_by, population.steps)
+            except ResultsError as error:
+                track.job.fail(error)
+                continue
+            seconds = share + time.perf_counter() - start
+            measured = done.measures | trained[place]
+            finished = population.steps >= self._total
+            simulated = population.steps - before + len(done.actions)
+            counts = population.episodes, population.steps, simulated
+            whole = not done.failure
+            step = Step(
+                measured, done.actions, states[place], *counts, seconds=seconds, keep=finished, whole=whole
+            )
+            yield track, step
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
-        horizon = self.tracks[0].cfg.sim.horizon
-        total = total_steps(self.method, horizon) // horizon
-        return total if self._trainer is None else self._trainer.episodes, total, self.method.evaluate_every
+        total = self._total // self._sizes.horizon
+        return self._least(self.tracks), total, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Leave it to the training, which reports every episode."""
+        """Note how the agents that were evaluated do on average; the training reports the pace, too."""
+        reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
+        mean = "" if len(rows) == 1 else "mean "
+        self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
+        self.report(self._least(tracks), self._shown)
 
     def close(self) -> None:
-        """Let go of the replay buffer."""
-        if self._trainer is not None:
-            self._trainer.close()
+        """Let go of networks and replay buffers."""
+        self._population = None
 
     def conclude(self, track: Track) -> None:
-        """Keep the policy of the last checkpoint, after which nothing is sampled any more."""
-        state = cast("dict[str, Any]", track.job.run.result.resume)
+        """Keep the policy of the last evaluation, after which nothing is sampled any more."""
+        state = track.job.run.result.resume or {}
+        policy = agents_of(self.method).trained_policy(track.cfg, self._spaces, state)
         moments = None
-        if state["statistics"]:
-            moments = state["statistics"]["observation"]["mean"], state["statistics"]["observation"]["var"]
-        save_policy(track.job.run.path, self.method, self._policy(state), moments)
-        self._replay_path.unlink(missing_ok=True)
+        if getattr(self.method, "normalise", False):
+            moments = state["observation_mean"], state["observation_var"]
+        save_policy(track.job.run.path, self.method, policy, moments)
+        _replay_path(track).unlink(missing_ok=True)
 
-    def _policy(self, state: Mapping[str, Any]) -> BasePolicy:
-        """Return the policy of a checkpoint; ValueError if it is that of another model, or was pickled."""
-        kind = model_kind(self.method.family, self.method.algorithm)
-        spaces = Spaces(self._evaluation.observation_space, self._evaluation.action_space)
-        policy = kind.policy(self.method, spaces)
-        restore_policy(policy, state["model"])
-        return policy
+    def _population_of(self, members: Sequence[Track]) -> Population:
+        """Return the population of some runs, a new one if it is of others."""
+        numbers = [track.number for track in members]
+        if self._population is None or numbers != [track.number for track in self._members]:
+            # Let go of the old one first: there may be no room for two.
+            self._population = None
+            cfgs, states = [t.cfg for t in members], [t.job.run.result.resume for t in members]
+            try:
+                self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
+            except (LookupError, ValueError, TypeError) as error:
+                files = ", ".join(str(track.job.run.partial_path) for track in members)
+                raise ResultsError(
+                    f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
+                ) from error
+            self._members = members
+            paths = [_replay_path(track) for track in members]
+            for stack in self._population.stacks:
+                stack.watched = any(track.log.wanted for track in members)
+                own, paths = paths[: stack.count], paths[stack.count :]
+                if isinstance(stack, OffPolicyAgents) and stack.steps:
+                    stack.replay.read(own, stack.steps // stack.sizes.envs)
+        return self._population
 
-    def _train(self, trainer: Trainer, track: Track) -> None:
-        self.enter("optimise")
-        columns = track.job.run.result.columns
-        due = int(columns["episodes"][-1]) + self.method.evaluate_every
-        self._watch = self._watch or _Watch(trainer, self.report)
-        self._watch.score = float(columns["score"][-1])
-        while trainer.episodes < due and trainer.steps < trainer.total_steps:
-            trainer.advance(self._watch)
+    def _require_memory(self) -> None:
+        """Raise RunError if there is no room for all replay buffers; on the CPU there always is for one."""
+        method, cfg = self.method, self.tracks[0].cfg
+        if not isinstance(method, OffPolicyConfig):
+            return
+        each = 4 * self._sizes.entries * self._sizes.capacity(method, self._total)
+        if method.torch_device == "cuda":
+            # The simulators and the networks take little beside them.
+            room = 0.9 * torch.cuda.mem_get_info()[0]
+        else:
+            room = max(cfg.sim.memory_mb * 1e6, each)
+        if len(self.tracks) * each > room:
+            raise RunError(
+                f"no room for {len(self.tracks)} replay buffers of {each / 1e9:.1f} GB: "
+                f"{room / 1e9:.1f} GB are free; set a smaller method.buffer_size or method.torch_device=cpu"
+            )
 
+    def _least(self, tracks: Sequence[Track], default: int = 0) -> int:
+        states = [track.job.run.result.resume for track in tracks if track.job.error is None]
+        return min(map(self._episodes, states), default=default)
 
-class _Watch(BaseCallback):
-    """Follows the training: notes the actions of the episode under way, reports the episodes that end.
-
-    Attributes:
-        score: Score of the last evaluation.
-    """
-
-    def __init__(self, trainer: Trainer, report: Report) -> None:
-        super().__init__()
-        self._trainer, self._report = trainer, report
-        self.score = math.nan
-        self._first: tuple[float, int] | None = None
-
-    def _on_step(self) -> bool:
-        # PPO keeps the actions as drawn, and gives the environments clipped ones.
-        actions = self.locals.get("clipped_actions", self.locals["actions"])
-        if self._trainer.note_step(actions, self.locals["infos"]):
-            self._report(self.num_timesteps // self._trainer.horizon, self._text())
-        return True
-
-    def _text(self) -> str:
-        now = time.perf_counter()
-        text = f"reward {self._trainer.last_reward:.4g} hard score {self.score:.3f}"
-        if self._first is None:
-            # What was before compiled the kernels.
-            self._first = now, self.num_timesteps
-            return text
-        begin, before = self._first
-        return f"{(self.num_timesteps - before) / (now - begin):.0f} steps/s {text}"
-
-
-class _Diagnostics(KVWriter):
-    """Passes on what Stable-Baselines3 logs of the training."""
-
-    def __init__(self, log: RunLog) -> None:
-        self._log = log
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        """Pass on the numbers, at some transitions of training."""
-        numbers = {
-            name: float(value)
-            for name, value in key_values.items()
-            if isinstance(value, int | float | np.number) and "tensorboard" not in key_excluded[name]
-        }
-        self._log.write(numbers, step)
-
-    def close(self) -> None:
-        """Leave the log to the run."""
+    def _episodes(self, state: Mapping[str, Any] | None) -> int:
+        return 0 if state is None else int(state["steps"]) // self._sizes.horizon
 
 
-def check_torch_device(method: PolicyConfig) -> None:
-    """Raise ConfigError, before anything is built, if torch does not have the device."""
-    if method.torch_device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(
-            "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
-        )
+def _replay_path(track: Track) -> Path:
+    return track.job.run.path.with_suffix(REPLAY_SUFFIX)

@@ -19,10 +19,10 @@ import torch
 from plab.autograd import Stretch, policy_gradient
 from plab.config import Config, ShacConfig
 from plab.envs.core import EpisodeBatch
-from plab.runners.actors import ActorKind, ActorPolicy, ActorRunner, ActorTraining, actor_network, set_rate
-from plab.runners.rl_models import Spaces
+from plab.runners.actors import ActorPolicy, ActorRunner, ActorTraining, actor_network, set_rate
+from plab.runners.policy import Spaces
 
-__all__ = ["SHAC", "ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
+__all__ = ["ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
 
 
 class ShacPolicy(ActorPolicy):
@@ -44,14 +44,8 @@ class ShacPolicy(ActorPolicy):
         return torch.tanh(mean + self.log_std.exp() * noise)
 
 
-SHAC = ActorKind(network=ShacPolicy)
-"""What reads a policy's file; the name that ``method.algorithm`` gives it is in :mod:`plab.families`."""
-
-
 class ShacTraining(ActorTraining):
     """Policy, value function, their optimisers, and the episodes from which they learn."""
-
-    actor = SHAC
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
@@ -62,6 +56,11 @@ class ShacTraining(ActorTraining):
             self._value = actor_network(self._spaces, 1, method.hidden).to(self._device)
         self._target = copy.deepcopy(self._value).requires_grad_(False)
         self._value_optimizer = torch.optim.Adam(self._value.parameters(), lr=method.value_lr)
+
+    @staticmethod
+    def make_policy(method: ShacConfig, spaces: Spaces) -> ShacPolicy:
+        """Return the policy that training begins with, on the CPU."""
+        return ShacPolicy(spaces, method)
 
     def train(self) -> None:
         """Run one episode of all environments, window by window."""

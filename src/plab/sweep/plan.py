@@ -58,20 +58,20 @@ def _kind(cfg: Config, scene: Scene) -> list[Any]:
     seen = [getattr(cfg, key) for key in OBSERVED]
     kind = [cfg.task.name, cfg.method.family, seen, *shared, loss]
     own = family(cfg.method.family)
-    if not (own.batching or own.joins_populations(cfg.method)):
+    if not own.batching:
         return [*kind, cfg.variant, asdict(cfg.task), method]
     # Runs of other lengths would have environments wait for each other, and agents learn in step.
-    alike = row_count(method) if own.batching else method
+    alike = method if own.in_step else row_count(method)
     return [*kind, alike, *scene_kind(scene)]
 
 
 def _limit(cfg: Config, size: int | None, sharing: int) -> int:
     own, scene = family(cfg.method.family), build_scene(cfg)
-    if not (own.batching or own.joins_populations(cfg.method)):
+    if not own.batching:
         return 1
     if size is not None:
         return size
-    if own.batching:
+    if not own.in_step:
         return batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
     # Agents need no gradient, so sim.memory_mb, the budget of one, is none of theirs.
     room = most_environments(scene, cfg.sim.precision, cfg.sim.device) // sharing

@@ -62,10 +62,5 @@ class Cmaes(Sampler):
         """Return to a :meth:`state`."""
         super().restore(state)
         self.settle(self.memory["best"])
-        fresh, held = self._search.__getstate__(), {}
-        for name, value in state["search"].items():
-            kept, own = np.asarray(value), fresh[name]
-            if own is not None and kept.shape != np.shape(own):
-                raise ValueError(f"the search's {name} has shape {list(kept.shape)}")
-            held[name] = kept[()]
-        self._search.__setstate__(fresh | held)
+        held = {name: np.asarray(value)[()] for name, value in state["search"].items()}
+        self._search.__setstate__(self._search.__getstate__() | held)

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from plab.config import MultistartConfig
-from plab.runners.model_state import alike, moments
 from plab.runners.planners.planner import Asking, CandidateStart, Planner, Request
 
 __all__ = ["Multistart"]
@@ -103,18 +103,14 @@ class Multistart(Planner):
         moments = {k: {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in held.items()}
         return super().state() | {"actions": self._actions().cpu().numpy(), "moments": moments}
 
-    def shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Return the shapes of what the memory may hold."""
-        return super().shapes() | {"order": (len(self._places),)}
-
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to a :meth:`state`."""
         super().restore(state)
-        actions = alike(state["actions"], self._actions(), "actions")
-        if "order" in self.memory and sorted(self.memory["order"].tolist()) != list(range(len(self._places))):
-            raise ValueError("its order is none of the candidates")
-        self._put(actions, range(len(self._places)))
+        self._put(torch.tensor(state["actions"]), range(len(self._places)))
         for k, own in state.get("moments", {}).items():
             place = self._places[int(k)]
             # The number of steps stays on the CPU, as Adam has it.
-            self._adam.state[place] = moments(own, place)
+            self._adam.state[place] = {
+                name: torch.tensor(np.asarray(v), device="cpu" if name == "step" else place.device)
+                for name, v in own.items()
+            }

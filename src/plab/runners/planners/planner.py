@@ -22,8 +22,8 @@ from plab.config import MethodConfig, PlannerConfig, StagesConfig
 from plab.families import family
 from plab.problem import Episodes, build_scenes
 from plab.runners.common import shared_problem
-from plab.runners.environments import torch_settings
 from plab.runners.planners.starts import ContactStarts
+from plab.runners.policy import torch_settings
 from plab.runners.runner import Runner, Step, Track
 from plab.scenes import Scene
 from plab.sim.memory import batch_limit
@@ -175,26 +175,10 @@ class Planner(ABC):
         return {"iteration": self.iteration, "memory": arrays}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`.
-
-        Raises:
-            ValueError: If it is that of another run.
-        """
+        """Return to a :meth:`state`."""
         self.iteration = int(state["iteration"])
-        arrays, shapes = state.get("memory", {}), self.shapes()
-        for name, array in arrays.items():
-            shape, wanted = np.shape(array), shapes.get(name)
-            if wanted is None or len(shape) != len(wanted):
-                raise ValueError(f"its {name} has shape {list(shape)}")
-            if any(size not in (None, own) for size, own in zip(wanted, shape, strict=True)):
-                raise ValueError(f"its {name} has shape {list(shape)}")
-        self.memory = {
-            name: torch.as_tensor(array, device=self.start.device) for name, array in arrays.items()
-        }
-
-    def shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Return the shapes of what :attr:`memory` may hold; a size of None is any."""
-        return {"champion": self.start.shape, "cost": ()}
+        arrays = state.get("memory", {}).items()
+        self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
 
 
 def make_planner(method: MethodConfig, start: CandidateStart) -> Any:

@@ -60,12 +60,6 @@ class Sampler(Planner):
         drawn = self.start.draw(self.method, self.method.population - len(kept), random)
         self.memory["candidates"] = torch.cat([kept, drawn])
 
-    def shapes(self) -> dict[str, tuple[int | None, ...]]:
-        """Return the shapes of what the memory may hold."""
-        curve = self.knots, self.start.shape[1]
-        curves = {"best": curve, "mean": curve, "std": curve}
-        return super().shapes() | {"candidates": (None, *self.start.shape)} | curves
-
     def candidates(self) -> Tensor:
         """Return the curves drawn last, the best first."""
         return self.memory["candidates"]

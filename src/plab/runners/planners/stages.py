@@ -42,8 +42,6 @@ class Stages:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to a :meth:`state`."""
-        if not 0 <= int(state["stage"]) < len(self._methods):
-            raise ValueError(f"it has no stage {int(state['stage'])}")
         self._enter(int(state["stage"]))
         self._planner.restore(state["planner"])
 

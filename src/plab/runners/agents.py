@@ -1,7 +1,13 @@
-"""What agents of all algorithms share: stacks, random numbers, and the state that a checkpoint holds."""
+"""Agents that learn in step with each other, as ``sac``, ``td3`` and ``ppo`` have them: one or many at once.
+
+The agents share nothing but the launches: parameters are stacked, [agent, ...], and multiplied in batches.
+Each has environments, a replay buffer, statistics and random numbers of its own, starts with the networks
+that Stable-Baselines3 would give it, and does what Stable-Baselines3 does, update by update.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -13,38 +19,77 @@ from torch import Tensor
 from torch.optim import Adam
 
 from plab.config import Config, OffPolicyConfig, RlConfig
-from plab.families import family
-from plab.runners.population.draws import Block, Draws
-from plab.runners.population.graphs import CapturedUpdate
-from plab.runners.population.networks import Networks, fill, flat
-from plab.runners.population.replay import ReplayBuffer, Sizes
-from plab.runners.rl_models import Spaces, model_kind, total_steps
+from plab.runners.networks import CapturedUpdate, Networks, fill, flat
+from plab.runners.policy import Spaces, first_policy
+from plab.runners.replay import ReplayBuffer, Sizes
 
-__all__ = ["Agents", "OffPolicyAgents", "first_policy", "trained_policy"]
+__all__ = ["Agents", "Block", "Draws", "OffPolicyAgents"]
 
 BLOCK = 50
 """Entries that are drawn at once."""
 
-
-def first_policy(cfg: Config, spaces: Spaces) -> BasePolicy:
-    """Return the policy with which Stable-Baselines3 would begin a run, on the CPU."""
-    method = cfg.method_as(RlConfig)
-    return model_kind(method.family, method.algorithm).policy(method, spaces, cfg.seed)
+LARGEST = 2**62
+"""Integers are drawn below it, and taken modulo what is asked for: then they are uniform to 1e-12."""
 
 
-def trained_policy(cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
-    """Return Stable-Baselines3's policy with the networks of one of :meth:`Agents.states`; ValueError if
-    they are others."""
-    method = cfg.method_as(RlConfig)
-    policy = first_policy(cfg, spaces)
-    kind: type[Agents] = family(method.family).agents(method.algorithm)
-    networks = Networks([policy], kind.PARTS, torch.device("cpu"))
-    row = torch.from_numpy(state["networks"])[None]
-    if row.shape != flat(networks.parameters(), 1).shape:
-        raise ValueError(f"its networks have {row.numel()} parameters")
-    fill(networks.parameters(), row)
-    networks.write_to(policy, 0)
-    return policy
+class Draws:
+    """Generators of K agents on a device; what one draws does not depend on the others."""
+
+    def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
+        """Seed a generator per agent."""
+        self._generators = [torch.Generator(device).manual_seed(seed) for seed in seeds]
+        self._device = device
+
+    def _each(self, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
+        return torch.stack([draw(generator) for generator in self._generators])
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal numbers, shape [agent, ...]."""
+        return self._each(lambda g: torch.randn(shape, generator=g, device=self._device))
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Numbers uniform in [-1, 1), shape [agent, ...]."""
+        return self._each(lambda g: torch.rand(shape, generator=g, device=self._device)) * 2.0 - 1.0
+
+    def integers(self, *shape: int) -> Tensor:
+        """Integers uniform in [0, :data:`LARGEST`), shape [agent, ...]."""
+        return self._each(lambda g: torch.randint(LARGEST, shape, generator=g, device=self._device))
+
+    def permutation(self, count: int) -> Tensor:
+        """The numbers below ``count`` in random order, shape [agent, count]."""
+        return self._each(lambda g: torch.randperm(count, generator=g, device=self._device))
+
+    def states(self) -> list[np.ndarray]:
+        """Return the state of each generator."""
+        return [generator.get_state().numpy() for generator in self._generators]
+
+    def restore(self, states: Sequence[np.ndarray]) -> None:
+        """Return to :meth:`states`."""
+        for generator, state in zip(self._generators, states, strict=True):
+            generator.set_state(torch.from_numpy(np.array(state, np.uint8)))
+
+
+class Block:
+    """Hands out entries of a block of random numbers one by one, and draws the next block when it is used up.
+
+    At a checkpoint the rest is to be dropped: a process that resumes begins with a new block.
+    """
+
+    def __init__(self, draw: Callable[..., Tensor], length: int, *shape: int) -> None:
+        """Take over a method of :class:`Draws`, and the length of a block and the shape of an agent's
+        entry."""
+        self._draw, self._shape = draw, (length, *shape)
+        self.drop()
+
+    def drop(self) -> None:
+        """Forget what has not been handed out."""
+        self._rest: list[Tensor] = []
+
+    def next(self) -> Tensor:
+        """Return an entry, shape [agent, ...]."""
+        if not self._rest:
+            self._rest = list(self._draw(*self._shape).unbind(1))[::-1]
+        return self._rest.pop()
 
 
 class Agents:
@@ -74,16 +119,46 @@ class Agents:
         ``method``."""
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
+        first = [first_policy(cfg.method_as(RlConfig), spaces, cfg.seed) for cfg in cfgs]
         (observed,), (actions,) = (space.shape for space in spaces)
         self.sizes = Sizes(self.method.num_envs, horizon, observed, actions)
-        self.total_steps = total_steps(self.method, horizon)
+        self.total_steps = self.training_steps(self.method, horizon)
         self.steps = self.updates = 0
         self.draws = Draws([cfg.seed for cfg in cfgs], device)
-        self.networks = Networks([first_policy(cfg, spaces) for cfg in cfgs], self.PARTS, device)
+        self.networks = Networks(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
         self._blocks: list[Block] = []
         self._updates: dict[str, CapturedUpdate] = {}
         self._losses: dict[str, list[Tensor]] = {}
+
+    @staticmethod
+    @abstractmethod
+    def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
+        """Return Stable-Baselines3's policy with the first weights, on the CPU."""
+
+    @classmethod
+    def trained_policy(cls, cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
+        """Return Stable-Baselines3's policy with the networks of one of :meth:`states`; ValueError if
+        they are others."""
+        policy = first_policy(cfg.method_as(RlConfig), spaces, cfg.seed)
+        networks = Networks([policy], cls.PARTS, torch.device("cpu"))
+        row = torch.from_numpy(state["networks"])[None]
+        if row.shape != flat(networks.parameters(), 1).shape:
+            raise ValueError(f"its networks have {row.numel()} parameters")
+        fill(networks.parameters(), row)
+        networks.write_to(policy, 0)
+        return policy
+
+    @classmethod
+    def cycle_steps(cls, method: Any, horizon: int) -> int:
+        """Return after how many transitions training can pause: a batch of episodes, or an update."""
+        return method.num_envs * horizon
+
+    @classmethod
+    def training_steps(cls, method: Any, horizon: int) -> int:
+        """Return the transitions of the whole training, ``method.episodes`` in whole cycles."""
+        cycle = cls.cycle_steps(method, horizon)
+        return math.ceil(method.episodes * horizon / cycle) * cycle
 
     def begin(self, observations: Tensor) -> None:
         """Take the observations with which the training begins, shape [agent, env, entry]."""

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import Tensor, nn
 
 from plab.config import Config, PpoConfig
-from plab.runners.population.agents import Agents
-from plab.runners.population.graphs import require_capturable
-from plab.runners.population.networks import adam, descend, linear, mlp
-from plab.runners.rl_models import CLIP, Spaces, entropy_weight, observed_steps, rollout_steps
+from plab.runners.agents import Agents
+from plab.runners.networks import adam, descend, linear, mlp, require_capturable
+from plab.runners.policy import CLIP, EPSILON, Spaces
 
 __all__ = ["PpoAgents", "Statistics"]
 
-EPSILON = 1e-8
-"""Added to variances and standard deviations, as in Stable-Baselines3."""
+ACTION_GAIN = 0.01
+"""Stable-Baselines3's gain of the last layer of PPO's policy; that of the value function is 1."""
 
 TANH = nn.Tanh()
 
@@ -68,9 +68,12 @@ class PpoAgents(Agents):
         """Begin with untrained networks."""
         super().__init__(cfgs, spaces, device)
         agents, envs = self.count, self.sizes.envs
-        self._length = rollout_steps(self.method)
-        self._watched = observed_steps(self.method, self.sizes.horizon)
-        self._entropy = entropy_weight(self.method, self.sizes.actions)
+        self._length = self.cycle_steps(self.method, self.sizes.horizon) // envs
+        few = self.method.statistics_episodes
+        self._watched = math.inf if few is None else few * self.sizes.horizon
+        # Of the sum of the entropies of an action's components.
+        divisor = self.sizes.actions if self.method.entropy_mean else 1
+        self._entropy = self.method.entropy_coefficient / divisor
         self._seen = Statistics(agents, self.sizes.observed, device=device)
         self._earned = Statistics(agents, 1, device=device)
         self._returns = torch.zeros((agents, envs), dtype=torch.float64, device=device)
@@ -86,6 +89,22 @@ class PpoAgents(Agents):
         names = ("values", "log_probs", "rewards", "advantages", "returns")
         self.rollout = {name: torch.zeros(rollout, device=device) for name in names}
         self._over: list[bool] = []
+
+    @staticmethod
+    def make_policy(method: PpoConfig, spaces: Spaces) -> ActorCriticPolicy:
+        """Return Stable-Baselines3's policy, whose first weights are orthogonal, with the method's gains."""
+        policy = ActorCriticPolicy(
+            *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.Tanh
+        )
+        last = (policy.action_net, method.policy_gain / ACTION_GAIN), (policy.value_net, method.value_gain)
+        for layer, gain in last:
+            cast(nn.Linear, layer).weight.data.mul_(gain)
+        return policy
+
+    @classmethod
+    def cycle_steps(cls, method: PpoConfig, horizon: int) -> int:
+        """Return the transitions of an update."""
+        return method.num_envs * math.ceil(method.steps_per_update / method.num_envs)
 
     def begin(self, observations: Tensor) -> None:
         """Take the very first observations into the statistics."""

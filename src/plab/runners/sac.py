@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
+from stable_baselines3.sac.policies import SACPolicy
 from torch import Tensor, nn
 
-from plab.config import Config
-from plab.runners.population.agents import OffPolicyAgents
-from plab.runners.population.networks import adam, descend, follow, linear, mlp, twin_values
-from plab.runners.rl_models import Spaces
+from plab.config import Config, SacConfig
+from plab.runners.agents import OffPolicyAgents
+from plab.runners.networks import adam, descend, follow, linear, mlp, twin_values
+from plab.runners.policy import Spaces
 
 __all__ = ["SacAgents"]
 
@@ -50,6 +51,19 @@ class SacAgents(OffPolicyAgents):
         drawn = self.method.batch_size, self.sizes.actions
         self._now, self._next = (self._block(self.draws.normal, *drawn) for _ in range(2))
 
+    @staticmethod
+    def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
+        """Return Stable-Baselines3's policy with the authors' first weights: Glorot's uniform ones, and no
+        biases."""
+        policy = SACPolicy(*spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.ReLU)
+        for part in (policy.actor, policy.critic):
+            for layer in part.modules():
+                if isinstance(layer, nn.Linear):
+                    nn.init.xavier_uniform_(layer.weight)
+                    nn.init.zeros_(layer.bias)
+        policy.critic_target.load_state_dict(policy.critic.state_dict())
+        return policy
+
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
         """Draw actions."""
         mean, log_std = self._gaussian(observations)
@@ -67,7 +81,7 @@ class SacAgents(OffPolicyAgents):
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets from some transitions, see
-        :meth:`plab.runners.population.replay.ReplayBuffer.sample`, with standard normal noise of the actions
+        :meth:`plab.runners.replay.ReplayBuffer.sample`, with standard normal noise of the actions
         and of the next ones, shape [agent, row, action]; return coefficient and losses, shape [4, agent]."""
         networks = self.networks
         observations, actions, next_observations, rewards = self.replay.sample(numbers)

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
+from stable_baselines3.td3.policies import TD3Policy
 from torch import Tensor, nn
 
 from plab.config import Config, Td3Config
-from plab.runners.population.agents import OffPolicyAgents
-from plab.runners.population.networks import adam, descend, follow, mlp, twin_values
-from plab.runners.population.replay import Samples
-from plab.runners.rl_models import Spaces
+from plab.runners.agents import OffPolicyAgents
+from plab.runners.networks import adam, descend, follow, mlp, twin_values
+from plab.runners.policy import Spaces
+from plab.runners.replay import Samples
 
 __all__ = ["Td3Agents"]
 
@@ -41,6 +42,11 @@ class Td3Agents(OffPolicyAgents):
         }
         self._smoothing = self._block(self.draws.normal, self.method.batch_size, self.sizes.actions)
 
+    @staticmethod
+    def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
+        """Return Stable-Baselines3's policy with its own first weights."""
+        return TD3Policy(*spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.ReLU)
+
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
         """Add noise to the policy's actions."""
         return self._noisy(self._actor("actor", observations), noise)
@@ -62,7 +68,7 @@ class Td3Agents(OffPolicyAgents):
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update the critics from some transitions, see
-        :meth:`plab.runners.population.replay.ReplayBuffer.sample`, with standard normal noise of the target
+        :meth:`plab.runners.replay.ReplayBuffer.sample`, with standard normal noise of the target
         policy, shape [agent, row, action]; losses of shape [1, agent]."""
         return self._update_critics(self.replay.sample(numbers), noise).unsqueeze(0)
 
