@@ -126,7 +126,7 @@ def run(configurations: Sequence[Start], targets: list[np.ndarray] | None, **sim
 
 def mass_of(scene: Scene, x: np.ndarray) -> np.ndarray:
     """Mass tensor of positions."""
-    return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor)
+    return spread_mass(x, scene.grid_size, scene.particle_mass, scene.floor_stencil)
 
 
 def compare(

@@ -77,7 +77,7 @@ def env_step(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
 
     With the scene's ``numbers="release"``, rotations that are not of unit length are so from now on.
     """
-    if scene.numbers == "release":
+    if scene.digits_convention == "release":
         state = replace(state, poses=_unit_rotations(state.poses))
     for _ in range(scene.substeps):
         state = substep(scene, state, action, alpha)
@@ -152,7 +152,7 @@ def _stencil(scene: Scene, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Indices [particle, 27, 3], weights [particle, 27] and offsets x_node - x [particle, 27, 3] of the nodes
     around each particle."""
     base = x.detach() / scene.dx - 0.5
-    base = base.trunc() if scene.floor == "release" else base.floor()
+    base = base.trunc() if scene.floor_stencil == "release" else base.floor()
     fx = x / scene.dx - base
     w = torch.stack([0.5 * (1.5 - fx) ** 2, 0.75 - (fx - 1.0) ** 2, 0.5 * (fx - 0.5) ** 2], dim=1)
     corner = torch.cartesian_prod(torch.arange(3), torch.arange(3), torch.arange(3))

@@ -332,9 +332,7 @@ def test_manipulators_start_within_their_bounds():
     ("override", "message"),
     [
         ("sim.dt=1e-3", "dt 0.001 is above the stability limit 0.000171"),
-        ("sim.dt=1e-300", "dt 1e-300"),
         ("sim.particles_scale=1e-300", "sim.particles_scale=1e-300"),
-        ("task.youngs_modulus=1e308", "youngs_modulus"),
         ("task.poisson_ratio=0.5", "poisson_ratio"),
         ("task.gravity=[0,-1e9,0]", "gravity"),
         ("task.bodies.rope.shape=cone", "cone"),

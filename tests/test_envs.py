@@ -28,7 +28,7 @@ from plab.config.suite import suite_tasks
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
-from plab.objective import OBSERVED_PARTICLES, observation, target_observation, total_loss
+from plab.objective import OBSERVED_PARTICLES, target_observation, total_loss
 from plab.sim import SimulationError
 from suite import make_not_finite
 
@@ -115,13 +115,15 @@ def test_an_episode_is_that_of_the_simulator_and_the_objective(env: PlabEnv) -> 
     assert env.np_random.random() == np.random.default_rng(5).random()
     assert first["score"] == pytest.approx(0.0, abs=1e-6)
     count = problem.scenes[0].particle_count
-    assert start.shape == (6 * len(range(0, count, max(count // OBSERVED_PARTICLES, 1))) + 2 * 7,)
+    stride = max(count // OBSERVED_PARTICLES, 1)
+    assert start.shape == (6 * len(range(0, count, stride)) + 2 * 7,)
     for action in random_actions()[:, 0]:
         observed, reward, *end, info = env.step(action)
         ends.append(end)
         state = problem.simulator.state()
-        poses = [pose[:7] for pose in state.poses[0]]
-        np.testing.assert_array_equal(observed, observation(state.x[0], state.v[0], poses).astype(np.float32))
+        particles = np.concatenate([state.x[0], state.v[0]], axis=1)[::stride]
+        whole = np.concatenate([particles.ravel(), state.poses[0, :, :7].ravel()])
+        np.testing.assert_array_equal(observed, whole.astype(np.float32))
         assert env.observation_space.contains(observed)
         terms = problem.simulator.losses()[0]
         assert [info["loss_density"], info["loss_sdf"], info["loss_contact"]] == list(terms)

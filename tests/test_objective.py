@@ -15,7 +15,6 @@ from plab.objective import (
     TARGET_ENTRIES,
     batch_scores,
     mass_change,
-    observation,
     rewards,
     score_scale,
     scores,
@@ -164,22 +163,6 @@ def test_total_loss_and_rewards(rng):
         assert loss[b, t] == pytest.approx(10 * d + 5 * s + 2 * c)
         assert reward[b, t] == pytest.approx(10 * (d0 - d) + 5 * (s0 - s) + 2 * (c0 - c))
     assert rewards(initial[0], steps[0], weights).shape == (6,)
-
-
-def test_observation_alone_and_in_a_batch(rng):
-    counts = ((10, 10), (199, 199), (200, 200), (399, 399), (450, 225), (1000, 200))
-    for particles, observed in counts:
-        x, v = rng.random((2, particles, 3)), rng.random((2, particles, 3))
-        ball, sticks = rng.random((2, 7)), rng.random((2, 8))
-        batch = observation(x, v, [ball, sticks])
-        assert batch.shape == (2, 6 * observed + 15)
-        stride = max(particles // 200, 1)
-        for e, seen in enumerate(batch):
-            np.testing.assert_array_equal(seen, observation(x[e], v[e], [ball[e], sticks[e]]))
-            np.testing.assert_array_equal(seen[-15:], np.concatenate([ball[e], sticks[e]]))
-            particle = seen[:-15].reshape(observed, 6)
-            np.testing.assert_array_equal(particle[:, :3], x[e, : observed * stride : stride])
-            np.testing.assert_array_equal(particle[:, 3:], v[e, : observed * stride : stride])
 
 
 def test_scores_of_a_batch_are_those_of_its_episodes() -> None:

@@ -188,11 +188,11 @@ def test_files_of_strangers_are_refused(capfd, monkeypatch):
 def test_particles_of_a_mesh(start):
     box = make_body("mesh", [0.5, 0.3, 0.4], [0.4], 4000, write(obj(BOX * [1, 2, 4])))
     ball = Body("sphere", (0.2, 0.2, 0.2), (0.1,), 100)
-    x = sample_particles(scene_of(ball, box, start=start))
+    x = sample_particles(scene_of(ball, box, sampling_convention=start))
     assert x.shape == (4100, 3)
     # What comes before a mesh is where it always was, and a scene's particles are always the same.
-    assert np.array_equal(x[:100], sample_particles(scene_of(ball, start=start)))
-    assert np.array_equal(x, sample_particles(scene_of(ball, box, start=start)))
+    assert np.array_equal(x[:100], sample_particles(scene_of(ball, sampling_convention=start)))
+    assert np.array_equal(x, sample_particles(scene_of(ball, box, sampling_convention=start)))
     assert (np.abs(x[100:] - [0.5, 0.3, 0.4]) <= [0.05, 0.1, 0.2]).all()
     np.testing.assert_allclose(x[100:].std(axis=0), np.array([0.1, 0.2, 0.4]) / np.sqrt(12), rtol=0.03)
     assert box.volume == pytest.approx(0.1 * 0.2 * 0.4)
@@ -200,8 +200,8 @@ def test_particles_of_a_mesh(start):
 
 def test_bodies_that_do_not_fit():
     for body, named in (
-        ({"size": [0.2, 0.2, 0.2]}, "1 size"),
-        ({"size": [0.0]}, "sizes"),
+        ({"size": [0.2, 0.2, 0.2]}, "1 positive size"),
+        ({"size": [0.0]}, "positive"),
         ({"center": [0.5, 0.05, 0.5]}, "y = -0.05 .. 0.15"),
         ({"size": [0.01]}, "diameter 0.00"),
     ):

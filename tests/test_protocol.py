@@ -31,6 +31,7 @@ FILES = os.environ.get("PLAB_RELEASE_TARGETS")
 WEIGHTS = (10.0, 10.0, 1.0)
 TERMS = dict(zip(("density", "sdf", "contact"), WEIGHTS, strict=True))
 KINDS = ("Sphere", "RollingPin", "Box")
+FIELDS = {"start": "sampling_convention", "numbers": "digits_convention", "floor": "floor_stencil"}
 
 
 def released(near: tuple[str, ...], **changes: float) -> Scene:
@@ -45,7 +46,7 @@ def released(near: tuple[str, ...], **changes: float) -> Scene:
         )
         for m in tools(made, KINDS)
     )
-    return replace(made, manipulators=lowered, start="release", numbers="release", floor="release")
+    return replace(made, manipulators=lowered, **dict.fromkeys(FIELDS.values(), "release"))
 
 
 SCENES = [
@@ -116,7 +117,7 @@ def test_masses_rotations_and_the_floor_of_a_simulator(simulator: Simulator) -> 
     simulator.step(np.full((len(SCENES), SCENES[0].action_dim), 0.5))
     np.testing.assert_allclose(np.linalg.norm(simulator.poses()[..., 3:7], axis=-1), 1.0, atol=1e-14)
     with pytest.raises(SceneError, match=r"scene 0 .*plab"):
-        simulator.set_scenes([replace(scene, floor="plab") for scene in SCENES])
+        simulator.set_scenes([replace(scene, floor_stencil="plab") for scene in SCENES])
 
 
 def test_weights_of_the_lowest_half_cell() -> None:
@@ -131,7 +132,7 @@ def test_weights_of_the_lowest_half_cell() -> None:
 
 def test_the_start_is_the_legacy_draw() -> None:
     bodies = (Body("box", (0.6, 0.08, 0.5), (0.16,) * 3, 6000), Body("sphere", (0.3, 0.06, 0.5), (0.06,), 4))
-    x = sample_particles(Scene("Assembly", bodies, (), start="release"))
+    x = sample_particles(Scene("Assembly", bodies, (), sampling_convention="release"))
     # RandomState(0).random_sample() begins 0.5488135, 0.71518937, 0.60276338.
     np.testing.assert_allclose(x[0], [0.60781016, 0.1144303, 0.51644214], atol=1e-8)
     rng = np.random.RandomState(0)
@@ -145,7 +146,7 @@ def test_the_release_is_for_all_methods() -> None:
     for method in choices("method"):
         cfg = load_config(["protocol=release", f"method={method}", "task=Rope"])
         world = build_scene(cfg)
-        assert world.start == world.floor == "release"
+        assert world.sampling_convention == world.floor_stencil == "release"
         # The one that is no method of the paper's, and chooses its own guidance.
         assert cfg.method.loss_terms == {"contact": "soft" if method == "solve" else "all"}
         assert cfg.task.yield_stress == world.yield_stress == 50.0 and cfg.task.release == {}
@@ -153,18 +154,18 @@ def test_the_release_is_for_all_methods() -> None:
     assert own.method.loss_terms == {"contact": "nearest"}
 
 
-@pytest.mark.parametrize("part", ["start", "numbers", "floor", None])
+@pytest.mark.parametrize("part", [*FIELDS, None])
 def test_parts_can_be_set_alone_and_are_plabs_own_else(part: str | None) -> None:
     cfg = load_config(["task=Rope", *([f"protocol.{part}=release"] if part else [])])
     changed = [key for key, value in asdict(cfg.protocol).items() if value == "release"]
     assert changed == ([part] if part else []) and cfg.protocol.name == "plab"
     assert cfg.method.loss_terms == {"contact": "nearest"} and cfg.task.release == {}
     world = build_scene(cfg)
-    assert (world.start, world.floor) == (cfg.protocol.start, cfg.protocol.floor)
+    assert (world.sampling_convention, world.floor_stencil) == (cfg.protocol.start, cfg.protocol.floor)
     assert world.yield_stress == (50.0 if part == "numbers" else 200.0)
     if part:
-        with pytest.raises(SceneError, match=part):
-            replace(SCENES[0], **{part: "paper"}).validate()
+        with pytest.raises(SceneError, match=FIELDS[part]):
+            replace(SCENES[0], **{FIELDS[part]: "paper"}).validate()
 
 
 def test_numbers_have_all_digits() -> None:
@@ -179,11 +180,11 @@ def test_numbers_have_all_digits() -> None:
     for task in choices("task"):
         ours, theirs = build_scene(load_config([f"task={task}", "variant=1"])), exact(task, 1)
         if task not in ("Move", "Rope", "RollingPin"):
-            assert theirs == replace(ours, numbers="release")
+            assert theirs == replace(ours, digits_convention="release")
         near = sample_particles(theirs).mean(axis=0) - sample_particles(ours).mean(axis=0)
         assert np.abs(near).max() < 0.01 and theirs.particle_count == ours.particle_count
     drawn = load_config(["task=Rope", "protocol=release", "variant=random", "seed_scene=3"])
-    assert build_scene(drawn).floor == "release" and drawn.task.yield_stress == 50.0
+    assert build_scene(drawn).floor_stencil == "release" and drawn.task.yield_stress == 50.0
 
 
 def test_overrides_mistakes_and_batches_of_one_protocol() -> None:

@@ -1,4 +1,4 @@
-"""What a run is judged by: mass tensors, target distance, losses, rewards, soft IoU, scores, observations.
+"""Mass tensors, distances to a target, losses, rewards, soft IoU and scores.
 
 Plain NumPy in float64: the final evaluation and the tests use it; the simulator computes the same loss terms
 on its own grid, where their gradient is needed.
@@ -6,7 +6,6 @@ on its own grid, where their gradient is needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,6 @@ __all__ = [
     "Scores",
     "batch_scores",
     "mass_change",
-    "observation",
     "rewards",
     "score_scale",
     "scores",
@@ -70,7 +68,7 @@ class Scores:
     score: float
 
 
-def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.ndarray:
+def spread_mass(x: ArrayLike, n: int, mass: float, floor_stencil: str = "plab") -> np.ndarray:
     """Spread particles of equal mass over the grid with the quadratic B-spline.
 
     Node i is at i / n. A particle within half a cell of a lower face also reaches the ghost node at -1; that
@@ -80,7 +78,7 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.nd
         x: Particle positions [domain units], shape [particle, 3].
         n: Grid nodes per axis.
         mass: Mass per particle.
-        floor: Whose stencil such particles have, as in :class:`plab.scenes.Scene`. With the release's, they
+        floor_stencil: Convention for such particles, as in :class:`plab.scenes.Scene`. With ``release``, they
             have negative weights instead of a ghost node.
 
     Returns:
@@ -93,13 +91,13 @@ def spread_mass(x: ArrayLike, n: int, mass: float, floor: str = "plab") -> np.nd
     if x.ndim != 2 or x.shape[1] != 3:
         raise ArgumentError(f"positions have shape {list(x.shape)}, not [particle, 3]")
     scaled = x * n
-    # Written so that nan fails it too. Beyond these limits a particle reaches nodes below -1 or above n - 1.
+    # Written so that NaN fails it, too. Beyond these limits a particle reaches nodes below -1 or above n - 1.
     if not np.all((scaled >= -0.5) & (scaled < n - 1.5)):
         raise ArgumentError(
             f"positions outside the grid: each coordinate must be in [{-0.5 / n:.4g}, {1 - 1.5 / n:.4g})"
         )
     base = np.floor(scaled - 0.5)
-    if floor == "release":
+    if floor_stencil == "release":
         base = np.maximum(base, 0.0)
     f = scaled - base
     weight = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
@@ -154,7 +152,7 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
     if a.shape != b.shape:
         raise ArgumentError(f"mass tensors of different shapes {list(a.shape)} and {list(b.shape)}")
     largest_a, largest_b = a.max(initial=0.0), b.max(initial=0.0)
-    # Written so that nan fails it too.
+    # Written so that NaN fails it, too.
     if not (0.0 < largest_a < np.inf and 0.0 < largest_b < np.inf):
         raise ArgumentError(
             f"mass tensors need finite mass somewhere: their maxima are {largest_a:g} and {largest_b:g}"
@@ -192,21 +190,8 @@ def scores_from_iou(start: float, end: float, best: float) -> Scores:
     Returns:
         The IoUs and both scores.
     """
-    return Scores(
-        iou_initial=start,
-        iou_final=end,
-        iou_target_self=best,
-        score_printed=_gain(start, end, 1.0),
-        score=min(max(_gain(start, end, best), 0.0), 1.0),
-    )
-
-
-def _gain(start: float, end: float, best: float) -> float:
-    """Share of the way from ``start`` to ``best`` that ``end`` has come."""
-    way = best - start
-    if way <= 1e-12:
-        return 1.0 if end >= best - 1e-12 else 0.0
-    return (end - start) / way
+    (score,), (printed,) = batch_scores(score_scale([start], [best]), np.array([end]))
+    return Scores(start, end, best, score_printed=float(printed), score=float(score))
 
 
 def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
@@ -250,7 +235,7 @@ def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def target_observation(start: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """What is observed of a target: where mass has to leave, and where it has to arrive.
+    """Describe a target for an observation: where mass has to leave, and where it has to arrive.
 
     Args:
         start: Mass tensor of the initial state, shape [n, n, n].
@@ -298,23 +283,3 @@ def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
         Rewards, shape [..., T], like the terms.
     """
     return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
-
-
-def observation(x: ArrayLike, v: ArrayLike, poses: Sequence[ArrayLike]) -> np.ndarray:
-    """What a policy sees: some particles, then the manipulators' poses.
-
-    Args:
-        x: Particle positions, shape [..., particle, 3].
-        v: Particle velocities, shape [..., particle, 3].
-        poses: One array per manipulator, shape [..., 7]: position and quaternion (w, x, y, z); chopsticks
-            [..., 8]: and their gap.
-
-    Returns:
-        Shape [..., 6 * observed + 7 * manipulators (+ 1 per chopsticks)]: position and velocity of every
-        (particle count // 200)-th particle, particle after particle, then the poses.
-    """
-    x, v = np.asarray(x), np.asarray(v)
-    stride = max(x.shape[-2] // OBSERVED_PARTICLES, 1)
-    particles = np.concatenate([x[..., ::stride, :], v[..., ::stride, :]], axis=-1)
-    flat = particles.reshape(*particles.shape[:-2], -1)
-    return np.concatenate([flat, *(np.asarray(pose) for pose in poses)], axis=-1)

@@ -293,9 +293,9 @@ def build_scene(cfg: Config) -> Scene:
         substeps=sim.substeps,
         horizon=sim.horizon,
         particle_seed=cfg.seed_particles,
-        start=protocol.start,
-        numbers=protocol.numbers,
-        floor=protocol.floor,
+        sampling_convention=protocol.start,
+        digits_convention=protocol.numbers,
+        floor_stencil=protocol.floor,
     )
     scene.validate()
     require_memory(1, scene, sim.precision, sim.device)

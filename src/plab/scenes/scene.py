@@ -1,4 +1,4 @@
-"""What is in a scene: bodies of plasticine, manipulators, material, floor.
+"""Scenes: bodies of plasticine, manipulators, material and floor.
 
 A :class:`Scene` is plain data in SI-like units inside the unit cube (y is up). It knows nothing of Taichi,
 Hydra or Gymnasium: the simulator, the reference implementation of the tests and the target recipes all start
@@ -58,14 +58,7 @@ PRECISIONS = ("float32", "float64")
 CONTACTS = ("soft", "hard")
 """Contact models of manipulators and particles."""
 
-STIFFEST = 1e-12
-"""Time step [s] below which no scene can be simulated in anybody's life."""
-
-SHORTEST = 1e-6
-"""Shortest time step, as a share of the longest that is stable: what moves less is lost in rounding."""
-
 Quaternion = tuple[float, float, float, float]
-
 
 ROLL_RADIUS = 0.03
 """Distance that a rolling pin travels per radian of roll, whatever its radius, as in the PlasticineLab
@@ -74,7 +67,7 @@ release."""
 
 @dataclass(frozen=True)
 class ManipulatorShape:
-    """What all manipulators of one shape have in common.
+    """Properties of all manipulators of one shape.
 
     Attributes:
         size_names: Names of the entries of :attr:`Manipulator.size`, in order; all lengths [domain units].
@@ -185,11 +178,11 @@ class Scene:
         substeps: Substeps per environment step.
         horizon: Environment steps per episode.
         particle_seed: Seed of the particles' positions.
-        start: Whose generator draws them, one of :data:`CONVENTIONS`.
-        numbers: Whose way with rotations that are not quite of unit length: plab's makes them so, with the
-            release's they are the poses at t = 0 as they are, and of unit length once something moves.
-        floor: Whose stencil particles within half a cell of a lower face have: plab's reaches the layer of
-            nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
+        sampling_convention: Random generator of these positions, one of :data:`CONVENTIONS`.
+        digits_convention: Treatment of rotations that are not quite of unit length, likewise: ``plab``
+            normalises them, ``release`` leaves the poses at t = 0 as they are until something moves.
+        floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's reaches the
+            layer of nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
     """
 
     name: str
@@ -205,9 +198,9 @@ class Scene:
     substeps: int = 19
     horizon: int = 50
     particle_seed: int = 0
-    start: str = "plab"
-    numbers: str = "plab"
-    floor: str = "plab"
+    sampling_convention: str = "plab"
+    digits_convention: str = "plab"
+    floor_stencil: str = "plab"
 
     @property
     def dx(self) -> float:
@@ -240,8 +233,7 @@ class Scene:
 
     @property
     def material_count(self) -> int:
-        """How many materials the simulator tells apart: one per body where one of several bodies has a
-        material of its own, else 1."""
+        """Number of materials in the simulator: one per body where any body has its own, else 1."""
         return len(self.bodies) if any(body.own_material for body in self.bodies) else 1
 
     @property
@@ -276,8 +268,7 @@ class Scene:
         return max(self.materials, key=lambda m: m.stiffness, default=self.material)
 
     def facts(self) -> dict[str, Any]:
-        """Return everything in it as plain data, meshes excepted; what a body shares with the scene is left
-        out."""
+        """Return the scene as plain data, apart from meshes, without what a body shares with the scene."""
         facts = asdict(self)
         for body in facts["bodies"]:
             for key in MATERIAL_KEYS:
@@ -297,47 +288,30 @@ class Scene:
             material.validate(f"bodies[{number}]: ")
         _require(self.substeps >= 1, f"substeps {self.substeps} must be at least 1")
         _require(self.dt > 0, f"dt {self.dt:g} must be positive")
-        stiffest = self._stiffest
-        young, nu = stiffest.youngs_modulus, stiffest.poisson_ratio
-        _require(
-            self.stable_dt > STIFFEST,
-            f"youngs_modulus {young:g} and poisson_ratio {nu:g} are too stiff for any time step: lower them",
-        )
         if self.dt > self.stable_dt:
             steps = math.ceil(self.substeps * self.dt / self.stable_dt)
             one = self.material_count == 1
-            what = "material" if one else f"bodies[{self.materials.index(stiffest)}]"
+            what = "material" if one else f"bodies[{self.materials.index(self._stiffest)}]"
             raise SceneError(
                 f"dt {self.dt:g} is above the stability limit {self.stable_dt:.3g} of {what} and grid: "
                 f"use dt <= {self.substeps * self.dt / steps:.3g} with substeps >= {steps}"
             )
-        # What is hardly stiff at all is stable with steps of any length.
-        shortest = SHORTEST * min(self.stable_dt, 1.0)
-        _require(
-            self.dt >= shortest,
-            f"dt {self.dt:g} is too short for anything to move: use dt >= {shortest:.3g}, "
-            f"and at most {self.stable_dt:.3g}",
-        )
         _require(
             self.floor_friction >= 0, f"floor_friction {self.floor_friction:g} must be 0 or more, 10 sticks"
         )
-        for name in ("start", "numbers", "floor"):
+        for name in ("sampling_convention", "digits_convention", "floor_stencil"):
             choice = getattr(self, name)
             _require(choice in CONVENTIONS, f"{name} '{choice}' is not one of {', '.join(CONVENTIONS)}")
-        self._validate_gravity()
+        limit = self.dx / self.dt**2
+        _require(
+            math.hypot(*self.gravity) <= limit,
+            f"gravity {self.gravity} accelerates by more than a cell per substep: use at most {limit:.3g}",
+        )
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
             self._validate_body(number, body)
         for number, manipulator in enumerate(self.manipulators):
             self._validate_manipulator(number, manipulator)
-
-    def _validate_gravity(self) -> None:
-        limit = self.dx / self.dt**2
-        strength = math.hypot(*self.gravity)
-        _require(
-            strength <= limit,
-            f"gravity {self.gravity} accelerates by more than a cell per substep: use at most {limit:.3g}",
-        )
 
     def _validate_body(self, number: int, body: Body) -> None:
         label = f"bodies[{number}]"
@@ -347,12 +321,8 @@ class Scene:
         _require((body.shape == "mesh") == isinstance(body, MeshBody), f"{label}: a mesh is a MeshBody")
         entries = 3 if body.shape == "box" else 1
         _require(
-            len(body.size) == entries,
-            f"{label}: a {body.shape} needs {entries} size(s), not {len(body.size)}",
-        )
-        _require(
-            all(0 < size < math.inf for size in body.size),
-            f"{label}: sizes must be positive and finite, not {body.size}",
+            len(body.size) == entries and all(0 < size < math.inf for size in body.size),
+            f"{label}: a {body.shape} needs {entries} positive size(s), not {body.size}",
         )
         _require(body.particles > 0, f"{label}: particles must be positive, not {body.particles}")
         top = 1.0 - 3.0 * self.dx
@@ -365,8 +335,7 @@ class Scene:
             _require(
                 inside,
                 f"{label}: reaches {name} = {low[axis]:.3g} .. {high[axis]:.3g}, outside the domain "
-                f"0 .. {top:.4g}: "
-                f"put its centre's {name} into {half:.3g} .. {top - half:.3g}",
+                f"0 .. {top:.4g}: put its centre's {name} into {half:.3g} .. {top - half:.3g}",
             )
         if isinstance(body, MeshBody):
             thickness = body.size[0] * body.mesh.thickness
@@ -402,23 +371,15 @@ class Scene:
             0 <= manipulator.friction < math.inf,
             f"{label}: friction {manipulator.friction:g} must not be negative, infinite or NaN",
         )
-        _require(
-            all(math.isfinite(c) for c in manipulator.position),
-            f"{label}: position {manipulator.position} must be three finite numbers",
-        )
+        for name in ("position", "scale"):
+            values = getattr(manipulator, name)
+            _require(all(map(math.isfinite, values)), f"{label}: {name} {values} must be finite numbers")
         low, high = manipulator.lower_bound, manipulator.upper_bound
         _require(
             all(a <= b for a, b in zip(low, high, strict=True)),
             f"{label}: lower_bound {low} must not be above upper_bound {high}",
         )
-        self._validate_motion(label, manipulator)
-
-    def _validate_motion(self, label: str, manipulator: Manipulator) -> None:
-        """Contact acts on nodes: what passes by more than one of them in a substep would not be felt."""
-        _require(
-            all(math.isfinite(c) for c in manipulator.scale),
-            f"{label}: scale {manipulator.scale} must be finite numbers",
-        )
+        # Contact acts on nodes: it is not felt by what passes more than one of them in a substep.
         way = manipulator.largest_step()
         limit = self.substeps * self.dx
         if way > limit:
@@ -438,13 +399,13 @@ def sample_particles(scene: Scene) -> np.ndarray:
     """Draw the particles' initial positions, uniformly inside each body.
 
     Args:
-        scene: The scene; ``particle_seed``, ``start`` and the bodies decide the result.
+        scene: The scene; ``particle_seed``, ``sampling_convention`` and the bodies decide the result.
 
     Returns:
         Positions [domain units], shape [particle, 3], float64, body after body.
     """
-    # The release's are the very same numbers with seed 0, to the last bit, which no other generator has.
-    release = scene.start == "release"
+    # Equal to the release's to the last bit with seed 0, as no other generator's are.
+    release = scene.sampling_convention == "release"
     rng = (np.random.RandomState if release else np.random.default_rng)(scene.particle_seed)
     parts = []
     for body in scene.bodies:

@@ -24,7 +24,15 @@ __all__ = [
     "with_material",
 ]
 
-SHARED = ("particle_count", "material_count", "grid_size", "dt", "substeps", "numbers", "floor")
+SHARED = (
+    "particle_count",
+    "material_count",
+    "grid_size",
+    "dt",
+    "substeps",
+    "digits_convention",
+    "floor_stencil",
+)
 """What scenes of one simulator have in common, beside their manipulators' shapes."""
 
 YIELD_STRAIN_MAX = 1e30
@@ -63,7 +71,7 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
 def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
     """Poses in which the scenes' manipulators start, as in :class:`plab.sim.State`, shape [batch,
     manipulator, 8]."""
-    turn = list if scenes[0].numbers == "release" else _unit
+    turn = list if scenes[0].digits_convention == "release" else _unit
     return np.array(
         [[[*m.position, *turn(m.rotation), m.gap] for m in s.manipulators] for s in scenes], dtype=np.float64
     ).reshape(len(scenes), len(scenes[0].manipulators), 8)

@@ -172,7 +172,7 @@ class Storage:
         self.stress_scale = -scene.dt * scene.particle_volume * 4.0 * self.inv_dx**2
         self.x_max = 1.0 - 3.0 * scene.dx
         # Of a stencil: the release truncates toward zero where plab rounds down.
-        self.lowest_base = 0 if scene.floor == "release" else -1
+        self.lowest_base = 0 if scene.floor_stencil == "release" else -1
         self.blocks_per_axis = -(-self.n // BLOCK)
         self.axis = self.blocks_per_axis * BLOCK
         self.nodes = self.axis**3
@@ -180,7 +180,7 @@ class Storage:
 
     def _set_manipulators(self, scene: Scene) -> None:
         manipulators = scene.manipulators
-        self.rotations_as_given = scene.numbers == "release"
+        self.rotations_as_given = scene.digits_convention == "release"
         self.manipulators = len(manipulators)
         self.shapes = tuple(m.shape for m in manipulators)
         require_surfaces(self.shapes)

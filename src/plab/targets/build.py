@@ -139,7 +139,7 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             f"{points.max(0).round(3)}"
         )
     share = scene.particle_count / len(points)
-    return spread_mass(points, scene.grid_size, share * scene.particle_mass, scene.floor)
+    return spread_mass(points, scene.grid_size, share * scene.particle_mass, scene.floor_stencil)
 
 
 def build_targets(
