@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from plab.results import read
-from plab.results.files import encode
+from plab.results.run_file import encode
 
 DEATH = -1
 """Instead of an error: the run dies, and from then on no file can be changed."""

@@ -13,7 +13,7 @@ import pytest
 
 from plab.config import Config
 from plab.results import RunResult, read, result_path
-from plab.results.running import RunFile
+from plab.results.run_file import RunFile
 from plab.runners.simulator_cache import SimulatorCache
 
 TIMES = ["seconds"]

@@ -23,7 +23,7 @@ from plab.results import (
     result_path,
     write,
 )
-from plab.results.schema import last_score
+from plab.results.schema import COLUMNS, last_score
 
 
 def make_config(folder: Path, **changes) -> dict:
@@ -32,8 +32,8 @@ def make_config(folder: Path, **changes) -> dict:
 
 
 def make_row(iteration: int) -> dict[str, float]:
-    terms = ("loss", "loss_density", "loss_sdf", "loss_contact")
-    names = (*terms, "reward", "iou", "score", "gradient_norm", "seconds")
+    terms = ("loss_density", "loss_sdf", "loss_contact")
+    names = (*terms, "gradient_norm", *COLUMNS[1:])
     return {"iteration": iteration} | {name: 0.1 * iteration + k for k, name in enumerate(names)}
 
 

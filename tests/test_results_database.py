@@ -17,7 +17,7 @@ from plab.cli.render import main as render
 from plab.cli.results import main
 from plab.config.selection import Selection
 from plab.report.collect import collect
-from plab.results import ResultsError, connect, load, loading, pack, read, read_curves, rows, write
+from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, table, write
 from plab.status import survey
 
 
@@ -39,13 +39,13 @@ def age(path: Path, seconds: float = 60.0) -> None:
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the files that are opened."""
     names: list[str] = []
-    read = loading.read_rows
+    read = table.read_rows
 
     def counting(path: Path):
         names.append(path.name)
         return read(path)
 
-    monkeypatch.setattr(loading, "read_rows", counting)
+    monkeypatch.setattr(table, "read_rows", counting)
     return names
 
 

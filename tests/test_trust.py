@@ -23,9 +23,8 @@ import synthetic
 from plab.cli import results, status
 from plab.config import build_scene, load_config
 from plab.families import FAMILIES
-from plab.results import ResultsError, RunFile, check, read, unpack
-from plab.results.loading import read_rows
-from plab.runners import run_config
+from plab.results import ResultsError, check, read, unpack
+from plab.results.table import read_rows
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, save_policy
 from plab.scenes import Scene
 from plab.targets import TargetError, load_release_target
@@ -164,28 +163,6 @@ def test_arrays_that_the_file_does_not_hold(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["best/actions"]
     assert f"mass/final claims {2**60} entries" in said(lambda: read(path))
-
-
-def test_actions_to_go_on_from(tmp_path: Path) -> None:
-    cfg = load_config(["task=Rope", "method.iterations=4", f"results_dir={tmp_path}", "progress=false"])
-    run = dataclasses.replace(
-        synthetic.synthetic_run(dataclasses.asdict(cfg), rows=2), status="stopped", evaluation={}
-    )
-    for wrong in (np.zeros((1, 6)), np.zeros((50, 7)), np.zeros(6), np.full((50, 6), 7.0)):
-        run.resume = {"actions": wrong, "optimizer": {}, "random": np.zeros(8, np.uint8)}
-        path = synthetic.save(run)
-        before = path.read_bytes()
-        ((_, problem),) = check(path)
-        assert problem is not None and "actions" in problem.reason
-        line = said(lambda: run_config(cfg))
-        assert str(path) in line and "force=true" in line
-        assert path.read_bytes() == before
-    run.resume["actions"] = run.best_actions
-    ((_, problem),) = check(synthetic.save(run))
-    assert problem is None
-    opened = RunFile(cfg)
-    assert len(opened.result.iterations) == 2
-    opened.release()
 
 
 # ------------------------------------------------------------------------------------------------ archives

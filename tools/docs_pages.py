@@ -63,7 +63,7 @@ PYTHON = {
     "results": (
         "Results",
         "",
-        ("plab.results.loading", "plab.results.files", "plab.results.schema", "plab.demonstrations"),
+        ("plab.results.table", "plab.results.run_file", "plab.results.schema", "plab.demonstrations"),
     ),
 }
 """Pages of the reference: title, first line, modules."""

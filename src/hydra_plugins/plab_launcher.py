@@ -58,7 +58,7 @@ class BatchSweeper(BasicSweeper):
         """Run the sweep; ConfigError if it has no jobs, or too many."""
         from plab.config import ConfigError
         from plab.config.words import parse, require_few
-        from plab.results.files import make_folder, remove_folders
+        from plab.results.run_file import make_folder, remove_folders
 
         assert self.hydra_context is not None and self.launcher is not None
         loader = self.hydra_context.config_loader

@@ -28,7 +28,7 @@ from plab.demonstrations import action_names, known_actions, save_actions
 from plab.objective import Scores
 from plab.problem import Problem
 from plab.render.recording import stored
-from plab.results.loading import Row, readable_rows
+from plab.results.table import Row, readable_rows
 from plab.targets import EPISODE_STEPS
 from plab.targets.scripted import DECIMALS
 

@@ -21,9 +21,9 @@ from plab.errors import tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.examples import EXAMPLES, resolve
-from plab.results.loading import readable_rows
 from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError
+from plab.results.table import readable_rows
 
 __all__ = ["main"]
 

@@ -63,7 +63,7 @@ def _usual_output(arguments: argparse.Namespace, ending: str) -> Path:
         raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
     if files:
         # Imported here: it loads pandas, for which no mistake above should have to wait.
-        from plab.results.files import split_archive
+        from plab.results.run_file import split_archive
 
         arguments.result = Path(files[0])
         folder = Path() if split_archive(arguments.result) else arguments.result.parent
@@ -86,7 +86,7 @@ def _holds_many(source: str) -> bool:
 
 def _best(sources: Sequence[str], words: Sequence[str]) -> tuple[Path, str]:
     """Return place and name of the finished run with the highest score, of those that the words choose."""
-    from plab.results.loading import readable_rows
+    from plab.results.table import readable_rows
 
     names = ("task", "variant", "method", "seed")
     chosen = select(words, names)

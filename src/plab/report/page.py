@@ -34,7 +34,7 @@ from plab.report.statistics import (
 from plab.report.tables import Cells, difference, ordered_tasks, settings_note
 from plab.report.templates import asset, render
 from plab.results import read_iterations
-from plab.results.files import replace_file
+from plab.results.run_file import replace_file
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
 """Columns of the curves, and the value below which their values are clamped, as in the paper's figures."""

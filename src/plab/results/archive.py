@@ -7,32 +7,34 @@ same HDF5 files as those of a results folder.
 
 from __future__ import annotations
 
+import io
 import lzma
 import math
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from plab.results.files import encode, read, replace_file, zipped
-from plab.results.loading import Row, readable_rows, rows
+from plab.results.run_file import encode, read, replace_file
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult, member_name
+from plab.results.table import Row, readable_rows, rows
 
-__all__ = ["Packed", "pack", "unpack"]
+_ALL_DIGITS = 17
+"""Significant decimal digits that identify any float64."""
 
 
 @dataclass(frozen=True)
 class Packed:
-    """What :func:`pack` did.
+    """Summary of :func:`pack`.
 
     Attributes:
         runs: Number of runs in the archive.
         archive_bytes: Size of the archive.
         file_bytes: Size of the runs' own files; of those that came out of an archive, 0.
-        unreadable: What could not be read, hence is not in the archive.
+        unreadable: Errors of files that could not be read, hence are not in the archive.
     """
 
     runs: int
@@ -59,7 +61,7 @@ def pack(
     Args:
         source: Folder of results, archive, result file, or several of them.
         archive: File to create or replace; its name ends in ``.plab.zip.xz``.
-        wanted: Says which runs to take; all finished ones by default.
+        wanted: Predicate of the runs to take; all finished ones by default.
         keep_masses: Keep the mass tensors, which are made again by a rollout of the best actions.
         keep_resume: Keep the state from which unfinished runs go on.
         digits: Significant decimal digits that the iterations keep at least, >= 1; None: all. Four take two
@@ -84,22 +86,39 @@ def pack(
     if not chosen:
         hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
         raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
-
-    def packed(path: Path) -> bytes:
-        run = read(path) if digits is None else _rounded(read(path), digits)
+    members = []
+    for name, row in sorted(chosen.items()):
+        try:
+            run = read(row.path)
+        except ResultsError as error:
+            unreadable.append(error)
+            continue
         run = replace(
-            run,
+            run if digits is None or digits >= _ALL_DIGITS else _rounded(run, digits),
             # A path of the computer that made it means nothing elsewhere.
             config=run.config | {"results_dir": "results"},
             masses=run.masses if keep_masses else {},
             resume=run.resume if keep_resume else None,
         )
-        return encode(run, compress=False)
-
-    content = zipped(((name, packed(row.path)) for name, row in sorted(chosen.items())), zipfile.ZIP_STORED)
+        members.append((name, encode(run, compress=False)))
+    if not members:
+        raise unreadable[-1]
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
-    replace_file(archive, lzma.compress(content, preset=9), sync=True, folders=True)
-    return Packed(len(chosen), archive.stat().st_size, size, unreadable)
+    content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
+    replace_file(archive, content, sync=True, folders=True)
+    return Packed(len(members), len(content), size, unreadable)
+
+
+def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
+    """Return a zip file of some members; the same ones give the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, data in members:
+            # The earliest time that zip knows.
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, data, method, 9)
+    return content.getvalue()
 
 
 def _rounded(run: RunResult, digits: int) -> RunResult:

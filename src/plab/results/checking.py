@@ -1,4 +1,4 @@
-"""Checking result files against the schema."""
+"""Checks of result files against the schema."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy as np
 
 from plab.families import SOLVED, known_family
 from plab.objective import scores_from_iou
-from plab.results.files import opened_archive, read
-from plab.results.loading import members, run_files
+from plab.results.run_file import opened_archive, read
 from plab.results.schema import (
     ARCHIVE_SUFFIX,
     BUDGETS,
@@ -20,25 +19,26 @@ from plab.results.schema import (
     EVALUATION,
     PARTIAL_SUFFIX,
     STATUSES,
+    SUFFIX,
     ResultsError,
     RunResult,
     config_hash,
     loss_columns,
-    resume_fault,
     row_count,
 )
-
-__all__ = ["Fault", "check", "faults"]
+from plab.results.table import members, run_files
 
 _IN_UNIT_INTERVAL = ("iou", "score", "iou_initial", "iou_target_self")
 
 _TOLERANCE = 1e-9
 """Relative error allowed between a score and the IoUs that it is computed from."""
 
+_GET_RIGHTS = "ask whom it belongs to for the right to read it"
+
 
 @dataclass(frozen=True)
 class Fault:
-    """What is wrong with a file, or a run in an archive, and what to do, a line each."""
+    """Fault of a file, or of a run in an archive: reason and advice, a line each."""
 
     path: Path
     reason: str
@@ -52,44 +52,25 @@ def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
         source: Folder of results, archive or result file.
 
     Yields:
-        Each file, or place in an archive, with what is wrong with it, or None.
+        Each file, or place in an archive, with its fault, or None.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
     for path, _ in run_files(Path(source)):
-        if path.name.endswith(ARCHIVE_SUFFIX):
-            yield from _check_archive(path)
-        else:
+        if not path.name.endswith(ARCHIVE_SUFFIX):
             yield path, _check_file(path)
-
-
-def faults(run: RunResult) -> list[str]:
-    """Return what is wrong with the contents of a run that could be read, nothing if all is well."""
-    found = [*_status(run), *_iterations(run), *_best(run)]
-    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
-        found.append("wall_time has seconds that are negative or not finite")
-    if run.status == "finished":
-        found += [*_evaluation(run), *_masses(run), *_complete(run)]
-    return list(dict.fromkeys(found))
-
-
-# ---------------------------------------------------------------------------------------------------- details
-
-_GET_RIGHTS = "ask whom it belongs to for the right to read it"
-
-
-def _check_archive(path: Path) -> Iterator[tuple[Path, Fault | None]]:
-    try:
-        with opened_archive(path) as archive:
-            names = members(archive)
-    except ResultsError as error:
-        reason = _reason(error, path)
-        hidden = reason.startswith("may not be read")
-        yield path, Fault(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
-        return
-    for name in names:
-        yield path / name, _check_file(path / name)
+            continue
+        try:
+            with opened_archive(path) as archive:
+                names = members(archive)
+        except ResultsError as error:
+            reason = _reason(error, path)
+            hidden = reason.startswith("may not be read")
+            yield path, Fault(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
+            continue
+        for name in names:
+            yield path / name, _check_file(path / name)
 
 
 def _check_file(path: Path) -> Fault | None:
@@ -98,29 +79,36 @@ def _check_file(path: Path) -> Fault | None:
         found = faults(run)
     except ResultsError as error:
         reason = _reason(error, path)
-        return Fault(path, reason, _advice_unreadable(path, reason))
+        return Fault(path, reason, _advice(path, reason))
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
-    if found:
-        return Fault(path, "; ".join(found), "run it again with force=true, or delete it")
-    return None
+    return Fault(path, "; ".join(found), "run it again with force=true, or delete it") if found else None
 
 
 def _reason(error: ResultsError, path: Path) -> str:
-    """Return what is wrong with a file, without its name."""
     return str(error).removeprefix(str(path)).strip()
 
 
-def _advice_unreadable(path: Path, reason: str) -> str:
+def _advice(path: Path, reason: str) -> str:
     if reason.startswith("may not be read"):
         return _GET_RIGHTS
     if reason.startswith(("was written by a newer plab", "has schema version")):
         return "read it with the plab that wrote it"
-    if "not a plab" in reason or reason.startswith("cannot be read: it is"):
+    if path.suffix != SUFFIX or "not a plab" in reason or reason.startswith("cannot be read: it is"):
         return "move it out of the results"
     if path.name.endswith(PARTIAL_SUFFIX) and not (path.is_file() and h5py.is_hdf5(path)):
         return "delete it; the run starts afresh"
     return "delete it and run it again"
+
+
+def faults(run: RunResult) -> list[str]:
+    """Return the faults of a run that could be read."""
+    found = [*_status(run), *_iterations(run), *_best(run)]
+    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
+        found.append("wall_time has seconds that are negative or not finite")
+    if run.status == "finished":
+        found += [*_evaluation(run), *_masses(run), *_complete(run)]
+    return list(dict.fromkeys(found))
 
 
 def _status(run: RunResult) -> Iterator[str]:
@@ -134,8 +122,6 @@ def _status(run: RunResult) -> Iterator[str]:
         yield "it failed without a message"
     if config_hash(run.config) != run.config_hash:
         yield "config_hash is not that of config"
-    if fault := resume_fault(run):
-        yield fault
 
 
 def _iterations(run: RunResult) -> Iterator[str]:
@@ -146,20 +132,17 @@ def _iterations(run: RunResult) -> Iterator[str]:
         return
     family, common = known_family(run.config["method"]["family"]), (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
-    # What further columns mean that a family outside plab has, only its record says.
+    # Further columns of a family outside plab may hold anything.
     may_be_nan = [name for name in table if name not in common] if family is None else family.may_be_nan
     if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
-    if strange := [name for name in table if table[name].dtype.kind not in "iuf"]:
-        yield f"iterations are not numbers: {', '.join(map(str, strange))}"
-        return
     if endless := [n for n in table if n not in may_be_nan and not np.isfinite(table[n]).all()]:
-        yield f"iterations are not finite: {', '.join(map(str, endless))}"
+        yield f"iterations are not finite: {', '.join(endless)}"
     if not np.array_equal(table["iteration"], np.arange(len(table))):
         yield "iterations are not numbered 0, 1, 2, ..."
     for name in ("episodes", "steps", *BUDGETS):
-        if name in table and (np.diff(table[name]) < 0).any():
+        if (np.diff(table[name]) < 0).any():
             yield f"{name} decrease"
     for name in ("iou", "score"):
         if not table[name].between(0.0, 1.0).all():
@@ -178,19 +161,14 @@ def _best(run: RunResult) -> Iterator[str]:
         yield "best actions leave [-1, 1]"
     if not 0 <= run.best_iteration < len(table):
         yield f"there is no iteration {run.best_iteration}, which is to be the best"
-    elif {"loss", "score"} <= set(table):
-        yield from _best_row(run)
-
-
-def _best_row(run: RunResult) -> Iterator[str]:
-    own, known = run.iterations.iloc[run.best_iteration], known_family(run.config["method"]["family"])
-    ranking = "loss" if known is None else known.ranking
-    if ranking == "score" and own["score"] != run.iterations["score"].max():
-        highest = run.iterations["score"].max()
-        yield f"the score of the best is {own['score']:g}, the highest in the iterations {highest:g}"
-    lowest = own["loss"] if ranking == "score" else run.iterations["loss"].min()
+        return
+    own, known = table.iloc[run.best_iteration], known_family(run.config["method"]["family"])
+    by_score = known is not None and known.ranking == "score"
+    if by_score and own["score"] != table["score"].max():
+        yield f"the score of the best is {own['score']:g}, the highest {table['score'].max():g}"
+    lowest = own["loss"] if by_score else table["loss"].min()
     if run.best_loss != lowest:
-        of = "of its iteration" if ranking == "score" else "the lowest in the iterations"
+        of = "of its iteration" if by_score else "the lowest in the iterations"
         yield f"the best loss is {run.best_loss:g}, {of} {lowest:g}"
 
 
@@ -220,7 +198,7 @@ def _masses(run: RunResult) -> Iterator[str]:
 
 
 def _possible(mass: np.ndarray, floor: str) -> bool:
-    """Return whether a tensor of finite numbers, shape [n, n, n], can be what some particles spread.
+    """Return whether particles can spread a tensor of masses, shape [n, n, n].
 
     Masses are not negative, with one exception: with the release's floor, a particle within 0.13 cells of a
     lower face has a negative weight for the second node along that axis, and at least 9/2 times as much for
@@ -230,8 +208,7 @@ def _possible(mass: np.ndarray, floor: str) -> bool:
     if floor == "release":
         for axis in range(3):
             allowed[(slice(None),) * axis + (1,)] = True
-    negative = mass < 0.0
-    return not (negative & ~allowed).any() and bool(mass.min() >= -2.0 / 9.0 * mass.max())
+    return not ((mass < 0.0) & ~allowed).any() and bool(mass.min() >= -2.0 / 9.0 * mass.max())
 
 
 def _complete(run: RunResult) -> Iterator[str]:

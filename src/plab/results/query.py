@@ -11,14 +11,11 @@ import pandas as pd
 
 from plab.config.selection import Selection, SelectionError, lookup
 from plab.errors import PlabError
-from plab.results.index import COLUMNS, Row
-from plab.results.loading import read_curves, readable_rows, sources_of, warn_of
 from plab.results.schema import ResultsError
+from plab.results.table import COLUMNS, Row, read_curves, readable_rows, sources_of, warn_of
 
 if TYPE_CHECKING:
     import duckdb
-
-__all__ = ["QueryError", "connect", "query", "scores"]
 
 
 class QueryError(PlabError, ValueError):
@@ -138,7 +135,12 @@ _TABLES = {
 }
 """Tables and their columns; ``iterations`` has those of the runs, too."""
 
-_PHASE = "seconds_"
+_TEXTS = ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets")
+_NUMBERS = ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best")
+"""Columns of ``runs`` whose type does not depend on which runs there are."""
+
+_NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
+"""Columns of a table of runs that are no scalars of the final evaluation."""
 
 
 def _answer(
@@ -156,29 +158,27 @@ def _connected(
     import duckdb
 
     found, unreadable = readable_rows(sources)
-    tables = _tables(list(enumerate(found)), sources)
+    tables = _tables(found, sources)
     if iterations:
         curves = read_curves(row.path for row in found)
-        tables["iterations"] = pd.concat(
-            [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
-            or [tables["times"][["run"]]]
-        )
+        frames = [pd.DataFrame({"run": run} | columns) for run, columns in enumerate(curves)]
+        tables["iterations"] = pd.concat(frames or [tables["times"][["run"]]])
     connection = duckdb.connect()
     for name, table in tables.items():
         connection.register("frame", table)
         connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
         connection.unregister("frame")
     # A query reaches neither files nor variables of this process.
-    connection.execute("SET python_enable_replacements = false")
-    connection.execute("SET enable_external_access = false")
+    for setting in ("python_enable_replacements = false", "enable_external_access = false"):
+        connection.execute(f"SET {setting}")
     connection.execute("SET lock_configuration = true")
     return connection, unreadable
 
 
-def _tables(found: Sequence[tuple[int, Row]], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
+def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataFrame]:
     """Return all tables but that of iterations."""
     rows: dict[str, list[tuple[Any, ...]]] = {name: [] for name in _TABLES if name != "iterations"}
-    for run, row in found:
+    for run, row in enumerate(found):
         values = row.values | {name: lookup(row.config, key) for name, key in _SETTINGS.items()}
         values["folder"] = next(str(one) for one in sources if row.path.is_relative_to(one))
         rows["runs"].append((run, *(values.get(name) for name in _TABLES["runs"][1:])))
@@ -187,29 +187,22 @@ def _tables(found: Sequence[tuple[int, Row]], sources: Sequence[Path]) -> dict[s
             plain = value is None or isinstance(value, str)
             rows["config"].append((run, key, value if plain else json.dumps(value), number))
         for name, value in row.values.items():
-            if name.startswith(_PHASE):
-                rows["times"].append((run, name.removeprefix(_PHASE), value))
+            if name.startswith("seconds_"):
+                rows["times"].append((run, name.removeprefix("seconds_"), value))
             elif value == value and name not in _NO_EVALUATION:
                 rows["evaluations"].append((run, "score" if name == "score_best" else name, value))
     tables = {
         name: pd.DataFrame([tuple(map(_encodable, row)) for row in table], columns=_TABLES[name])
         for name, table in rows.items()
     }
-    # Types do not depend on which runs there are.
-    for name in ("message", "started", "device", "precision", "plab", "git_commit", "protocol", "targets"):
-        tables["runs"][name] = tables["runs"][name].astype("string")
-    for name in ("score", "iou", "loss", "best_loss", "seconds", "batch", "score_best"):
-        tables["runs"][name] = tables["runs"][name].astype("float64")
-    tables["config"]["number"] = tables["config"]["number"].astype("float64")
+    types = dict.fromkeys(_TEXTS, "string") | dict.fromkeys(_NUMBERS, "float64")
+    tables["runs"] = tables["runs"].astype(types)
+    tables["config"] = tables["config"].astype({"number": "float64"})
     return tables
 
 
-_NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
-"""Columns of a table of runs that are no scalars of the final evaluation."""
-
-
 def _encodable(value: Any) -> Any:
-    """Return a value that DuckDB takes: file names may hold bytes that are no UTF-8."""
+    # File names may hold bytes that are no UTF-8, which DuckDB refuses.
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 

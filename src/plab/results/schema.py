@@ -1,4 +1,4 @@
-"""What a result file holds: its parts, its columns, its name."""
+"""Schema of a result file: parts, columns, hash of the configuration, name."""
 
 from __future__ import annotations
 
@@ -19,35 +19,6 @@ from plab.scenes.bodies import MATERIAL_KEYS
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = [
-    "ARCHIVE_SUFFIX",
-    "BUDGETS",
-    "COLUMNS",
-    "EVALUATION",
-    "PARTIAL_SUFFIX",
-    "REPLAY_SUFFIX",
-    "SCHEMA_VERSION",
-    "STATUSES",
-    "SUFFIX",
-    "NewerSchemaError",
-    "ResultsError",
-    "RunBusyError",
-    "RunResult",
-    "config_dict",
-    "config_hash",
-    "counts_last",
-    "final_path",
-    "last_score",
-    "loss_columns",
-    "member_name",
-    "parse_member",
-    "result_path",
-    "resume_fault",
-    "row_count",
-    "stored_config",
-    "stored_hash",
-]
 
 SCHEMA_VERSION = 2
 """Version of the file layout; files of another version are not read."""
@@ -76,22 +47,15 @@ EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 _NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds")
 """Configuration keys that cannot change a result, hence are left out of the hash."""
 
-_SECTIONS = ("task", "method", "sim", "protocol")
-
 _NEEDED: dict[str, type | tuple[type, ...]] = {
-    "task.name": str,
+    **dict.fromkeys(("task", "method", "sim", "protocol"), dict),
+    **dict.fromkeys(("task.name", "method.name", "method.family"), str),
+    **dict.fromkeys(("protocol.name", "protocol.score", "sim.device"), str),
+    **dict.fromkeys(("seed", "seed_particles", "observe_particles"), int),
     "variant": (str, int),
-    "method.name": str,
-    "method.family": str,
-    "protocol.name": str,
-    "protocol.score": str,
-    "sim.device": str,
-    "seed": int,
-    "seed_particles": int,
-    "observe_particles": int,
     "observe_target": bool,
 }
-"""What every configuration says, and the types of it."""
+"""Keys of every configuration, and their types."""
 
 _NAME = re.compile(r"(?!/)(?!(?:.*/)?\.\.(?:/|$))[^\\\x00-\x1f\x7f]{1,200}")
 """Names with which :func:`member_name` stays in its folder."""
@@ -193,47 +157,16 @@ def stored_config(text: str) -> dict[str, Any]:
     """Return the configuration that a result file holds as ``text``.
 
     Raises:
-        ValueError: If it is no configuration of a run.
+        ValueError: If it is no configuration of a run, or its names lead out of a folder.
     """
     config = json.loads(text)
-    if not isinstance(config, dict):
-        raise ValueError(f"config is a {type(config).__name__}, not sections and values")
-    if strange := [name for name in _SECTIONS if not isinstance(config.get(name), dict)]:
-        raise ValueError(f"config has no section {strange[0]}")
     for key, kind in _NEEDED.items():
-        if not isinstance(value := lookup(config, key), kind) or isinstance(value, bool) != (kind is bool):
+        value = lookup(config, key)
+        if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
             raise ValueError(f"{key} in config is {value!r:.80}")
         if isinstance(value, str) and not _NAME.fullmatch(value):
             raise ValueError(f"{key} in config is no name: {value!r:.80}")
-    _check_tables(config)
     return config
-
-
-def stored_hash(text: str) -> str:
-    """Return the hash that a result file holds as ``text``.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    if not re.fullmatch("[0-9a-f]{64}", text):
-        raise ValueError(f"config_hash is {text!r:.80}")
-    return text
-
-
-def _check_tables(config: Mapping[str, Any]) -> None:
-    """See that what readers look into are tables, and that :func:`row_count` can count."""
-    method, variants = config["method"], config["task"].get("variants") or {}
-    stages = method.get("stages", {})
-    tables = {"task.variants": variants, "method.stages": stages}
-    for key, table in tables.items():
-        if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-            raise ValueError(f"{key} in config is no table")
-    if not isinstance(method.get("loss_weights", {}), dict):
-        raise ValueError("method.loss_weights in config is no table")
-    counts = [stage.get("iterations") for stage in stages.values()]
-    counts += [method[name] for name in ("iterations", "episodes") if method.get(name) is not None]
-    if not all(type(count) is int and count >= 0 for count in counts):
-        raise ValueError("method in config counts iterations or episodes by something that is no number")
 
 
 def config_hash(cfg: Any) -> str:
@@ -291,29 +224,6 @@ def row_count(method: Mapping[str, Any]) -> int | None:
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")
-
-
-def resume_fault(run: RunResult) -> str:
-    """Return why a run cannot go on from what its file holds, empty if nothing speaks against it."""
-    columns, actions = run.columns, run.best_actions
-    if run.resume is None or not run.rows:
-        return ""
-    if actions is None or actions.ndim != 2:
-        return "it has iterations, but no best actions"
-    if not 0 <= run.best_iteration < run.rows:
-        return f"there is no iteration {run.best_iteration}, which is to be the best"
-    if missing := [name for name in ("loss", "score", *BUDGETS) if name not in columns]:
-        return f"iterations lack {missing[0]}"
-    if endless := [name for name in BUDGETS if not np.isfinite(columns[name]).all()]:
-        return f"iterations are not finite: {endless[0]}"
-    if run.config["method"]["family"] == "trajectory":
-        state = run.resume.get("actions")
-        if not isinstance(state, np.ndarray) or state.shape != actions.shape:
-            shape = list(getattr(state, "shape", ()))
-            return f"the actions to go on from have shape {shape}, not {list(actions.shape)}"
-        if not (np.abs(state) <= 1.0).all():
-            return "the actions to go on from leave [-1, 1]"
-    return ""
 
 
 def result_path(cfg: Any) -> Path:

@@ -16,7 +16,6 @@ from plab.errors import TRACEBACK, ConfigError, traceback_wanted
 from plab.families import family
 from plab.outcomes import Outcome
 from plab.results import ResultsError, RunBusyError, RunFile
-from plab.results.schema import resume_fault
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
 from plab.runners.runner import Runner, Step, Track
 from plab.runners.simulator_cache import SimulatorCache
@@ -138,10 +137,7 @@ def _parties(jobs: Sequence[Job]) -> list[Sequence[Job]]:
     able = []
     for job in jobs:
         try:
-            # What a runner that does everything itself goes on from only it knows.
-            if _runner_type(job).run is Runner.run and (fault := resume_fault(job.run.result)):
-                what = f"{job.run.partial_path} cannot be gone on from: {fault}"
-                raise ResultsError(f"{what}; start afresh with force=true")
+            _runner_type(job)
             able.append(job)
         except Exception as error:
             job.fail(error)

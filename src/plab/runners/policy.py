@@ -32,7 +32,7 @@ from plab.envs.core import EpisodeBatch
 from plab.families import FAMILIES, family
 from plab.files import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
-from plab.results.files import replace_file
+from plab.results.run_file import replace_file
 from plab.runners.common import LAST, episode_columns, simulator_key
 from plab.runners.runner import Runner, Track
 from plab.runners.simulator_cache import SimulatorCache

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from plab.config import OffPolicyConfig
 from plab.results import ResultsError
-from plab.results.files import cause
+from plab.results.run_file import cause
 
 __all__ = ["ReplayBuffer", "Samples", "Sizes", "require_file"]
 

@@ -16,10 +16,10 @@ from plab.config.selection import Selection, SelectionError, one_protocol, requi
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.outcomes import MOST_RUNS
 from plab.results import ResultsError, Row, row_count
-from plab.results.files import columns_of, opened, split_archive, summary_of
-from plab.results.loading import readable_rows, sources_of
 from plab.results.locks import held
+from plab.results.run_file import columns_of, opened, split_archive, summary_of
 from plab.results.schema import parse_member
+from plab.results.table import readable_rows, sources_of
 
 __all__ = ["NAMES", "STATES", "Group", "Run", "Survey", "survey"]
 

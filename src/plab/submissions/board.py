@@ -18,7 +18,7 @@ from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.series import BUDGETS
 from plab.results import ResultsError, Row, config_dict
 from plab.results.examples import example_archive
-from plab.results.loading import readable_rows
+from plab.results.table import readable_rows
 from plab.submissions.collecting import steps_to_best, submission_files
 from plab.submissions.files import read
 from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submission, SubmissionError

@@ -10,7 +10,7 @@ from plab.config.selection import Selection
 from plab.render import RenderError, recording
 from plab.report.series import load_rows
 from plab.results import Row
-from plab.results.loading import readable_rows
+from plab.results.table import readable_rows
 from plab.submissions.files import read
 from plab.submissions.playing import play_policy
 from plab.submissions.policies import load

@@ -21,7 +21,8 @@ from numpy.lib import format as npy
 import plab
 from plab.config.suite import suite_tasks
 from plab.files import UnreadableError, member_bytes, opened_zip
-from plab.results.files import replace_file, zipped
+from plab.results.archive import zipped
+from plab.results.run_file import replace_file
 from plab.submissions.schema import (
     SUFFIX,
     TARGETS,

@@ -12,8 +12,8 @@ from typing import Any
 
 import plab
 from plab.config import Config
-from plab.results.files import replace_file
 from plab.results.provenance import now
+from plab.results.run_file import replace_file
 from plab.scenes import PRECISIONS
 from plab.submissions.playing import Played, play_plans, play_policy
 from plab.submissions.policies import load

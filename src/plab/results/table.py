@@ -1,0 +1,433 @@
+"""Folders and archives of results as one table, a row per run, with an index of unchanged files.
+
+The index is a Parquet file read by DuckDB. It is never trusted over the files: an entry counts only while its
+file has the same size, inode and times of change. It is replaced atomically, and can be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+import time
+import warnings
+import zipfile
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+import pandas as pd
+
+from plab.config.selection import lookup
+from plab.files import cache_dir
+from plab.results.run_file import (
+    actions_of,
+    config_of,
+    curves_of,
+    opened,
+    opened_archive,
+    opened_member,
+    split_archive,
+    summary_of,
+)
+from plab.results.schema import (
+    ARCHIVE_SUFFIX,
+    PARTIAL_SUFFIX,
+    SCHEMA_VERSION,
+    SUFFIX,
+    ResultsError,
+    counts_last,
+    last_score,
+    row_count,
+)
+
+T = TypeVar("T")
+
+_ORIGIN = {"started": "start_time"} | {
+    name: name for name in ("device", "precision", "batch", "plab", "git_commit")
+}
+"""Column to key of the provenance."""
+
+_BEST = ("best_iteration", "best_loss")
+
+COLUMNS = (
+    *("task", "variant", "method", "seed", "status", "message", "score", "iou", "loss", "iterations"),
+    *(*_BEST, "seconds", *_ORIGIN, "config_hash", "path"),
+)
+"""Columns that every table of runs has."""
+
+_ATTEMPTS = 3
+"""Maximum number of times that a folder is listed while runs end in it."""
+
+_INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
+
+_FIELDS = ("file", "identity", "member", "row", "config")
+"""Columns of the index: path below the folder, identity of the file, name in an archive (empty for a file of
+its own), and the two parts of :class:`Row` as JSON."""
+
+_SETTLED = 2.0
+"""Age from which on a file's times identify its contents [s]: file systems round them."""
+
+File = tuple[Path, os.stat_result]
+"""A result file or an archive, and its status in the file system."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run in a table of runs.
+
+    Attributes:
+        values: Value of each column of :func:`plab.results.load`.
+        config: Configuration of the run.
+    """
+
+    values: dict[str, Any]
+    config: dict[str, Any]
+
+    @property
+    def path(self) -> Path:
+        """Path of the run's file, or its place in an archive."""
+        return Path(self.values["path"])
+
+
+Entries = list[Row | ResultsError]
+"""Rows of a file or an archive, and what is wrong where there is none."""
+
+
+def load(
+    source: str | Path | Sequence[str | Path] = "results", keys: Sequence[str] = (), *, index: bool = True
+) -> pd.DataFrame:
+    """Load results, a row per run.
+
+    Partial files are included (their status tells them apart) unless the same run has a finished file, and so
+    are the runs in archives unless the folder has the same run in a file. Files that cannot be read are named
+    in one warning.
+
+    Args:
+        source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
+        keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
+        index: Take rows of unchanged files from the folder's index, and keep it up to date.
+
+    Returns:
+        Columns task, variant, method, seed, status, message, score, iou, loss, iterations, best_iteration,
+        best_loss, seconds, started, device, precision, plab, git_commit, config_hash, path, the other scalars
+        of the final evaluation, the seconds of each phase (``seconds_optimise`` and so on), and ``keys``.
+        ``score_best``, ``iou`` and ``loss`` are the final evaluation's, NaN before it; ``score`` is the same,
+        or that of the last iteration with ``protocol.score=last``: see :attr:`RunResult.score`.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``, or ``keys`` is a text.
+    """
+    if isinstance(keys, str):
+        raise ResultsError(f"keys are a list of dotted keys, such as ['{keys}'], not the text '{keys}'")
+    found, unreadable = rows(source, index=index)
+    warn_of(unreadable)
+    table = [row.values | {key: lookup(row.config, key) for key in keys} for row in found]
+    return pd.DataFrame(table, columns=None if table else [*COLUMNS, *keys])
+
+
+def warn_of(unreadable: Sequence[ResultsError]) -> None:
+    """Name unreadable files in one warning, as if by the caller's caller."""
+    if unreadable:
+        listed = "; ".join(str(error) for error in unreadable)
+        warnings.warn(f"left out {len(unreadable)} unreadable file(s): {listed}", stacklevel=3)
+
+
+def rows(
+    source: str | Path | Sequence[str | Path] = "results", *, index: bool = True
+) -> tuple[list[Row], list[ResultsError]]:
+    """Return the rows of :func:`load` with their configurations, and what could not be read.
+
+    A file is read in full before it has a row, so that its iterations and actions can be read afterwards.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``.
+    """
+    entries = [entry for root in sources_of(source) for entry in _all_rows(root, index)]
+    found = [entry for entry in entries if isinstance(entry, Row)]
+    return _without_repetitions(found), [entry for entry in entries if isinstance(entry, ResultsError)]
+
+
+def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row], list[ResultsError]]:
+    """Return the same as :func:`rows`, but raise where files are asked for and none can be read.
+
+    Raises:
+        ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
+    """
+    found, unreadable = rows(source)
+    if unreadable and not found and not any(root.is_dir() for root in sources_of(source)):
+        raise unreadable[0]
+    return found, unreadable
+
+
+def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return the folders, archives and files that are meant."""
+    return [Path(source)] if isinstance(source, str | Path) else list(map(Path, source))
+
+
+def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
+    """Read the iterations of many runs.
+
+    Args:
+        paths: The runs' files or places in archives, as :func:`plab.results.load` gives them.
+
+    Returns:
+        The columns of each run, shape [iteration] each, in the order of ``paths``.
+
+    Raises:
+        ResultsError: If one cannot be read.
+    """
+    wanted = list(map(str, paths))
+    archives = dict.fromkeys(inside[0] for path in wanted if (inside := split_archive(Path(path))))
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for archive in archives:
+        # An archive is unpacked once for all of its runs.
+        for entry in read_each(archive, lambda file, place: (str(place), curves_of(file)), {*wanted}):
+            if isinstance(entry, ResultsError):
+                raise entry
+            found[entry[0]] = entry[1]
+    for path in {*wanted} - found.keys():
+        with opened(Path(path)) as file:
+            found[path] = curves_of(file)
+    return [found[path] for path in wanted]
+
+
+def run_files(root: Path) -> Iterator[File]:
+    """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
+
+    Links that lead in a circle, folders named like a file, and folders that may not be searched are among
+    them: reading says what is wrong.
+
+    Raises:
+        ResultsError: If there is nothing at ``root``.
+    """
+    try:
+        found = os.stat(root)
+    except OSError as error:
+        why = "does not exist" if not os.path.lexists(root) else f"cannot be read ({error.strerror})"
+        raise ResultsError(f"there are no results: {root} {why}") from None
+    if not stat.S_ISDIR(found.st_mode):
+        yield root, found
+        return
+    closed: list[Path] = []
+    for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
+        subfolders.sort()
+        wrong = {name for name in subfolders if name.endswith(SUFFIX)}
+        for name in sorted(name for name in (*names, *wrong) if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
+            # By text: pathlib takes longer than the file system. A run that ends removes its partial file.
+            path = os.path.join(folder, name)
+            with suppress(FileNotFoundError):
+                try:
+                    status = os.stat(path)
+                except OSError:
+                    status = os.lstat(path)
+                yield Path(path), status
+    if root in closed:
+        raise ResultsError(f"there are no results: {root} may not be read")
+    yield from ((path, os.lstat(path)) for path in sorted(closed))
+
+
+def read_rows(path: Path) -> Iterator[Row | ResultsError]:
+    """Yield the rows of a result file or an archive, and what is wrong where there is none."""
+    return read_each(path, _row)
+
+
+def read_each(
+    path: Path, extract: Callable[[h5py.File, Path], T], wanted: set[str] | None = None
+) -> Iterator[T | ResultsError]:
+    """Yield what ``extract`` takes from a result file or from each run of an archive, or what is wrong.
+
+    Args:
+        path: The file or archive.
+        extract: Function of the open file and its path, of a run in an archive its place there.
+        wanted: Places to read; None for all.
+    """
+    try:
+        if not path.name.endswith(ARCHIVE_SUFFIX):
+            with opened(path) as file:
+                yield extract(file, path)
+            return
+        with opened_archive(path) as archive:
+            for name in members(archive):
+                place = path / name
+                if wanted is not None and str(place) not in wanted:
+                    continue
+                try:
+                    with opened_member(archive, name, place) as file:
+                        yield extract(file, place)
+                except ResultsError as error:
+                    yield error
+    except ResultsError as error:
+        yield error
+
+
+def members(archive: zipfile.ZipFile) -> list[str]:
+    """Return the names of the runs in an archive, without folders, which other programs add."""
+    return [info.filename for info in archive.infolist() if not info.is_dir()]
+
+
+def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
+    """Yield the rows of all files below a folder, or of one file, from the index where it has them."""
+    for left in reversed(range(_ATTEMPTS)):
+        files = list(run_files(root))
+        present = {str(path) for path, _ in files}
+        # A finished file takes the place of its partial one.
+        files = [
+            (path, status)
+            for path, status in files
+            if not path.name.endswith(PARTIAL_SUFFIX)
+            or str(path).removesuffix(PARTIAL_SUFFIX) + SUFFIX not in present
+        ]
+        entries = _indexed(root, files) if index else [_read(path) for path, _ in files]
+        # A run that ended meanwhile has a final file in place of its partial one.
+        if None not in entries or not left:
+            break
+    for found in entries:
+        yield from found or ()
+
+
+def _read(path: Path) -> Entries | None:
+    """Return the rows of a file, None if it is gone: a run that ends removes its partial file."""
+    entries = list(read_rows(path))
+    return entries if os.path.lexists(path) else None
+
+
+def _without_repetitions(found: list[Row]) -> list[Row]:
+    """Leave out what the same configuration's finished run makes superfluous.
+
+    Of loose files that are as good as each other all stay, of archived runs only the first, and none where
+    there is a loose one.
+    """
+    by_hash: dict[str, list[Row]] = defaultdict(list)
+    for row in found:
+        by_hash[row.values["config_hash"]].append(row)
+    kept = []
+    for same in by_hash.values():
+        if len(same) == 1:
+            kept += same
+            continue
+        best = [row for row in same if row.values["status"] == "finished"] or same
+        loose = [row for row in best if split_archive(row.path) is None]
+        kept += loose or best[:1]
+    return kept
+
+
+def _row(file: h5py.File, path: Path) -> Row:
+    """Return the row of an open file, all of whose columns and actions can be read."""
+    config, summary, columns = config_of(file), summary_of(file), curves_of(file)
+    actions_of(file)
+    # A method's section that cannot be counted is named here, not where a table is made.
+    row_count(config["method"])
+    evaluation, phases, origin = summary["evaluation"], summary["wall_time"], summary["provenance"]
+    known = {
+        "task": config["task"]["name"],
+        "variant": str(config["variant"]),
+        "method": config["method"]["name"],
+        "seed": config["seed"],
+        "iterations": len(next(iter(columns.values()), ())),
+        "seconds": float(sum(phases.values())),
+        "path": str(path),
+        **{
+            name: summary[name]
+            for name in ("status", "message", "best_iteration", "best_loss", "config_hash")
+        },
+        **{name: origin.get(key, np.nan) for name, key in _ORIGIN.items()},
+    }
+    values = {name: known.get(name, evaluation.get(name, np.nan)) for name in COLUMNS}
+    values |= {name: value for name, value in evaluation.items() if name not in values}
+    values["score_best"] = values["score"]
+    if evaluation and counts_last(config):
+        values["score"] = last_score(columns)
+    return Row(values | {f"seconds_{name}": seconds for name, seconds in phases.items()}, config)
+
+
+# ------------------------------------------------------------------------------------------------------ index
+
+
+def _indexed(root: Path, files: Sequence[File]) -> list[Entries | None]:
+    """Return the rows of each file below a folder, from the index where the file has not changed."""
+    place = _index_place(root)
+    known = _stored(place)
+    identities = [_identity(status) for _, status in files]
+    names = [os.path.relpath(path, root) for path, _ in files]
+    found: list[Entries | None] = []
+    changed = len(known) != len(files)
+    for (path, _), name, identity in zip(files, names, identities, strict=True):
+        entry = known.get(name)
+        if entry is not None and entry[0] == identity:
+            found.append([_restored(path, *parts) for parts in entry[1]])
+        else:
+            found.append(_read(path))
+            changed = True
+    if changed:
+        _write(place, zip(files, names, identities, found, strict=True))
+    return found
+
+
+def _identity(status: os.stat_result) -> str:
+    # The time of the last change of the inode cannot be set back, unlike the modification time.
+    return f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
+
+
+def _index_place(root: Path) -> Path:
+    """Return the path of the index: in the folder if that is writable, else in the user's cache folder."""
+    if root.is_dir() and os.access(root, os.W_OK):
+        return root / _INDEX
+    digest = hashlib.sha256(os.fsencode(root.resolve())).hexdigest()[:16]
+    return cache_dir() / "results" / f"{digest}{_INDEX}"
+
+
+def _stored(place: Path) -> dict[str, tuple[str, list[tuple[str, str, str]]]]:
+    """Return identity and runs of each file in the index; nothing if it is missing or damaged."""
+    if not place.exists():
+        return {}
+    import duckdb
+
+    known: dict[str, tuple[str, list[tuple[str, str, str]]]] = {}
+    with suppress(duckdb.Error), duckdb.connect() as connection:
+        query = f"SELECT {', '.join(_FIELDS)} FROM read_parquet(?)"
+        for file, identity, *parts in connection.execute(query, [str(place)]).fetchall():
+            known.setdefault(file, (identity, []))[1].append(tuple(parts))
+    return known
+
+
+def _restored(path: Path, member: str, row: str, config: str) -> Row:
+    values = json.loads(row)
+    # The same folder may have another path in the next call.
+    values["path"] = str(path / member) if member else str(path)
+    return Row(values, json.loads(config))
+
+
+def _write(place: Path, entries: Iterator[tuple[File, str, str, Entries | None]]) -> None:
+    """Replace the index; a folder that cannot be written has none."""
+    import duckdb
+
+    now, table = time.time(), []
+    for (path, status), name, identity, found in entries:
+        sound = [row for row in found or () if isinstance(row, Row)]
+        # Damaged files are read again: the message is part of the result.
+        if not sound or len(sound) < len(found or ()) or now - status.st_mtime < _SETTLED:
+            continue
+        for row in sound:
+            member = row.path.relative_to(path).as_posix() if row.path != path else ""
+            values = json.dumps(row.values | {"path": ""})
+            table.append((name, identity, member, values, json.dumps(row.config)))
+    if not table and not place.exists():
+        return
+    temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with duckdb.connect() as connection:
+            connection.register("entries", pd.DataFrame(table, columns=list(_FIELDS), dtype=object))
+            target = str(temporary).replace("'", "''")
+            connection.execute(f"COPY entries TO '{target}' (FORMAT parquet, COMPRESSION zstd)")
+        os.replace(temporary, place)
+    except (OSError, duckdb.Error):
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
