@@ -1,5 +1,7 @@
 """The material's formulas with NumPy's arrays, beside singular values and central differences."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from plab.sim import linalg, material
 from plab.sim.linalg import Series
 
 SERIES = Series.for_precision("float64")
-MU, LAM, YIELD, DT = 417.0, 278.0, 0.02, 1e-4
+PARAMETERS = MU, LAM, YIELD = np.array([417.0, 278.0, 0.02])
+DT = 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -18,14 +21,16 @@ def state() -> tuple[np.ndarray, np.ndarray]:
     return 30.0 * rng.normal(size=(9, 1000)), np.eye(3).reshape(9, 1) + size * rng.normal(size=(9, 1000))
 
 
-def by_series(c: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def by_series(
+    c: np.ndarray, f: np.ndarray, mu: float = MU, lam: float = LAM, limit: float = YIELD
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Kirchhoff stress (6), new F (9) and the factor of return mapping."""
     g = material.trial_gradient(c, f, DT)
     j = linalg.det(g)
     c2, _w, _z, z_squared, _a1, _a2, d = material.hencky_strain(g, j, SERIES)
     assert (z_squared < SERIES.z_squared_max).all()
-    tau = material.stress(d, j, c2, MU, LAM, YIELD, SERIES)
-    return np.array(tau), np.array(material.flow(d, g, YIELD, SERIES)), material.yield_factor(d, YIELD)[3]
+    tau = material.stress(d, j, c2, mu, lam, limit, SERIES)
+    return np.array(tau), np.array(material.flow(d, g, limit, SERIES)), material.yield_factor(d, limit)[3]
 
 
 def test_stress_and_flow_are_those_of_singular_values(state) -> None:
@@ -45,29 +50,34 @@ def test_stress_and_flow_are_those_of_singular_values(state) -> None:
     np.testing.assert_allclose(f_new.reshape(3, 3, -1).transpose(2, 0, 1), (u * s[:, None]) @ vt, atol=1e-13)
 
 
-def test_adjoints_are_central_differences(state) -> None:
+def test_adjoints_are_central_differences(state, monkeypatch) -> None:
+    """Of C, F and the parameters, as traced for the bitcode."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "tools")
+    from adjoints import flow_adjoint, strain_adjoint, stress_adjoint
+
     c, f = state
     rng = np.random.default_rng(1)
-    tau_bar, f_bar = rng.normal(size=(6, c.shape[1])), rng.normal(size=(9, c.shape[1]))
+    a_bar, f_bar = rng.normal(size=(9, c.shape[1])), rng.normal(size=(9, c.shape[1]))
     g = material.trial_gradient(c, f, DT)
     j = linalg.det(g)
     c2, w, z, _z_squared, a1, a2, d = material.hencky_strain(g, j, SERIES)
-    adjoint, flow_adjoint = material.stress_adjoint, material.flow_adjoint
-    d_bar, k_bar, c2_bar, j_bar = adjoint(d, j, c2, tau_bar, MU, LAM, YIELD, SERIES)
-    d_flow, k_flow, g_bar = flow_adjoint(d, g, f_bar, YIELD, SERIES)
-    sums = [x + y for x, y in zip(d_bar, d_flow, strict=True)]
-    z_bar = material.log_adjoint(z, a1, a2, d, sums, k_bar + k_flow, YIELD, SERIES)
-    last = material.strain_adjoint
-    c_bar, f_out = (np.array(x) for x in last(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, DT))
-    directions = 30.0 * rng.normal(size=c.shape), 0.01 * rng.normal(size=f.shape)
+    d_bar, c2_bar, j_bar, parameters_bar = stress_adjoint(d, j, c2, PARAMETERS, a_bar, 0.5, SERIES)
+    d_flow, g_bar, yield_bar = flow_adjoint(d, g, YIELD, f_bar, SERIES)
+    known = [*g, j, c2, *w, *z, a1, a2, *d]
+    bars = [*g_bar, j_bar, c2_bar, *np.add(d_bar, d_flow)]
+    c_bar, f_out = (np.array(x) for x in strain_adjoint(c, f, DT, known, bars, SERIES))
+    parameters_bar[2] = parameters_bar[2] + yield_bar
+    ways = 30.0 * rng.normal(size=c.shape), 0.01 * rng.normal(size=f.shape), PARAMETERS * rng.normal(size=3)
 
     def loss(step: float) -> tuple[np.ndarray, np.ndarray]:
-        tau, f_new, k = by_series(c + step * directions[0], f + step * directions[1])
-        return linalg.dot_sym(tau_bar, tau) + (f_bar * f_new).sum(axis=0), k
+        parameters = PARAMETERS + step * ways[2]
+        tau, f_new, k = by_series(c + step * ways[0], f + step * ways[1], *parameters)
+        a = material.scattered_matrix(tau, c, 0.5, 0.0)
+        return (a_bar * a).sum(axis=0) + (f_bar * f_new).sum(axis=0), k
 
     h = 1e-5
     (up, k_up), (down, k_down) = loss(h), loss(-h)
     smooth = (k_up < 1.0) == (k_down < 1.0)
     assert smooth.mean() > 0.98
-    wanted = (c_bar * directions[0] + f_out * directions[1]).sum(axis=0)
+    wanted = (c_bar * ways[0] + f_out * ways[1]).sum(axis=0) + ways[2] @ np.array(parameters_bar)
     np.testing.assert_allclose(((up - down) / (2.0 * h))[smooth], wanted[smooth], rtol=1e-5, atol=1e-5)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import adjoints
 import numpy as np
 from llvmlite import ir
 from stencils import LANE, Code
@@ -71,6 +72,9 @@ class Lanes:
     def __lt__(self, other: Lanes | float) -> Lanes:
         return self._operation("below", self, other)
 
+    def __gt__(self, other: Lanes | float) -> Lanes:
+        return self._operation("below", other, self)
+
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Lanes | float) -> Lanes:
         """What NumPy's functions of numbers do."""
         if function is np.sqrt:
@@ -80,9 +84,9 @@ class Lanes:
     def __array_function__(self, function: Any, _types: Any, given: Any, _words: Any) -> Lanes:
         """What :func:`numpy.where` does; no other of NumPy's functions of arrays is known."""
         assert function is np.where
-        chosen, a, b = given
-        other = b.value if isinstance(b, Lanes) else self.code.constant(b)
-        return Lanes(self.code, self.code.chosen(chosen.value, a.value, other))
+        chosen, *rest = given
+        a, b = (one.value if isinstance(one, Lanes) else self.code.constant(one) for one in rest)
+        return Lanes(self.code, self.code.chosen(chosen.value, a, b))
 
 
 def _is(other: Lanes | float, number: float) -> bool:
@@ -186,13 +190,14 @@ def flow(module: ir.Module, name: str, real: ir.Type) -> None:
 def stress_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     """Adjoint of a tile's stress, from that of A in ``affine``; ``rigid`` is 1 where nothing yields."""
     tile = Tile(module, name, real, "affine", "stress_scale rigid")
-    d, (j, c2), (mu, lam, limit) = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.parameters()
-    adjoint = material.stress_adjoint
-    tau_bar = material.scattered_matrix_adjoint(tile.take(0, 9, "affine"), tile.number("stress_scale"))
-    d_bar, *bars = adjoint(d, j, c2, tau_bar, mu, lam, limit, tile.series)
+    d, (j, c2), a_bar = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.take(0, 9, "affine")
+    parameters, scale = tile.parameters(), tile.number("stress_scale")
+    adjoint = adjoints.stress_adjoint
+    d_bar, c2_bar, j_bar, parameter_bars = adjoint(d, j, c2, parameters, a_bar, scale, tile.series)
     tile.leave(STRAIN_D_BAR, d_bar)
-    tile.leave(STRAIN_BARS, bars)
-    tile.note_yield(d, limit)
+    tile.leave(STRAIN_BARS, [j_bar, c2_bar])
+    tile.leave(STRAIN_PARAMETER_BARS, parameter_bars)
+    tile.note_yield(d, parameters[2])
     tile.code.end()
 
 
@@ -200,37 +205,24 @@ def flow_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     """Adjoint of a tile's plastic flow, from that of the new F in ``bar``, added to that of the stress."""
     tile = Tile(module, name, real, "bar", "")
     d, g, f_bar = tile.take(STRAIN_D, 6), tile.take(0, 9), tile.take(AT_F, 9, "bar")
-    d_bar, k_bar, g_bar = material.flow_adjoint(d, g, f_bar, tile.parameters()[2], tile.series)
+    d_bar, g_bar, yield_bar = adjoints.flow_adjoint(d, g, tile.parameters()[2], f_bar, tile.series)
     tile.leave(STRAIN_D_BAR, [a + b for a, b in zip(tile.take(STRAIN_D_BAR, 6), d_bar, strict=True)])
-    tile.leave(STRAIN_BARS, [tile.take(STRAIN_BARS, 1)[0] + k_bar])
     tile.leave(STRAIN_G_BAR, g_bar)
-    tile.code.end()
-
-
-def parameter_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
-    """Adjoints of a tile's mu, lambda and yield strain, from those of A in ``affine`` and of k."""
-    tile = Tile(module, name, real, "affine", "stress_scale")
-    d, (j, c2), k_bar = tile.take(STRAIN_D, 6), tile.take(STRAIN_SCALARS, 2), tile.take(STRAIN_BARS, 1)[0]
-    tau_bar = material.scattered_matrix_adjoint(tile.take(0, 9, "affine"), tile.number("stress_scale"))
-    adjoint = material.parameter_adjoint
-    tile.leave(STRAIN_PARAMETER_BARS, adjoint(d, j, c2, tau_bar, k_bar, tile.parameters()[2], tile.series))
+    tile.leave(STRAIN_PARAMETER_BARS + 2, [tile.take(STRAIN_PARAMETER_BARS + 2, 1)[0] + yield_bar])
     tile.code.end()
 
 
 def strain_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     """Adjoints of C and F of a tile to ``bar``, from those of d, of what else the stress takes, and of G."""
     tile = Tile(module, name, real, "source affine bar", "dt mass")
-    z, d, d_bar = (tile.take(first, 6) for first in (STRAIN_Z, STRAIN_D, STRAIN_D_BAR))
-    j, c2, a1, a2 = tile.take(STRAIN_SCALARS, 4)
-    k_bar, c2_bar, j_bar = tile.take(STRAIN_BARS, 3)
-    z_bar = material.log_adjoint(z, a1, a2, d, d_bar, k_bar, tile.parameters()[2], tile.series)
     c, f = tile.take(AT_C, 9, "source"), tile.take(AT_F, 9, "source")
-    g, w, g_bar = tile.take(0, 9), tile.take(STRAIN_W, 6), tile.take(STRAIN_G_BAR, 9)
-    adjoint = material.strain_adjoint
-    c_out, f_out = adjoint(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, tile.number("dt"))
+    g, w, z, d = (tile.take(at, n) for at, n in ((0, 9), (STRAIN_W, 6), (STRAIN_Z, 6), (STRAIN_D, 6)))
+    known = [*g, *tile.take(STRAIN_SCALARS, 2), *w, *z, *tile.take(STRAIN_SCALARS + 2, 2), *d]
+    bars = [*tile.take(STRAIN_G_BAR, 9), *tile.take(STRAIN_BARS, 2), *tile.take(STRAIN_D_BAR, 6)]
+    c_bar, f_bar = adjoints.strain_adjoint(c, f, tile.number("dt"), known, bars, tile.series)
     mass, a_bar = tile.number("mass"), tile.take(0, 9, "affine")
-    tile.leave(AT_C, [one + mass * a for one, a in zip(c_out, a_bar, strict=True)], "bar")
-    tile.leave(AT_F, f_out, "bar")
+    tile.leave(AT_C, [one + mass * a for one, a in zip(c_bar, a_bar, strict=True)], "bar")
+    tile.leave(AT_F, f_bar, "bar")
     tile.code.end()
 
 
@@ -241,7 +233,6 @@ MATERIAL = (
     flow,
     stress_adjoint,
     flow_adjoint,
-    parameter_adjoint,
     strain_adjoint,
 )
 """What makes the functions, named as these."""

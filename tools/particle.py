@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager
 from functools import reduce
 from typing import Any
 
+from adjoints import flow_adjoint, strain_adjoint, stress_adjoint
 from llvmlite import ir
 from material import Lanes, series_of, served
 from stencils import WORD, Code
@@ -132,20 +133,18 @@ def particle_adjoint(module: ir.Module, name: str, real: ir.Type) -> None:
     g, j, (c2, w, z, _z2, a1, a2, d), fits = one.strain(c, f)
     mu, lam, limit = (one.number(key) for key in ("mu", "lam", "limit"))
     with code.where(fits):
-        tau_bar = material.scattered_matrix_adjoint(a_bar, one.number("stress_scale"))
-        adjoint = material.stress_adjoint
-        d_bar, k_bar, c2_bar, j_bar = adjoint(d, j, c2, tau_bar, mu, lam, limit, one.series)
-        kept = code.variables([x.value for x in (*d_bar, k_bar, *g_bar)])
+        scale = one.number("stress_scale")
+        d_bar, c2_bar, j_bar, bars = stress_adjoint(d, j, c2, (mu, lam, limit), a_bar, scale, one.series)
+        kept = code.variables([x.value for x in (*d_bar, bars[2], *g_bar)])
         with code.where(one.flows(d)):
-            d_flow, k_flow, g_flow = material.flow_adjoint(d, g, g_bar, limit, one.series)
-            sums = [x + y for x, y in zip((*d_bar, k_bar), (*d_flow, k_flow), strict=True)]
+            d_flow, g_flow, limit_flow = flow_adjoint(d, g, limit, g_bar, one.series)
+            sums = [x + y for x, y in zip((*d_bar, bars[2]), (*d_flow, limit_flow), strict=True)]
             code.set_variables(kept, [x.value for x in (*sums, *g_flow)])
-        *d_bar, k_bar = (Lanes(code, value) for value in code.values(kept[:7]))
+        *d_bar, bars[2] = (Lanes(code, value) for value in code.values(kept[:7]))
         g_bar = [Lanes(code, value) for value in code.values(kept[7:])]
-        bars = material.parameter_adjoint(d, j, c2, tau_bar, k_bar, limit, one.series)
-        z_bar = material.log_adjoint(z, a1, a2, d, d_bar, k_bar, limit, one.series)
-        last = material.strain_adjoint
-        c_out, f_out = last(c, f, g, j, c2, w, z_bar, c2_bar, j_bar, g_bar, one.number("dt"))
+        known = [*g, j, c2, *w, *z, a1, a2, *d]
+        own = [*g_bar, j_bar, c2_bar, *d_bar]
+        c_out, f_out = strain_adjoint(c, f, one.number("dt"), known, own, one.series)
         mass = one.number("mass")
         one.leave("c", [x + mass * a for x, a in zip(c_out, a_bar, strict=True)])
         one.leave("f", f_out)

@@ -18,7 +18,6 @@ __all__ = [
     "flow_adjoint",
     "gather",
     "gather_adjoint",
-    "parameter_adjoint",
     "scatter",
     "strain",
     "strain_adjoint",
@@ -112,7 +111,8 @@ def flow(real: ti.template(), strains, target):
 
 @ti.func
 def stress_adjoint(real: ti.template(), strains, affine, stress_scale):
-    """Adjoint of a tile's stress, within ``strains``; whether any of its particles yields."""
+    """Adjoints of a tile's strain and parameters by the stress, within ``strains``; whether any of its
+    particles yields."""
     s, a, scale, rigid = ti.u64(strains), ti.u64(affine), ti.cast(stress_scale, real), ti.cast(0.0, real)
     ti.static(_function("stress_adjoint", real))(s, a, scale, rigid)
     return rigid < 1.0
@@ -120,16 +120,9 @@ def stress_adjoint(real: ti.template(), strains, affine, stress_scale):
 
 @ti.func
 def flow_adjoint(real: ti.template(), strains, bar):
-    """Adjoint of a tile's plastic flow, added to that of the stress in ``strains``."""
+    """Adjoints by a tile's plastic flow, added to those by the stress in ``strains``."""
     s, b = ti.u64(strains), ti.u64(bar)
     ti.static(_function("flow_adjoint", real))(s, b)
-
-
-@ti.func
-def parameter_adjoint(real: ti.template(), strains, affine, stress_scale):
-    """Adjoints of a tile's mu, lambda and yield strain, within ``strains``, from that of A in ``affine``."""
-    s, a, scale = ti.u64(strains), ti.u64(affine), ti.cast(stress_scale, real)
-    ti.static(_function("parameter_adjoint", real))(s, a, scale)
 
 
 @ti.func

@@ -18,7 +18,6 @@ from plab.sim.cpu_bitcode import (
     flow_adjoint,
     gather,
     gather_adjoint,
-    parameter_adjoint,
     scatter,
     strain,
     strain_adjoint,
@@ -291,8 +290,6 @@ class MaterialTiles(ParticlePhases):
     @ti.func
     def parameter_tile_adjoint(self, entry9, at):
         """Add a tile's adjoints of the material's parameters, from ``strains``."""
-        affine = self.lane_in(self.affine, entry9, 0)
-        parameter_adjoint(self.real, self.lane_in(self.strains, at, 0), affine, self.stress_scale)
         mu_bar, lam_bar, yield_bar = [self.strains[at + STRAIN_PARAMETER_BARS + i] for i in range(3)]
         if ti.static(self.mixed):
             for lane in range(self.lanes):

@@ -1,4 +1,4 @@
-"""3x3 algebra, and series for the logarithm and exponential of symmetric 3x3 matrices, with adjoints.
+"""3x3 algebra, and series for the logarithm and exponential of symmetric 3x3 matrices.
 
 Components may be of any kind: numbers, arrays, or what ``make bitcode`` calls these functions with. A matrix
 is a tuple of 9 components in row-major order, a symmetric one a tuple of 6: (00, 11, 22, 01, 02, 12).
@@ -10,7 +10,7 @@ coefficients:
   factor of Z^2 maps the coefficients of (I, Z, Z^2) linearly; Horner's rule runs over these maps.
 * ``exp``: d is traceless, so ``d^3 = q d + D I`` with ``q = tr(d^2) / 2`` and ``D = det d``.
 
-Their adjoints are those of the scalar recurrences. :mod:`plab.sim.material` defines b, Z and d.
+:mod:`plab.sim.material` defines b, Z and d.
 """
 
 import math
@@ -23,23 +23,15 @@ __all__ = [
     "cofactor_sym",
     "det",
     "det_sym",
-    "dot_sym",
     "exp_coefficients",
-    "exp_coefficients_adjoint",
     "inverse_cbrt",
     "inverse_sym",
     "log_coefficients",
-    "log_coefficients_adjoint",
     "mat_from_sym",
     "mul",
-    "mul_nt",
     "mul_sym_mat",
-    "mul_tn",
     "outer_sym",
-    "sandwich_sym",
     "square_sym",
-    "sym_of_product",
-    "sym_product_twice",
 ]
 
 SYM = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -66,37 +58,12 @@ def mul(a, b):
     return tuple(entry(a, b, i, j) for i in range(3) for j in range(3))
 
 
-def mul_tn(a, b):
-    """A^T B, both full."""
-    return mul(transposed(a), b)
-
-
-def mul_nt(a, b):
-    """A B^T, both full."""
-    return mul(a, transposed(b))
-
-
 def det(a):
     """Determinant of a full matrix."""
     return (
         a[0] * (a[4] * a[8] - a[5] * a[7])
         - a[1] * (a[3] * a[8] - a[5] * a[6])
         + a[2] * (a[3] * a[7] - a[4] * a[6])
-    )
-
-
-def cofactor(a):
-    """d det(A) / dA of a full matrix."""
-    return (
-        a[4] * a[8] - a[5] * a[7],
-        a[5] * a[6] - a[3] * a[8],
-        a[3] * a[7] - a[4] * a[6],
-        a[2] * a[7] - a[1] * a[8],
-        a[0] * a[8] - a[2] * a[6],
-        a[1] * a[6] - a[0] * a[7],
-        a[1] * a[5] - a[2] * a[4],
-        a[2] * a[3] - a[0] * a[5],
-        a[0] * a[4] - a[1] * a[3],
     )
 
 
@@ -145,11 +112,6 @@ def square_sym(s):
     )
 
 
-def dot_sym(a, b):
-    """A : B of two symmetric matrices."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + 2.0 * (a[3] * b[3] + a[4] * b[4] + a[5] * b[5])
-
-
 def mat_from_sym(s):
     """The 9 components of a symmetric matrix."""
     return (s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2])
@@ -158,36 +120,6 @@ def mat_from_sym(s):
 def mul_sym_mat(s, b):
     """S B with S symmetric, B full."""
     return mul(mat_from_sym(s), b)
-
-
-def sym_product_twice(a, b):
-    """A B + B A of two symmetric matrices, symmetric."""
-    a, b = mat_from_sym(a), mat_from_sym(b)
-    pairs = ((a, b), (b, a))
-    return tuple(
-        2.0 * entry(a, b, i, i)
-        if i == j
-        else total(c[3 * i + k] * d[3 * k + j] for c, d in pairs for k in range(3))
-        for i, j in SYM
-    )
-
-
-def sandwich_sym(w, z):
-    """W Z W of two symmetric matrices, symmetric."""
-    w = mat_from_sym(w)
-    wz = mul(w, mat_from_sym(z))
-    return tuple(entry(wz, w, i, j) for i, j in SYM)
-
-
-def sym_of_product(a, b):
-    """Symmetric part of A B^T, both full."""
-    b = transposed(b)
-    return tuple(
-        entry(a, b, i, i)
-        if i == j
-        else 0.5 * total(a[3 * m + k] * b[3 * k + n] for m, n in ((i, j), (j, i)) for k in range(3))
-        for i, j in SYM
-    )
 
 
 # -- series -----------------------------------------------------------------------------------------------
@@ -212,6 +144,11 @@ class Series:
     z_squared_max: float = 0.0144
     j_min: float = 0.6
     j_max: float = 1.6
+
+    def unimodular_scale(self, j):
+        """J^(-2/3), which makes det(J^(-2/3) G G^T) = 1."""
+        c = inverse_cbrt(j, self.cbrt_steps)
+        return c * c
 
     @classmethod
     def for_precision(cls, precision: str) -> "Series":
@@ -253,43 +190,6 @@ def log_coefficients(i1, i2, i3, terms):
     return h[0] - i2 * h[2], h[1] + i1 * h[2]
 
 
-def log_coefficients_adjoint(i1, i2, i3, a1_bar, a2_bar, terms):
-    """Adjoints of i1, i2, i3 under :func:`log_coefficients`."""
-    h = log_horner(i1, i2, i3, terms)
-    n13 = i1 * i3
-    n23 = i3 - i1 * i2
-    n33 = i1 * i1 - i2
-    b1 = a1_bar
-    b2 = a2_bar
-    b3 = i1 * a2_bar - i2 * a1_bar
-    i1_bar = h[2] * a2_bar
-    i2_bar = -h[2] * a1_bar
-    i3_bar = 0.0 * i1
-    n13_bar = 0.0 * i1
-    n23_bar = 0.0 * i1
-    n33_bar = 0.0 * i1
-    for r in range(terms - 1):
-        h2 = h[3 * (r + 1) + 1]
-        h3 = h[3 * (r + 1) + 2]
-        i1_bar += b3 * h2
-        i2_bar -= b2 * h2
-        i3_bar += b1 * h2
-        n13_bar += b1 * h3
-        n23_bar += b2 * h3
-        n33_bar += b3 * h3
-        c1 = b3
-        c2 = i3 * b1 - i2 * b2 + i1 * b3
-        c3 = n13 * b1 + n23 * b2 + n33 * b3
-        b1 = c1
-        b2 = c2
-        b3 = c3
-    return (
-        i1_bar + n13_bar * i3 - n23_bar * i2 + 2.0 * n33_bar * i1,
-        i2_bar - n23_bar * i1 - n33_bar,
-        i3_bar + n13_bar * i1 + n23_bar,
-    )
-
-
 def exp_horner(q, det_d, terms):
     """Horner states of the exponential series of a traceless d with q = tr(d^2) / 2, lowest order first.
 
@@ -309,22 +209,3 @@ def exp_coefficients(q, det_d, terms):
     """Coefficients of I, d, d^2 in exp(d) for a traceless d with q = tr(d^2) / 2."""
     h = exp_horner(q, det_d, terms)
     return h[0], h[1], h[2]
-
-
-def exp_coefficients_adjoint(q, det_d, e0_bar, e1_bar, e2_bar, terms):
-    """Adjoints of q and det(d) under :func:`exp_coefficients`."""
-    h = exp_horner(q, det_d, terms)
-    b0 = e0_bar
-    b1 = e1_bar
-    b2 = e2_bar
-    q_bar = 0.0 * q
-    det_bar = 0.0 * q
-    for r in range(terms - 1):
-        h2 = h[3 * (r + 1) + 2]
-        det_bar += b0 * h2
-        q_bar += b1 * h2
-        c2 = det_d * b0 + q * b1
-        b0 = b1
-        b1 = b2
-        b2 = c2
-    return q_bar, det_bar

@@ -105,12 +105,12 @@ BASES = 8
 """Lane vectors of integers per chunk for the base nodes of one tile; 2 are used."""
 
 STRAINS = 56
-"""Lane vectors per chunk for the intermediate results of one tile's material update; 55 are used."""
+"""Lane vectors per chunk for the intermediate results of one tile's material update; 54 are used."""
 
 STRAIN_D, STRAIN_W, STRAIN_Z, STRAIN_SCALARS = 9, 15, 21, 27
-STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 31, 37, 40, 49, 52
+STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 31, 37, 39, 48, 51
 """Entries of a tile among these, named as in :mod:`plab.sim.material`: G is first; scalars are J, c2, a1,
-a2; bars those of k, c2, J; parameters mu, lambda and the yield strain, with adjoints of their own."""
+a2; bars those of J, c2; parameters mu, lambda and the yield strain, with adjoints of their own."""
 
 LANES = {"cpu": 8, "cuda": 32}
 """Particles per tile."""
