@@ -47,7 +47,7 @@ def stress_adjoint(
 def flow_adjoint(
     d: Sequence[Any], g: Sequence[Any], yield_strain: Any, f_bar: Sequence[Any], series: linalg.Series
 ) -> tuple[list[Any], list[Any], Any]:
-    """Return the adjoints of d (6), G (9) and the yield strain by plastic flow, from that of the new F (9)."""
+    """Return the adjoints of d (6), G (9) and the yield strain by plastic flow, from that of the new F."""
     trace = Trace()
     inputs = [*trace.inputs("d", 6), *trace.inputs("g", 9), *trace.inputs("yield_strain", 1)]
     bars = trace.inputs("f_bar", 9)
