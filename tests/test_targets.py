@@ -126,7 +126,7 @@ def test_refused_targets(rope):
         (RING | {"floor": -0.1}, "domain"),
         ({"recipe": "bodies", "bodies": {}}, "bodies"),
         (bodies(**BALL | {"center": [0.5, 0.5]}), r"bodies\.a\.center"),
-        (bodies(**BALL | {"size": []}), "1 size"),
+        (bodies(**BALL | {"size": []}), "1 positive size"),
         (bodies(**BALL | {"size": [-0.1]}), "sizes"),
         (bodies(**BALL | {"size": [0.6]}), r"bodies\[0\]: .* x"),
         (bodies(**BALL | {"shape": "ball"}), "'ball'"),
@@ -181,26 +181,31 @@ def test_simulated_targets_are_built_once_and_reached_by_their_script(tmp_path, 
     overrides = ("task=RollingPin", *COARSE, f"sim.device={device}")
     cfgs = [load_config([*overrides, f"variant={k}"]) for k in (2, 3)]
     drawn = load_config([*overrides, "variant=2", "seed_particles=3"])
-    problem = Problem([*cfgs, drawn])
+    softer = [load_config([*overrides, "variant=2", "task.yield_stress=20"])]
+    softer += [load_config([*overrides, "variant=2", "task.yield_stress=20", "+task.target.yield_stress=50"])]
+    problem = Problem(cfgs := [*cfgs, drawn, *softer])
     for scene, x in zip(problem.scenes, problem.simulator.state().x, strict=True):
         np.testing.assert_allclose(x, sample_particles(scene), atol=1e-6)
-    assert [scene.particle_seed for scene in problem.scenes] == [0, 0, 3]
+    assert [scene.particle_seed for scene in problem.scenes] == [0, 0, 3, 0, 0]
     assert not np.array_equal(problem.initial_mass[0], problem.initial_mass[2])
     # Another draw of the particles has the same target.
-    assert len(list(tmp_path.glob("targets/RollingPin-*.npz"))) == 2
+    assert len(list(tmp_path.glob("targets/RollingPin-*.npz"))) == 3
     assert not list(tmp_path.glob("targets/*.tmp"))
     assert np.array_equal(problem.target_mass[0], problem.target_mass[2])
     assert not np.array_equal(problem.target_mass[0], problem.target_mass[1])
+    # Another material has another target, unless the target says which it is made in.
+    assert not np.array_equal(problem.target_mass[0], problem.target_mass[3])
+    assert np.array_equal(problem.target_mass[0], problem.target_mass[4])
     # From the initial state, whatever was done before; targets leave no trace in it.
     np.testing.assert_array_equal(problem.simulator.state().v, 0)
     simulator, calls = problem.simulator, []
     monkeypatch.setattr(simulator, "rollout", lambda *a, **k: calls.append(1))
-    again = build_targets(simulator, [c.task.target for c in (*cfgs, drawn)])
+    again = build_targets(simulator, [c.task.target for c in cfgs])
     assert np.array_equal(again, problem.target_mass) and not calls
     monkeypatch.undo()
     script = demonstration(problem.scenes[0], cfgs[0].task.target)
     simulator.set_contact("hard")
-    simulator.rollout(np.stack([script] * 3), gradient=False)
+    simulator.rollout(np.stack([script] * 5), gradient=False)
     reached = simulator.mass_tensor()[0]
     np.testing.assert_allclose(reached, problem.target_mass[0], atol=1e-5 * reached.max())
 

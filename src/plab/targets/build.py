@@ -1,4 +1,4 @@
-"""From the ``target`` section of a task to a mass tensor."""
+"""Mass tensors of the ``target`` sections of tasks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.objective import spread_mass
-from plab.scenes import Scene
+from plab.scenes import Scene, SceneError
 from plab.targets import recipes, scripted
 from plab.targets.recipes import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore
@@ -70,8 +70,7 @@ def make_recipe(target: Mapping[str, Any]) -> Recipe:
 
 @functools.lru_cache(maxsize=64)
 def _made(pickled: bytes) -> Recipe:
-    """Make the recipe of a pickled ``target`` section; a configuration's checks and its target ask for the
-    same one several times, and OmegaConf takes milliseconds."""
+    """Make the recipe of a pickled ``target`` section, once: OmegaConf takes milliseconds."""
     parameters = pickle.loads(pickled)
     name = parameters.pop("recipe", None)
     kind = RECIPES.get(str(name))
@@ -108,6 +107,7 @@ def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
     :func:`demonstration` for arguments and errors."""
     if demonstration(scene, target) is None:
         build_target(scene, target)
+    _target_scene(scene, make_recipe(target))
 
 
 def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
@@ -163,32 +163,41 @@ def build_targets(
         plab.sim.SimulationError: If a demonstration makes the state not finite.
     """
     store, own = TargetStore(simulator), simulator.scenes
-    # The start may be another draw of the particles than the one that targets are made from.
-    others = {id(scene): replace(scene, particle_seed=0) for scene in own if scene.particle_seed}
-    scenes = [others.get(id(scene), scene) for scene in own]
-    scenes = [scenes[scenes.index(scene)] for scene in scenes]
+    scenes = [_target_scene(scene, make_recipe(target)) for scene, target in zip(own, targets, strict=True)]
     # Vectorised environments are many of one kind: each kind is built once.
-    kinds = [(id(scene), id(target)) for scene, target in zip(scenes, targets, strict=True)]
-    first = {kind: kinds.index(kind) for kind in kinds}
-    masses: dict[tuple[int, int], np.ndarray] = {}
-    missing: dict[tuple[int, int], np.ndarray] = {}
-    for kind, k in first.items():
-        script = demonstration(scenes[k], targets[k])
+    kinds = [(scene, id(target)) for scene, target in zip(scenes, targets, strict=True)]
+    masses: dict[tuple[Scene, int], np.ndarray] = {}
+    missing: dict[tuple[Scene, int], np.ndarray] = {}
+    for kind, target in dict(zip(kinds, targets, strict=True)).items():
+        script = demonstration(kind[0], target)
         if script is None:
-            masses[kind] = build_target(scenes[k], targets[k])
-        elif (kept := None if rebuild else store.load(scenes[k], script)) is not None:
+            masses[kind] = build_target(kind[0], target)
+        elif (kept := None if rebuild else store.load(kind[0], script)) is not None:
             masses[kind] = kept
         else:
             missing[kind] = script
     if missing:
         still = np.zeros((EPISODE_STEPS, simulator.action_dim))
         simulator.set_contact("hard")
-        if others:
+        changed = scenes != list(own)
+        if changed:
             simulator.set_scenes(scenes)
         simulator.rollout(np.stack([missing.get(kind, still) for kind in kinds]), gradient=False)
         made = simulator.mass_tensor()
-        simulator.set_scenes(own) if others else simulator.reset()
+        simulator.set_scenes(own) if changed else simulator.reset()
         for kind, script in missing.items():
-            masses[kind] = made[first[kind]]
-            store.save(scenes[first[kind]], script, masses[kind])
+            masses[kind] = made[kinds.index(kind)]
+            store.save(kind[0], script, masses[kind])
     return np.stack([masses[kind] for kind in kinds])
+
+
+def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
+    """Return the scene that a target is made from: draw 0 of the particles, in the recipe's material."""
+    material = recipe.material if isinstance(recipe, scripted.Script) else {}
+    made_from = replace(scene, particle_seed=0, **material)
+    if material:
+        try:
+            made_from.validate()
+        except SceneError as error:
+            raise TargetError(f"target: {error}") from None
+    return made_from

@@ -1,8 +1,8 @@
-"""Scripted target recipes: what a demonstration, drawn from a seed, makes of the scene.
+"""Scripted target recipes: the scene after a demonstration that is drawn from a seed.
 
-Each recipe draws where and how far its manipulators go, from the ranges in the task's YAML, and turns the way
-into actions; the target is the plasticine after those actions in the hard contact model. So every such
-configuration can be solved, and its solution is known.
+Each recipe draws the manipulators' ways from the ranges in the task's YAML and turns them into actions; the
+target is the plasticine after those actions in the hard contact model. So every such configuration can be
+solved, and its solution is known.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scenes import ROLL_RADIUS, Body, Manipulator, Scene
+from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, TargetError
 
 __all__ = [
@@ -46,7 +46,7 @@ class _TooLong(Exception):
 
 
 class ActionTrack:
-    """The actions of one manipulator, built up way by way."""
+    """Actions of one manipulator, built up way by way."""
 
     def __init__(self, manipulator: Manipulator) -> None:
         """Start at the manipulator's place with no step taken."""
@@ -76,8 +76,7 @@ class ActionTrack:
         self._actions = [np.zeros_like(self._scale)] * (EPISODE_STEPS - len(self)) + self._actions
 
     def actions(self) -> np.ndarray:
-        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; raise _TooLong if the way takes
-        longer."""
+        """Return the actions of a whole episode, shape [EPISODE_STEPS, A]; _TooLong if they are more."""
         if len(self) > EPISODE_STEPS:
             raise _TooLong
         return self.first(EPISODE_STEPS)
@@ -93,10 +92,24 @@ class Script(ABC):
     """A scripted demonstration.
 
     Attributes:
-        seed: Seed of what is drawn, >= 0.
+        seed: Seed of the draws, >= 0.
+        youngs_modulus: Young's modulus E during the demonstration; the scene's if None, and so on. Bodies
+            with a material of their own keep that.
+        poisson_ratio: Poisson ratio nu.
+        yield_stress: von Mises yield stress.
     """
 
     seed: int
+    youngs_modulus: float | None = field(default=None, kw_only=True)
+    poisson_ratio: float | None = field(default=None, kw_only=True)
+    yield_stress: float | None = field(default=None, kw_only=True)
+
+    @property
+    def material(self) -> dict[str, float]:
+        """Material of the demonstration where it is not the scene's, by the names of
+        :data:`plab.scenes.MATERIAL_KEYS`."""
+        values = {key: getattr(self, key) for key in MATERIAL_KEYS}
+        return {key: value for key, value in values.items() if value is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
         """See :meth:`plab.targets.recipes.ScriptedRecipe.actions`."""
@@ -134,7 +147,6 @@ class PressTarget(Script):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         offset = np.array([_draw(rng, "offset", self.offset) for _ in range(2)])
         x, z = offset * rng.choice([-1.0, 1.0], size=2)
@@ -162,7 +174,6 @@ class DrawTarget(Script):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
         depth = _draw(rng, "depth", self.depth)
@@ -202,7 +213,6 @@ class DentTarget(Script):
     depth: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         body = scene.bodies[0]
         centre, half = np.asarray(body.center), body.half_extent()
@@ -239,7 +249,6 @@ class RollTarget(Script):
     yaw: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         tool, (track, *_) = _mover(scene), tracks
         per_step = np.array([_draw(rng, "yaw", self.yaw), -_draw(rng, "depth", self.depth)]) / EPISODE_STEPS
         angle = _draw(rng, "reach", self.reach) / ROLL_RADIUS
@@ -269,7 +278,6 @@ class LiftTarget(Script):
     z: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         (track, *_) = tracks
         height, z = _draw(rng, "height", self.height), _draw(rng, "z", self.z)
         turn, x = _draw(rng, "turn", self.turn), _draw(rng, "x", self.x)
@@ -293,7 +301,6 @@ class CarryTarget(Script):
     press: list[float]
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         base, cargo = scene.bodies[0], scene.bodies[-1]
         tools = [m for m in scene.manipulators if m.action_dim]
         squeeze, press = _draw(rng, "squeeze", self.squeeze), _draw(rng, "press", self.press)
@@ -329,7 +336,6 @@ class PushTarget(Script):
     steps: int
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
-        """See :meth:`Script.plan`."""
         if not 0 < self.legs <= len(scene.bodies):
             raise TargetError(f"target.legs must be in 1 .. {len(scene.bodies)}, not {self.legs}")
         tool, (track, *_) = _mover(scene), tracks
@@ -359,7 +365,6 @@ def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
 
 
 def _mover(scene: Scene) -> Manipulator:
-    """The first manipulator that can move."""
     return next(m for m in scene.manipulators if m.action_dim)
 
 

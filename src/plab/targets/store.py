@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["TargetStore", "load_release_target"]
 
 PHYSICS_VERSION = 1
-"""To be raised when the simulator's results change by more than rounding: cached targets are then stale."""
+"""Version of the physics, raised when results change by more than rounding: cached targets are then stale."""
 
 RELEASE_PARTICLES = 10000
 """Particle masses that each of the release's targets holds, whatever the scene has."""
@@ -40,7 +40,7 @@ weight of -0.25, and a stray one beyond it, of which three of the fifty targets 
 
 
 class TargetStore:
-    """Simulated targets on disk, by what they depend on."""
+    """Cache of simulated targets, keyed by scene, actions, precision, device and physics."""
 
     def __init__(self, simulator: Simulator) -> None:
         """Open the store for targets that this simulator makes: precision and device are part of the key."""
@@ -48,7 +48,7 @@ class TargetStore:
 
     def path(self, scene: Scene, actions: np.ndarray) -> Path:
         """Return the file of the target that a demonstration, shape [T, A], makes of a scene."""
-        # The length of later episodes has no part in it; a mesh is what its file holds.
+        # The horizon plays no part; a mesh counts by its content.
         facts = replace(scene, horizon=0).facts() | {"by": self._made_by, "physics": PHYSICS_VERSION}
         text = dumps(facts, sort_keys=True, default=attrgetter("sha256"))
         digest = hashlib.sha256(text.encode() + actions.astype("<f8").tobytes())
@@ -96,40 +96,32 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
     """
     name = "Rollingpin" if scene.name == "RollingPin" else scene.name
     path = Path(folder) / f"{name}3D-v{variant}.npy"
-    if not Path(folder).is_dir():
-        raise TargetError(f"targets.source: there is no folder {folder}")
     try:
         mass = read_array(path)
     except FileNotFoundError:
         raise TargetError(
             f"targets.source: {path} does not exist; name the files like Move3D-v1.npy"
         ) from None
-    except PermissionError:
-        raise TargetError(f"targets.source: {path} may not be read") from None
-    except (UnreadableError, OSError, MemoryError) as error:
+    except (UnreadableError, OSError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise TargetError(f"targets.source: {path} cannot be read: {reason}") from None
-    _check_release_target(str(path), mass, scene)
-    return mass.astype(np.float64)
-
-
-def _check_release_target(path: str, mass: np.ndarray, scene: Scene) -> None:
-    n = scene.grid_size
-    if mass.shape != (n, n, n):
-        raise TargetError(f"targets.source: {path} has shape {mass.shape}, but the grid is {(n, n, n)}")
-    if mass.dtype.kind not in "fiu" or not np.isfinite(mass).all():
+    n, expected = scene.grid_size, (scene.particle_count, RELEASE_PARTICLES)
+    if mass.shape != (n, n, n) or mass.dtype.kind not in "fiu":
+        raise TargetError(
+            f"targets.source: {path} has shape {mass.shape} of {mass.dtype}, the grid needs numbers of shape "
+            f"{(n, n, n)}"
+        )
+    if not np.isfinite(mass).all():
         raise TargetError(f"targets.source: {path} must hold finite numbers")
-    negative = float(-mass[mass < 0].sum()) / scene.particle_mass
+    negative, total = (float(part.sum()) / scene.particle_mass for part in (-mass.clip(None, 0), mass))
     if negative > NEGATIVE_PARTICLES:
         raise TargetError(
             f"targets.source: {path} has negative masses, {negative:.3g} particle masses in all where the "
             f"release's files have up to {NEGATIVE_PARTICLES:g}: the least is {mass.min():.3g}"
         )
-    total = float(mass.sum()) / scene.particle_mass
-    if not any(
-        abs(total - count) <= MASS_TOLERANCE * count for count in (scene.particle_count, RELEASE_PARTICLES)
-    ):
+    if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
         raise TargetError(
             f"targets.source: {path} holds {total:.0f} particle masses of {scene.particle_mass:.3g}, but the "
             f"scene has {scene.particle_count} and the release's files {RELEASE_PARTICLES}"
         )
+    return mass.astype(np.float64)
