@@ -1,0 +1,35 @@
+"""Scenes as data: volumes, advice on time steps, entries of observations."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plab.config import build_scene, load_config
+from plab.envs.observations import level_entries
+from plab.scenes import SceneError, make_body
+
+
+def test_the_volume_of_a_sphere_is_that_of_its_formula():
+    body = make_body("sphere", (0.5, 0.5, 0.5), (0.2,), 100)
+    assert body.volume == pytest.approx(4 / 3 * math.pi * 0.2**3)
+
+
+def test_the_time_step_that_is_advised_is_accepted():
+    scene = build_scene(load_config(["task=Move"]))
+    unstable = replace(scene, dt=2.4 * scene.stable_dt)
+    with pytest.raises(SceneError) as caught:
+        unstable.validate()
+    dt, substeps = re.findall(r"= ([\d.e-]+)", str(caught.value))
+    assert int(substeps) * float(dt) == pytest.approx(unstable.substeps * unstable.dt, rel=0.02)
+    replace(scene, dt=float(dt), substeps=int(substeps)).validate()
+
+
+def test_entries_along_x_and_z_are_two_apart():
+    cfg = load_config(["task=Move", "observe_target=true"])
+    along_x, along_z = level_entries(build_scene(cfg), cfg)
+    np.testing.assert_array_equal(along_z - along_x, 2)
