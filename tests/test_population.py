@@ -338,8 +338,8 @@ def test_runs_that_learn_alike_make_a_population() -> None:
 
 
 def test_a_population_fits_half_of_the_device(monkeypatch) -> None:
-    """An environment of Move takes 20 MB on CUDA; the budget of gradients does not count."""
+    """An environment of Move takes 14 MB on CUDA; the budget of gradients does not count."""
     one = load_config(["task=Move", "method=ppo", "sim.device=cuda", "method.num_envs=16", "sim.memory_mb=1"])
-    for gigabytes, batches in ((80, [9]), (4, [4, 5]), (0.1, [1] * 9), (math.inf, [9])):
-        monkeypatch.setattr("plab.sizes.computer_bytes", lambda device, have=gigabytes: have * 1e9)
+    for gigabytes, batches in ((80, [9]), (3, [4, 5]), (0.1, [1] * 9), (math.inf, [9])):
+        monkeypatch.setattr("plab.sim.memory.device_bytes", lambda device, have=gigabytes: have * 1e9)
         assert [len(batch) for batch in plan([replace(one, seed=s) for s in range(9)])] == batches

@@ -16,7 +16,7 @@ import pytest
 
 import synthetic
 import unseen
-from plab import bench, sizes
+from plab import bench
 from plab.bench import accuracy, speed, stability
 from plab.cli import (
     demonstrations,
@@ -53,7 +53,7 @@ def on_some_computer(tmp_path, monkeypatch):
     """In an empty folder of a computer with 16 GB of memory, and with graphics."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(graphics, "missing_graphics", lambda: None)
-    monkeypatch.setattr(sizes, "computer_bytes", lambda device: 16e9)
+    monkeypatch.setattr("plab.sim.memory.device_bytes", lambda device: 16e9)
 
 
 # ------------------------------------------------------------------------------------------------ plab.run
@@ -270,7 +270,7 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "no configuration": (lambda: Problem([]), "configuration"),
     "a text of a configuration": (lambda: Problem(["task=Move"]), "'task=Move'"),
     "a scene": (lambda: Simulator(scene(("Sphere",))), "Simulator([scene])"),
-    "too many scenes": (lambda: Simulator([scene(("Sphere",))] * 2727), "at most 2726 together"),
+    "too many scenes": (lambda: Simulator([scene(("Sphere",))] * 3176), "at most 3175 together"),
     "too large a scene": (lambda: Simulator([scene((), particles=10**9)]), "324 GB"),
     "a text of keys": (lambda: load(keys="task.name"), "'task.name'"),
 }

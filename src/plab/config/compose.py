@@ -31,7 +31,6 @@ from plab.errors import ConfigError, pick
 from plab.families import family, schemas
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3
-from plab.sizes import require_memory
 
 __all__ = [
     "EXPERIMENT",
@@ -268,7 +267,7 @@ def build_scene(cfg: Config) -> Scene:
         The validated scene.
 
     Raises:
-        ConfigError: If the task is another variant's, or this computer's memory cannot hold the run.
+        ConfigError: If the task is another variant's.
         plab.scenes.SceneError: If the scene cannot be simulated.
     """
     task, protocol, sim = cfg.task, cfg.protocol, cfg.sim
@@ -298,7 +297,6 @@ def build_scene(cfg: Config) -> Scene:
         floor_stencil=protocol.floor,
     )
     scene.validate()
-    require_memory(1, scene, sim.precision, sim.device)
     return scene
 
 

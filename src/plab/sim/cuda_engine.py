@@ -10,13 +10,13 @@ runs by rounding, unless the simulator is deterministic (:mod:`plab.sim.cuda_sum
 """
 
 import ctypes
-import sys
 
 import taichi as ti
 
 from plab.sim.cuda_phases import DISTANCE_GROUPS, POSE_SHARE, RESIDENT_BLOCK, CudaPhases
 from plab.sim.cuda_warp import BLOCK_WARPS, NODE_BITS, NODE_STRIDE, WARP_BLOCK, WARP_NUMBERS
 from plab.sim.particle_phases import SIZES
+from plab.sim.runtime import cuda_driver
 from plab.sim.storage import STATE
 from plab.sim.tensors import Array
 
@@ -44,8 +44,9 @@ MULTIPROCESSORS, SHARED_BYTES = 16, 81
 def device_attribute(number: int) -> int:
     """A number of the CUDA device, by asking the driver; Taichi does not tell. 1 if it does not answer."""
     value = ctypes.c_int(0)
-    driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-    driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0)
+    driver = cuda_driver()
+    if driver is not None:
+        driver.cuDeviceGetAttribute(ctypes.byref(value), number, 0)
     return max(1, value.value)
 
 

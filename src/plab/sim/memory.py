@@ -1,23 +1,88 @@
-"""How much memory gradients will take, and what fields and arrays do."""
+"""Memory of a simulation: estimates before anything is allocated, limits of indices, and bytes held.
+
+Estimates are lower bounds. They refuse scenes that cannot fit, and size batches and checkpoints.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
 
 import taichi as ti
 
-from plab.scenes import Scene
+from plab.scenes import Scene, SceneError
+from plab.sim.runtime import cuda_driver
 from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
-from plab.sizes import REAL_BYTES
-
-__all__ = ["BYTES", "ENTRIES_MAX", "array_bytes", "batch_limit", "held_bytes", "kept_states"]
 
 ENTRIES_MAX = {"cpu": (STATE_MASK + 1) * LANES["cpu"], "cuda": 2**31 - 1}
 """Numbers in one array of states. Taichi counts them in 32 bits; on the CPU see
 :data:`plab.sim.storage.STATE_MASK`."""
 
-BYTES = {ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
+BYTES = {"float32": 4, "float64": 8, ti.f32: 4, ti.f64: 8, ti.i32: 4, ti.i64: 8}
 """Bytes of a number by its type."""
+
+
+def environment_bytes(
+    scene: Scene, precision: str, device: str, *, states: int = 3, gradient: bool = False
+) -> int:
+    """Return how much memory one environment takes at least [bytes].
+
+    Args:
+        scene: The scene.
+        precision: ``float32`` or ``float64``.
+        device: ``cpu`` or ``cuda``.
+        states: Particle states that are kept.
+        gradient: Whether adjoints of the grids are held, too.
+    """
+    places = -(-scene.particle_count // LANES[device]) * LANES[device]
+    # Momentum by chunk and velocity, four numbers each; target mass and distance.
+    grids = _nodes(scene) * 4 * (_chunks(device) + 1) * (2 if gradient else 1) + 2 * scene.grid_size**3
+    frames = scene.substeps * len(scene.manipulators)
+    # Beside its states a particle has 9 numbers of stress; a pose is in float64.
+    return (places * (states * STATE + 9) + grids + 25 * frames) * BYTES[precision] + 64 * frames
+
+
+def _chunks(device: str) -> int:
+    return CHUNKS if device == "cpu" else 1
+
+
+def _nodes(scene: Scene) -> int:
+    return (-(-scene.grid_size // BLOCK) * BLOCK) ** 3
+
+
+def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None:
+    """Raise an error unless scenes that are alike in size fit into one simulator.
+
+    Raises:
+        SceneError: If the device has too little memory; says how many environments would fit.
+        MemoryError: If there are more grid nodes than the simulator can number.
+    """
+    numbered = INDEX_MASK // (_chunks(device) * _nodes(scenes[0]))
+    if len(scenes) > numbered:
+        raise MemoryError(
+            f"{len(scenes)} environments of {scenes[0].grid_size}^3 nodes are more than one simulator can "
+            f"number: use at most {numbered} at once"
+        )
+    one, room = environment_bytes(scenes[0], precision, device), device_bytes(device)
+    if one > room:
+        raise SceneError(
+            f"the scene needs at least {one / 1e9:.3g} GB, and there are {room / 1e9:.3g} GB: "
+            "use fewer particles, grid nodes, substeps or steps"
+        )
+    if len(scenes) * one > room:
+        raise SceneError(
+            f"{len(scenes)} environments need at least {len(scenes) * one / 1e9:.3g} GB, and there are "
+            f"{room / 1e9:.3g} GB: simulate at most {int(room // one)} together"
+        )
+
+
+def most_environments(scene: Scene, precision: str, device: str) -> int:
+    """Return how many environments half of a device's memory has room for, without a gradient; at least 1."""
+    room = min(device_bytes(device) / 2, 1e15)
+    return max(1, int(room // environment_bytes(scene, precision, device)))
 
 
 def kept_states(steps: int, slots_per_step: int, length: int, reach: int) -> int:
@@ -46,30 +111,72 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
     Returns:
         Number of environments, at least 1.
     """
-    real, lanes = REAL_BYTES[precision], LANES[device]
-    entries = -(-scene.particle_count // lanes) * lanes * STATE
     # On CUDA a step's start may be kept in two orders of the particles.
     slots_per_step = scene.substeps + (0 if device == "cpu" else 1)
     if device == "cpu":
-        kept = kept_states(scene.horizon, slots_per_step, scene.horizon, scene.horizon) + 1
+        kept = kept_states(scene.horizon, slots_per_step, scene.horizon, scene.horizon)
     else:
         # No array is longer than that of one step; there is one array for the segments.
-        segments_max = slots_per_step + 1
-        lengths = range(-(-scene.horizon // segments_max), scene.horizon + 1)
-        kept = min(kept_states(scene.horizon, slots_per_step, length, 1) for length in lengths) + 1
-    # Current and initial state, stress, adjoints, orders and what goes with them: less than six more states.
-    kept += 6
-    # Momentum and its adjoint, by chunk on the CPU; velocity and its adjoint; counts by cell; target and
-    # distance.
-    nodes, chunks = (-(-scene.grid_size // BLOCK) * BLOCK) ** 3, CHUNKS if device == "cpu" else 1
-    grids = nodes * (8 * chunks + 9) + 2 * scene.grid_size**3
-    fitting = int(memory_mb * 1e6 / ((kept * entries + grids) * real))
-    numbered = ENTRIES_MAX[device] // ((slots_per_step + 1) * entries), INDEX_MASK // (chunks * nodes)
-    return max(1, min(fitting, *numbered))
+        lengths = range(-(-scene.horizon // (slots_per_step + 1)), scene.horizon + 1)
+        kept = min(kept_states(scene.horizon, slots_per_step, length, 1) for length in lengths)
+    # The current and the initial state, their adjoints, orders, and room to sort: less than seven states.
+    one = environment_bytes(scene, precision, device, states=kept + 7, gradient=True)
+    entries = -(-scene.particle_count // LANES[device]) * LANES[device] * STATE
+    numbered = (
+        ENTRIES_MAX[device] // ((slots_per_step + 1) * entries),
+        INDEX_MASK // (_chunks(device) * _nodes(scene)),
+    )
+    return max(1, min(int(memory_mb * 1e6 / one), *numbered))
 
 
-def array_bytes(data: ti.Field | ti.Ndarray) -> int:
-    """Bytes of a field's or an array's entries."""
+def segment_length(
+    steps: int, slots_per_step: int, reach: int, segments_max: int, slot_bytes: int, held: int, memory_mb: float
+) -> int:
+    """Return how many environment steps of a gradient's T ``steps`` are one segment.
+
+    Args:
+        steps: Environment steps T.
+        slots_per_step: States that are kept of a step.
+        reach: Steps whose states fit into one array.
+        segments_max: States that fit into one array.
+        slot_bytes: Bytes of a state of all environments.
+        held: Bytes of everything else.
+        memory_mb: Budget for all of it [MB].
+
+    Returns:
+        The most that fit into the budget, or fewer if as many segments do; all have about this length.
+
+    Raises:
+        MemoryError: If no length fits into the budget, or none into arrays that Taichi can address.
+    """
+    lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
+    if not lengths:
+        raise MemoryError(
+            f"a gradient of {steps} steps has more numbers than Taichi can address, whatever the memory: "
+            "simulate fewer environments together, or fewer steps"
+        )
+    cost = {n: kept_states(steps, slots_per_step, n, reach) * slot_bytes + held for n in lengths}
+    fitting = [length for length in lengths if cost[length] <= memory_mb * 1e6]
+    if not fitting:
+        need = math.ceil(min(cost.values()) / 1e6)
+        raise MemoryError(
+            f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
+            f"set sim.memory_mb={need} or more"
+        )
+    # Fewest recomputed steps first: as few segments as possible, of even length.
+    segments = -(-steps // max(fitting))
+    return -(-steps // segments)
+
+
+def held_bytes(*holders: object) -> int:
+    """Return the bytes of all fields and arrays among the attributes of objects, also in lists."""
+    values = [value for holder in holders for value in vars(holder).values()]
+    values += [part for value in values if isinstance(value, list) for part in value]
+    held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
+    return sum(map(_array_bytes, held.values()))
+
+
+def _array_bytes(data: ti.Field | ti.Ndarray) -> int:
     if isinstance(data, ti.Ndarray):
         scalars = math.prod(data.element_shape)
     else:
@@ -77,9 +184,19 @@ def array_bytes(data: ti.Field | ti.Ndarray) -> int:
     return math.prod(data.shape) * scalars * BYTES[data.dtype]
 
 
-def held_bytes(*holders: object) -> int:
-    """Bytes of all fields and arrays among the attributes of objects, also in lists, each counted once."""
-    values = [value for holder in holders for value in vars(holder).values()]
-    values += [part for value in values if isinstance(value, list) for part in value]
-    held = {id(value): value for value in values if isinstance(value, ti.Field | ti.Ndarray)}
-    return sum(array_bytes(value) for value in held.values())
+def device_bytes(device: str) -> float:
+    """Return the memory of a device that this process may use [bytes]; infinite where it is unknown."""
+    if device == "cuda":
+        total, driver = ctypes.c_size_t(0), cuda_driver()
+        known = driver is not None and driver.cuDeviceTotalMem_v2(ctypes.byref(total), 0) == 0
+        return float(total.value) if known else math.inf
+    limits = [math.inf]
+    if hasattr(os, "sysconf"):
+        limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
+    # A container's or a cluster job's; there may be no such file, or it may say "max".
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            limits.append(float((Path("/sys/fs/cgroup") / file).read_text(encoding="ascii")))
+        except (OSError, ValueError):
+            continue
+    return min(limits)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import io
 import os
+import sys
 import time
 import weakref
 from collections.abc import Mapping
@@ -171,6 +173,15 @@ def _start_taichi(device: str, precision: str, threads: int) -> None:
         # Its warnings are of a cache that another process is writing; these kernels are then not kept.
         log_level=ti.ERROR,
     )
+
+
+def cuda_driver() -> ctypes.CDLL | None:
+    """Return the CUDA driver, ready to answer; None if this computer has none."""
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return None
+    return driver if driver.cuInit(0) == 0 else None
 
 
 def in_use() -> Runtime | None:

@@ -16,7 +16,7 @@ from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
 from plab.sim.callbacks import ClosedLoop, Recording, StateRecorder
 from plab.sim.cpu_engine import CpuEngine
-from plab.sim.memory import held_bytes
+from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
 from plab.sim.runtime import is_current, register_user, start_runtime
 from plab.sim.state import (
@@ -32,7 +32,6 @@ from plab.sim.state import (
 from plab.sim.tape import Tape
 from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
-from plab.sizes import require_memory
 
 if TYPE_CHECKING:
     import torch
@@ -84,12 +83,13 @@ class Simulator:
         Raises:
             SceneError: If a scene cannot be simulated or the scenes do not fit together.
             DeviceError: If CUDA was asked for and is not there.
+            ValueError: If device or precision are unknown.
         """
         require_alike(scenes)
-        require_memory(len(scenes), scenes[0], precision, device)
         self.scenes = tuple(scenes)
         self.memory_mb = memory_mb
         self._runtime = start_runtime(device, precision, threads)
+        require_memory(self.scenes, precision, device)
         self._engine = _engine_class(device)(
             self.scenes, self._runtime, full_gradient, deterministic, _singular_values
         )

@@ -206,11 +206,6 @@ class Storage:
 
     def _allocate(self) -> None:
         real, b = self.real, self.batch
-        if b * self.chunks * self.nodes > INDEX_MASK:
-            raise MemoryError(
-                f"{b} environments of {self.n}^3 nodes are more than one simulator can number: "
-                f"use at most {INDEX_MASK // (self.chunks * self.nodes)} at once"
-            )
         m = max(1, self.manipulators)
         self.lane_type = ti.types.vector(self.lanes, real)
         # Vectors first: fields lie one behind the other, and behind single numbers a vector straddles two

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import taichi as ti
 
-from plab.sim.memory import ENTRIES_MAX, held_bytes, kept_states
+from plab.sim.memory import ENTRIES_MAX, held_bytes, segment_length
 from plab.sim.particles import Particles
 
 __all__ = ["Tape"]
@@ -58,46 +57,19 @@ class Tape:
         return self._history[number], within * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
-        """Environment steps per segment for a gradient over ``steps`` of them.
-
-        Args:
-            steps: Environment steps T.
-            memory_mb: Budget for everything that the simulator holds [MB].
-
-        Returns:
-            The most that fit into the budget, or fewer if as many segments do; all have about this length.
-
-        Raises:
-            MemoryError: If no length fits into the budget, or none into arrays that Taichi can address.
-        """
-        engine, slot_bytes, reach = self._engine, self._particles.slot_bytes, self._reach_max
+        """Return :func:`plab.sim.memory.segment_length` for a gradient of T ``steps``, within ``memory_mb`` [MB]
+        for everything that the simulator holds."""
+        engine, particles = self._engine, self._particles
         engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
-        fixed = held_bytes(engine, *engine.terms, self._particles, self._particles.order) + slot_bytes
+        held = held_bytes(engine, *engine.terms, particles, particles.order) + particles.slot_bytes
         if engine.sorts:
             # The orders of all steps, and the adjoint's other half.
-            fixed += 4 * steps * self._particles.order.places + slot_bytes
-
-        def cost(length: int) -> int:
-            return kept_states(steps, self._slots_per_step, length, reach) * slot_bytes + fixed
-
-        segments_max = ENTRIES_MAX[engine.device] // self._particles.slot_entries
-        lengths = [n for n in range(1, steps + 1) if reach and -(-steps // n) <= segments_max]
-        if not lengths:
-            raise MemoryError(
-                f"{engine.batch} environments are too many for a gradient of {steps} steps, "
-                "whatever the memory: simulate fewer environments together, or fewer steps"
-            )
-        fitting = [length for length in lengths if cost(length) <= memory_mb * 1e6]
-        if not fitting:
-            need = math.ceil(min(map(cost, lengths)) / 1e6)
-            raise MemoryError(
-                f"the gradient of {steps} steps needs at least {need} MB, but memory_mb is {memory_mb:g}: "
-                f"set sim.memory_mb={need} or more"
-            )
-        # Fewest recomputed steps first: as few segments as possible, of even length.
-        segments = -(-steps // max(fitting))
-        return -(-steps // segments)
+            held += 4 * steps * particles.order.places + particles.slot_bytes
+        segments_max = ENTRIES_MAX[engine.device] // particles.slot_entries
+        return segment_length(
+            steps, self._slots_per_step, self._reach_max, segments_max, particles.slot_bytes, held, memory_mb
+        )
 
     def _allocate(self, steps: int) -> None:
         per_slot, segments = self._particles.current.shape[0], -(-steps // self._length)

@@ -15,8 +15,7 @@ from plab.problem import build_scenes
 from plab.results import row_count
 from plab.scenes import Scene
 from plab.sim.batch import scene_kind
-from plab.sim.memory import batch_limit
-from plab.sizes import most_environments
+from plab.sim.memory import batch_limit, most_environments
 
 __all__ = ["plan"]
 
