@@ -238,7 +238,7 @@ def test_memory_is_checked(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> N
     most = batch_limit(scene, "float32", sim.device, 1e12)
     grids = 256**3 * (1 if sim.device == "cuda" else CHUNKS)
     assert most * grids <= INDEX_MASK < (most + 1) * grids
-    with pytest.raises(MemoryError, match=f"at most {most} "):
+    with pytest.raises(SceneError, match=f"at most {most} "):
         Simulator([scene] * (most + 1), device=sim.device)
 
 

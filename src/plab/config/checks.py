@@ -16,8 +16,12 @@ __all__ = ["check_device", "check_packages", "check_sources", "cuda_devices", "c
 
 def check_sources(cfg: Config) -> None:
     """Find mistakes in the scene and in what the target comes from: ConfigError, SceneError or
-    TargetError."""
+    TargetError. So is a scene for which there is too little memory."""
+    # Imported here: Taichi takes a second.
+    from plab.sim.memory import require_memory
+
     scene, source = build_scene(cfg), cfg.targets.source
+    require_memory([scene], cfg.sim.precision, cfg.sim.device)
     if source is None:
         check_target(scene, cfg.task.target)
     else:

@@ -54,28 +54,21 @@ def _nodes(scene: Scene) -> int:
 
 
 def require_memory(scenes: Sequence[Scene], precision: str, device: str) -> None:
-    """Raise an error unless scenes that are alike in size fit into one simulator.
-
-    Raises:
-        SceneError: If the device has too little memory; says how many environments would fit.
-        MemoryError: If there are more grid nodes than the simulator can number.
-    """
-    numbered = INDEX_MASK // (_chunks(device) * _nodes(scenes[0]))
-    if len(scenes) > numbered:
-        raise MemoryError(
-            f"{len(scenes)} environments of {scenes[0].grid_size}^3 nodes are more than one simulator can "
-            f"number: use at most {numbered} at once"
-        )
-    one, room = environment_bytes(scenes[0], precision, device), device_bytes(device)
+    """Raise SceneError unless scenes that are alike in size fit into one simulator; the message says how many
+    would."""
+    count, one, room = len(scenes), environment_bytes(scenes[0], precision, device), device_bytes(device)
+    numbered, n = INDEX_MASK // (_chunks(device) * _nodes(scenes[0])), scenes[0].grid_size
+    if not numbered:
+        raise SceneError(f"a grid of {n}^3 nodes has more nodes than the simulator can number: use fewer")
     if one > room:
         raise SceneError(
             f"the scene needs at least {one / 1e9:.3g} GB, and there are {room / 1e9:.3g} GB: "
-            "use fewer particles, grid nodes, substeps or steps"
+            "use fewer particles, grid nodes or substeps"
         )
-    if len(scenes) * one > room:
+    if count > numbered or count * one > room:
         raise SceneError(
-            f"{len(scenes)} environments need at least {len(scenes) * one / 1e9:.3g} GB, and there are "
-            f"{room / 1e9:.3g} GB: simulate at most {int(room // one)} together"
+            f"{count} environments of {n}^3 nodes need at least {count * one / 1e9:.3g} GB, and there are "
+            f"{room / 1e9:.3g} GB: simulate at most {min(numbered, int(room // one))} together"
         )
 
 
