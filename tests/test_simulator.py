@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from taichi.lang import impl
 
+import plab
 import reference_mpm as reference
 from plab.losses import make_terms
 from plab.scenes import Body, Manipulator, Scene, SceneError
@@ -215,6 +219,8 @@ def test_arguments_are_checked(sim: Simulator) -> None:
         (lambda: replace(ball(), dt=0.1).validate(), "substeps >= "),
         (lambda: ball(center=(0.5, 0.95, 0.5)).validate(), "outside the domain"),
         (lambda: Simulator([ball(), replace(ball(), manipulators=())]), "manipulators"),
+        (lambda: Simulator(SCENES, device="gpu"), "device 'gpu' is not one of cpu, cuda"),
+        (lambda: Simulator(SCENES, precision="f64"), "precision 'f64' is not one of float32, float64"),
     ):
         with pytest.raises(ValueError, match=named):
             call()
@@ -240,6 +246,20 @@ def test_memory_is_checked(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> N
     assert most * grids <= INDEX_MASK < (most + 1) * grids
     with pytest.raises(SceneError, match=f"at most {most} "):
         Simulator([scene] * (most + 1), device=sim.device)
+
+
+def test_a_simulator_that_is_dropped_leaves_its_memory_to_the_next(sim: Simulator) -> None:
+    """Though others go on, so that Taichi does not start anew."""
+    trees, held = [], []
+    for _ in range(3):
+        other = built(SCENES[:1], DEVICE)
+        other.rollout(ACTIONS[:1])
+        trees.append(impl.get_runtime().prog.get_snode_tree_size())
+        held.append(weakref.ref(other))
+        del other
+        gc.collect()
+    assert [one() for one in held] == [None] * 3 and len(set(trees)) == 1
+    assert sim.rollout(ACTIONS).gradient.any()
 
 
 def test_the_curve_goes_from_neighbour_to_neighbour_through_all_cells() -> None:
@@ -283,3 +303,9 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
         np.testing.assert_array_equal(got.step_terms, want.step_terms[:count])
         np.testing.assert_array_equal(got.gradient, want.gradient[:count])
         np.testing.assert_array_equal(state.x, final.x[:count])
+
+
+def test_a_simulator_of_a_configuration_has_its_precision() -> None:
+    cfg = plab.load_config(["task=Move", "sim=reference", "sim.grid_size=32", "sim.particles_scale=0.03"])
+    simulator = plab.make_simulator([cfg] * 2, terms=())
+    assert (simulator.precision, simulator.batch, simulator.terms) == ("float64", 2, ())

@@ -16,6 +16,7 @@ from plab.envs import make, make_vec, register_suite
 
 if TYPE_CHECKING:
     from plab.config import build_scene, load_config
+    from plab.problem import make_simulator
     from plab.results import load as load_results
     from plab.scenes import Scene
     from plab.sim import Simulator
@@ -29,6 +30,7 @@ __all__ = [
     "load_config",
     "load_results",
     "make",
+    "make_simulator",
     "make_vec",
 ]
 
@@ -43,6 +45,7 @@ _PLACES = {
     "build_scene": ("plab.config", "build_scene"),
     "load_config": ("plab.config", "load_config"),
     "load_results": ("plab.results", "load"),
+    "make_simulator": ("plab.problem", "make_simulator"),
 }
 """Module and name of each part that is imported on first use: Taichi and pandas take seconds."""
 

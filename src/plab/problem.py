@@ -42,9 +42,9 @@ __all__ = [
     "Problem",
     "Trials",
     "build_scenes",
-    "build_simulator",
     "fits",
     "kinds_of",
+    "make_simulator",
     "make_targets",
 ]
 
@@ -115,24 +115,31 @@ def fits(cfg: Config) -> bool:
     return True
 
 
-def build_simulator(scenes: Sequence[Scene], cfg: Config) -> Simulator:
-    """Build a simulator of some scenes with the loss, precision, device and memory of a configuration.
+def make_simulator(
+    cfgs: Config | Sequence[Config], scenes: Sequence[Scene] | None = None, **options: Any
+) -> Simulator:
+    """Make a simulator with the scenes, loss terms, device, precision and memory of configurations.
+
+    Args:
+        cfgs: A configuration, or one per environment, alike in ``sim`` and the loss.
+        scenes: Their scenes, where they have been built already.
+        **options: Arguments of :class:`plab.sim.Simulator`, in place of the configuration's.
 
     Raises:
         plab.config.ConfigError: If there is no such term of the loss.
         plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
         plab.sim.DeviceError: If CUDA was asked for and is not there.
     """
-    sim, method = cfg.sim, cfg.method
-    terms = make_terms(method.loss_weights, method.loss_terms)
-    return Simulator(
-        scenes,
-        terms=terms,
-        precision=sim.precision,
-        device=sim.device,
-        memory_mb=sim.memory_mb,
-        deterministic=sim.deterministic,
-    )
+    cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
+    sim, method = cfgs[0].sim, cfgs[0].method
+    settings = {
+        "terms": make_terms(method.loss_weights, method.loss_terms),
+        "precision": sim.precision,
+        "device": sim.device,
+        "memory_mb": sim.memory_mb,
+        "deterministic": sim.deterministic,
+    }
+    return Simulator(build_scenes(cfgs) if scenes is None else scenes, **settings | options)
 
 
 def kinds_of(cfgs: Sequence[Config]) -> list[str]:
@@ -180,7 +187,7 @@ class Problem:
         # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
         kinds = kinds_of(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
-        self.simulator = simulator or build_simulator(build_scenes(cfgs), cfgs[0])
+        self.simulator = simulator or make_simulator(cfgs)
         self.scenes = self.simulator.scenes
         weights = cfgs[0].method.loss_weights
         self.term_names = tuple(term.name for term in self.simulator.terms)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import taichi as ti
 
-from plab.config import Config, build_scene, load_config
+from plab.config import Config, load_config
 from plab.demonstrations import known_actions
-from plab.losses import make_terms
 from plab.objective import target_sdf
+from plab.problem import make_simulator
 from plab.sim import Simulator
 
 FORWARD = "forward"
@@ -77,15 +77,8 @@ def build(cfg: Config, batch: int, steps: int, *, from_start: bool = False) -> W
         plab.targets.TargetError: If the target, which the best actions come from, has a mistake.
         plab.sim.DeviceError: If CUDA was asked for and is not there.
     """
-    scene = build_scene(cfg)
-    simulator = Simulator(
-        [scene] * batch,
-        terms=make_terms(cfg.method.loss_weights, cfg.method.loss_terms),
-        precision=cfg.sim.precision,
-        device=cfg.sim.device,
-        memory_mb=cfg.sim.memory_mb,
-        deterministic=cfg.sim.deterministic,
-    )
+    simulator = make_simulator([cfg] * batch)
+    scene = simulator.scenes[0]
     simulator.set_contact(cfg.method.contact, softness=cfg.method.softness)
     mass = np.roll(simulator.mass_tensor()[0], scene.grid_size // 16, axis=0)
     # Relative to the largest mass, because all masses are small where there are few particles.

@@ -17,7 +17,7 @@ from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskCo
 from plab.config.checks import cuda_is_usable
 from plab.errors import tell
 from plab.objective import scores_from_iou, soft_iou
-from plab.problem import Problem, build_scenes, build_simulator
+from plab.problem import Problem, build_scenes, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
 from plab.scenes import Scene
@@ -174,7 +174,7 @@ def record_with_motion(cfg: Config, actions: np.ndarray) -> RecordedRollout:
             say(f"with the target of your file in {cfg.targets.source}: mind whom you give it to")
         return recording
     scenes = build_scenes([cfg])
-    states = list(_states(build_simulator(scenes, cfg), actions[None]))
+    states = list(_states(make_simulator(cfg, scenes), actions[None]))
     return RecordedRollout(
         task=cfg.task.name,
         variant=cfg.variant,

@@ -10,7 +10,7 @@ import numpy as np
 
 from plab.config import Config
 from plab.errors import ConfigError, out_of_memory
-from plab.problem import Episodes, Problem, build_scenes, build_simulator
+from plab.problem import Episodes, Problem, build_scenes, make_simulator
 from plab.runners.jobs import RunError
 from plab.runners.simulator_cache import SimulatorCache
 from plab.scenes import Scene
@@ -64,7 +64,7 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
     these scenes."""
     scenes = build_scenes(cfgs)
     key = len(cfgs), simulator_key(cfgs[0], scenes[0])
-    kept = cache.get(key, lambda: build_simulator(scenes, cfgs[0]), check=lambda it: it.set_scenes(scenes))
+    kept = cache.get(key, lambda: make_simulator(cfgs, scenes), check=lambda it: it.set_scenes(scenes))
     return Problem(cfgs, kept)
 
 

@@ -123,7 +123,13 @@ def batch_limit(scene: Scene, precision: str, device: str, memory_mb: float) -> 
 
 
 def segment_length(
-    steps: int, slots_per_step: int, reach: int, segments_max: int, slot_bytes: int, held: int, memory_mb: float
+    steps: int,
+    slots_per_step: int,
+    reach: int,
+    segments_max: int,
+    slot_bytes: int,
+    held: int,
+    memory_mb: float,
 ) -> int:
     """Return how many environment steps of a gradient's T ``steps`` are one segment.
 

@@ -11,6 +11,7 @@ Patches, with what they change and why:
     :func:`forget_arguments`: ``Kernel.mapper.mapping``. It would hold 100 kB of each simulator for good.
     :func:`free_own_arrays_only`: ``ScalarNdarray.__init__`` and ``__del__``. Arrays from before ``ti.init``
         would free memory that is in use.
+    :func:`free_with`: ``FieldsBuilder.finalize`` of one builder. Fields would never be freed.
     :func:`watch_compiling`: ``kernel_impl._get_tree_and_ctx``, ``Kernel.launch_kernel``. Nothing else says
         when a kernel is compiled.
 
@@ -56,6 +57,7 @@ __all__ = [
     "cuda_available",
     "forget_arguments",
     "free_own_arrays_only",
+    "free_with",
     "hasten_tracing",
     "local_variable",
     "tell_classes_quickly",
@@ -242,6 +244,26 @@ def free_own_arrays_only() -> None:
             free(self)
 
     kind.__init__, kind.__del__ = made, freed
+
+
+def free_with(owner: object) -> None:
+    """Let the memory of all fields declared since the last kernel be freed together with their owner.
+
+    A field keeps its memory until Taichi starts anew otherwise. Taichi's ``SNodeTree.destroy`` would forget
+    all compiled kernels, those of other simulators, too.
+    """
+    builder, trees = impl._root_fb, []
+    finalize = builder.finalize
+    builder.finalize = lambda **words: trees.append(finalize(**words))
+    impl.get_runtime().materialize()
+    for tree in trees:
+        weakref.finalize(owner, _free_tree, tree)
+
+
+def _free_tree(tree: Any) -> None:
+    runtime = impl.get_runtime()
+    if runtime is not None and tree.prog is runtime.prog:
+        tree.ptr.destroy_snode_tree(tree.prog)
 
 
 def address_of(array: ti.Ndarray) -> int:

@@ -57,8 +57,8 @@ class Tape:
         return self._history[number], within * self._slots_per_step + (1 if self._engine.sorts else 0)
 
     def plan(self, steps: int, memory_mb: float) -> int:
-        """Return :func:`plab.sim.memory.segment_length` for a gradient of T ``steps``, within ``memory_mb`` [MB]
-        for everything that the simulator holds."""
+        """Return :func:`plab.sim.memory.segment_length` for a gradient of T ``steps``, within a budget for
+        everything that the simulator holds [MB]."""
         engine, particles = self._engine, self._particles
         engine.allocate_adjoint()
         # The initial state is one more of the current one's size.
