@@ -32,10 +32,10 @@ def blocks(language: str) -> list[str]:
 
 
 def arguments(line: str) -> list[str]:
-    """Arguments of a ``python -m plab.run`` line of the page, with the example's folder where it is."""
+    """Arguments of a ``plab run`` line of the page, with the example's folder where it is."""
     words = shlex.split(line.removeprefix("$ "))
-    assert words[:3] == ["python", "-m", "plab.run"]
-    return [str(ROOT / word) if word.startswith("examples/") else word for word in words[3:]]
+    assert words[:2] == ["plab", "run"]
+    return [str(ROOT / word) if word.startswith("examples/") else word for word in words[2:]]
 
 
 def example(*overrides: str) -> Config:

@@ -1,6 +1,6 @@
 """A term of the loss of one's own, outside plab: mass above a surface.
 
-python -m plab.run --config-dir examples/own_loss/conf method=adam_height task=RollingPin
+plab run --config-dir examples/own_loss/conf method=adam_height task=RollingPin
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """A method of one's own, outside plab: random search around the best actions so far.
 
-python -m plab.run --config-dir examples/own_method/conf method=random_search task=Move
+plab run --config-dir examples/own_method/conf method=random_search task=Move
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A learning algorithm of another library, outside plab: truncated quantile critics of SB3-Contrib.
 
-python -m plab.run --config-dir examples/own_rl/conf method=tqc task=Move
+plab run --config-dir examples/own_rl/conf method=tqc task=Move
 """
 
 from __future__ import annotations
