@@ -167,9 +167,11 @@ def test_pictures(env: PlabEnv, vector: PlabVectorEnv, monkeypatch: pytest.Monke
             assert one.render() is None
     drawn = Mock()
     drawn.frame.return_value = np.zeros((3, 4, 3), np.uint8)
-    monkeypatch.setitem(sys.modules, "plab.render", SimpleNamespace(Renderer=Mock(return_value=drawn)))
+    renderer = Mock(return_value=drawn)
+    monkeypatch.setitem(sys.modules, "plab.render", SimpleNamespace(Renderer=renderer))
     monkeypatch.setattr(env, "render_mode", "rgb_array")
     assert env.render().shape == (3, 4, 3)
+    renderer.assert_called_once_with(env.batch.problem.scenes[0], None, (480, 360))
     state = env.batch.problem.simulator.state()
     assert all(map(np.array_equal, drawn.frame.call_args.args, (state.x[0], state.poses[0])))
     # Puts back what closing takes away: the other tests go on with this environment.

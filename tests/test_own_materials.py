@@ -16,7 +16,7 @@ import numpy as np
 from plab.config import Config, build_scene, load_config
 from plab.results import config_dict, config_hash
 from plab.run import main
-from plab.submissions.schema import Digests
+from plab.submissions.submission import Digests
 from plab.sweep.plan import plan
 from plab.targets.store import TargetStore
 

@@ -22,11 +22,17 @@ from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.vector import PlabVectorEnv
 from plab.submissions import record
-from plab.submissions.files import read, write
-from plab.submissions.playing import play_plans, play_policy
-from plab.submissions.policies import load
-from plab.submissions.schema import UNSEEN, SubmissionError
-from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, NOT_RUN, TOLERANCE, read_verification
+from plab.submissions.submission import UNSEEN, SubmissionError, read, write
+from plab.submissions.verifying import (
+    BROKE_OFF,
+    HOLDS,
+    LIES,
+    NOT_RUN,
+    TOLERANCE,
+    load_policy,
+    play,
+    read_verification,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 COARSE = ("sim.grid_size=32", "sim.horizon=6", "sim.substeps=7", "sim.dt=2.7e-4", "sim.particles_scale=0.03")
@@ -75,7 +81,7 @@ def why(function: Callable[..., Any], *args: Any, **options: Any) -> str:
 def test_the_best_episode_of_each_budget_is_kept(
     tmp_path: Path, env: gymnasium.Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plab.submissions.recording.BUDGETS", (6, 13))
+    monkeypatch.setattr("plab.submissions.recorder.BUDGETS", (6, 13))
     # Two recorders of one configuration share a file.
     first, second = record(env, tmp_path), record(env, tmp_path)
     scores = [episode(one, plan) for one, plan in zip((first, second, first), PLANS, strict=True)]
@@ -231,11 +237,11 @@ def test_policies_answer_alike_in_both_formats(tmp_path: Path) -> None:
     expected = module(torch.from_numpy(observations)).detach().numpy().clip(-1.0, 1.0)
     files = {"a.pt": torchscript(tmp_path / "a.pt", module), "a.onnx": as_onnx(module)}
     for name, content in files.items():
-        assert load(name, content)(observations) == pytest.approx(expected, abs=1e-6)
-        assert name in why(load, name, b"no module")
-        assert f"{name} cannot be run" in why(load(name, content), observations[:, 1:])
+        assert load_policy(name, content)(observations) == pytest.approx(expected, abs=1e-6)
+        assert name in why(load_policy, name, b"no module")
+        assert f"{name} cannot be run" in why(load_policy(name, content), observations[:, 1:])
     torch.nn.init.constant_(module.layer.bias, float("nan"))
-    assert "finite" in why(load("a.onnx", as_onnx(module)), observations)
+    assert "finite" in why(load_policy("a.onnx", as_onnx(module)), observations)
 
 
 def test_a_policy_is_run_only_if_asked(
@@ -265,13 +271,13 @@ def test_a_policy_is_run_only_if_asked(
 def test_plans_and_policies_whose_actions_do_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cfgs = [load_config(["task=RollingPin", *COARSE])]
     batch = EpisodeBatch(cfgs)
-    monkeypatch.setattr("plab.submissions.playing.EpisodeBatch", lambda cfgs: batch)
-    line = why(play_plans, cfgs, [np.zeros((6, 2))], "float32")
+    monkeypatch.setattr("plab.submissions.verifying.EpisodeBatch", lambda cfgs: batch)
+    line = why(play, cfgs, [np.zeros((6, 2))], "float32")
     assert "RollingPin-v1" in line and "[6, 2]" in line and "[6, 3]" in line
     (size,) = batch.observation_space.shape
     for module, fault in ((Acting(size, 2), "2 components"), (Whim(size), "not deterministic")):
-        policy = load("a.pt", torchscript(tmp_path / "a.pt", module))
-        line = why(play_policy, cfgs, policy, "a.pt", "float32")
+        policy = load_policy("a.pt", torchscript(tmp_path / "a.pt", module))
+        line = why(play, cfgs, policy, "float32", "a.pt")
         assert line.startswith("a.pt ") and fault in line
 
 

@@ -57,7 +57,7 @@ PYTHON = {
             "plab.envs.sb3",
             "plab.envs.tensors",
             "plab.envs",
-            "plab.submissions.recording",
+            "plab.submissions.recorder",
         ),
     ),
     "results": (

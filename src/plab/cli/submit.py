@@ -15,20 +15,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from plab.cli.arguments import Parser, seed, sources_and_words, to_write
-from plab.cli.command import command_line, complain
+from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.results.examples import resolve
 from plab.submissions.collecting import from_policies, from_sources
-from plab.submissions.files import inconsistency, write
-from plab.submissions.schema import (
+from plab.submissions.submission import (
     CARD_BYTES,
     SUFFIX,
     UNSEEN,
-    CardError,
     Submission,
     SubmissionError,
+    inconsistency,
     parse_card,
+    write,
 )
 
 __all__ = ["main"]
@@ -45,9 +45,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
     except OSError as error:
         raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
-    except CardError as error:
-        # All that is wrong with it, a line each.
-        return max(map(complain, error.faults))
     folders, words = sources_and_words(options.arguments)
     sources = [resolve(folder) for folder in folders]
     if options.policy:

@@ -21,8 +21,7 @@ from plab.cli.tables import print_table
 from plab.errors import PlabError, tell
 from plab.scenes import PRECISIONS
 from plab.submissions.collecting import submission_files
-from plab.submissions.files import read
-from plab.submissions.schema import SUFFIX, Submission, SubmissionError
+from plab.submissions.submission import SUFFIX, Submission, SubmissionError, read
 from plab.submissions.verifying import Verification, verify, write_verification
 
 __all__ = ["main"]

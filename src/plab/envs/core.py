@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "METADATA",
+    "PICTURE_SIZE",
     "EpisodeBatch",
     "Transition",
     "action_array",
@@ -45,6 +46,9 @@ MOST_ENVS = 100_000
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
+
+PICTURE_SIZE = (480, 360)
+"""Default width and height of pictures [pixels]."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}
 """Gymnasium's metadata of every environment; 20 frames a second show an episode in two and a half."""
@@ -166,6 +170,8 @@ class EpisodeBatch:
         horizon: Steps of an episode.
         observation_space: Space of one sub-environment's observation.
         action_space: Space of one sub-environment's action.
+        picture_size: Width and height of pictures [pixels], to be set before the first.
+        picture_target: Whether pictures show the target, as a ghost; likewise.
     """
 
     def __init__(self, cfgs: Sequence[Config], *, contact: str = "hard") -> None:
@@ -188,6 +194,7 @@ class EpisodeBatch:
         _require_alike(cfgs)
         problem = Problem(cfgs)
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
+        self.picture_size, self.picture_target = PICTURE_SIZE, False
         self._renderers: list[Renderer] = []
         self._take(cfgs, problem)
         self.observation_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
@@ -377,8 +384,9 @@ class EpisodeBatch:
             # Imported here: drawing is not for everyone, and its library takes a second to load.
             from plab.render import Renderer
 
-            pairs = zip(self.problem.scenes, self.problem.target_mass, strict=True)
-            self._renderers = [Renderer(scene, target) for scene, target in pairs]
+            for scene, mass in zip(self.problem.scenes, self.problem.target_mass, strict=True):
+                target = mass if self.picture_target else None
+                self._renderers.append(Renderer(scene, target, self.picture_size))
         x, poses = simulator.observe(1)[..., :3], simulator.poses()
         return tuple(r.frame(x[e], poses[e]) for e, r in enumerate(self._renderers))
 

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from plab.envs import ENTRY_POINT
 from plab.envs.core import (
     METADATA,
+    PICTURE_SIZE,
     EpisodeBatch,
     action_array,
     check_render_mode,
@@ -31,6 +32,8 @@ def make_sb3(
     *,
     contact: str = "hard",
     render_mode: str | None = None,
+    render_size: tuple[int, int] = PICTURE_SIZE,
+    render_target: bool = False,
     **kwargs: Any,
 ) -> PlabVecEnv:
     """Make the environments of a registered id.
@@ -40,6 +43,8 @@ def make_sb3(
         num_envs: Number of sub-environments.
         contact: Contact model, ``hard`` or ``soft``.
         render_mode: ``rgb_array``, or None for no pictures.
+        render_size: Width and height of pictures [pixels].
+        render_target: Whether pictures show the target, as a ghost.
         **kwargs: ``overrides``, ``overrides_per_env`` and ``config_dir``; see
             :func:`plab.envs.core.compose_configs`.
 
@@ -50,7 +55,9 @@ def make_sb3(
     """
     spec = _spec(env_id)
     cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
-    return PlabVecEnv(EpisodeBatch(cfgs, contact=contact), render_mode=render_mode, spec=spec)
+    batch = EpisodeBatch(cfgs, contact=contact)
+    batch.picture_size, batch.picture_target = render_size, render_target
+    return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
 
 
 def _spec(env_id: str) -> EnvSpec:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from plab.envs.core import (
     METADATA,
+    PICTURE_SIZE,
     EpisodeBatch,
     action_array,
     check_render_mode,
@@ -43,6 +44,8 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         contact: str = "hard",
         config_dir: str | Path | None = None,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = PICTURE_SIZE,
+        render_target: bool = False,
     ) -> None:
         """Build the environment.
 
@@ -53,6 +56,8 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             contact: Contact model, ``hard`` or ``soft``.
             config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
+            render_size: Width and height of pictures [pixels].
+            render_target: Whether pictures show the target, as a ghost.
 
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
@@ -60,6 +65,7 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode = check_render_mode(render_mode)
         cfgs = compose_configs(task, variant, overrides=overrides, config_dir=config_dir)
         self.batch = EpisodeBatch(cfgs, contact=contact)
+        self.batch.picture_size, self.batch.picture_target = render_size, render_target
         self.observation_space = self.batch.observation_space
         self.action_space = self.batch.action_space
 

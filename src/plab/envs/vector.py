@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from plab.envs.core import (
     METADATA,
+    PICTURE_SIZE,
     EpisodeBatch,
     action_array,
     check_render_mode,
@@ -50,6 +51,8 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         contact: str = "hard",
         config_dir: str | Path | None = None,
         render_mode: str | None = None,
+        render_size: tuple[int, int] = PICTURE_SIZE,
+        render_target: bool = False,
     ) -> None:
         """Build the environments.
 
@@ -63,6 +66,8 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             contact: Contact model, ``hard`` or ``soft``.
             config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
+            render_size: Width and height of pictures [pixels].
+            render_target: Whether pictures show the target, as a ghost.
 
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
@@ -77,6 +82,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             config_dir=config_dir,
         )
         self.batch = EpisodeBatch(cfgs, contact=contact)
+        self.batch.picture_size, self.batch.picture_target = render_size, render_target
         self.num_envs = num_envs
         self.single_observation_space = self.batch.observation_space
         self.single_action_space = self.batch.action_space

@@ -36,6 +36,7 @@ _GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20,
 _SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
 _SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
 _TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
+_NEAR = 0.02  # distance from the plasticine's surface at which the ghost vanishes [domain units]
 _CLEAREST = 0.45  # opacity of a manipulator that hides what it does
 _HIDES = (0.5, 0.8)  # share of itself with which it hides plasticine: it begins to be translucent, and is
 _SHADOW = 0.6  # strength of the shadows on the floor
@@ -139,11 +140,22 @@ class Target:
         self.actors = [*self.ghost, *self.solid.actors]
 
     def fade(self, bodies: Sequence[Field]) -> None:
-        """Let the ghost vanish where the plasticine's surface has come to it."""
-        density = sum(field.at(self.mesh.points) for field in bodies)
-        outside = np.clip((0.12 - density) / 0.1, 0.0, 1.0)
-        inside = np.clip((density - 0.92) / 0.07, 0.0, 1.0)
-        for bubble, share in zip(self._bubbles, (outside, inside), strict=True):
+        """Hide the ghost where it runs along the plasticine's surface, not where it crosses it."""
+
+        def density(points: np.ndarray) -> np.ndarray:
+            return sum(field.at(points) for field in bodies)
+
+        points, normals = self.mesh.points, self.mesh.point_normals
+        here, ahead, behind = (density(points + way * _NEAR * normals) for way in (0.0, 1.0, -1.0))
+        outside = np.clip((0.12 - np.maximum(here, behind)) / 0.1, 0.0, 1.0)
+        inside = np.clip((np.minimum(here, ahead) - 0.92) / 0.07, 0.0, 1.0)
+        steps = 0.5 * _NEAR * np.eye(3)
+        slope = np.stack([density(points + step) - density(points - step) for step in steps], axis=1)
+        length = np.linalg.norm(slope, axis=1)
+        cosine = np.abs(np.sum(slope * normals, axis=1)) / np.maximum(length, 1e-6)
+        # The plasticine in front hides what of these is inside.
+        crossing = np.where(here < 0.9, np.clip((0.9 - cosine) / 0.2, 0.0, 1.0), 0.0)
+        for bubble, share in zip(self._bubbles, (np.maximum(outside, crossing), inside), strict=True):
             bubble["color"][:, 3] = self._alpha * share
             bubble.Modified()
 

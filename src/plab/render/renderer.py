@@ -59,6 +59,8 @@ class Renderer:
             size: Width and height of the pictures [pixels].
             camera: Where the pictures are taken from; :func:`plab.render.camera.scene_camera` if None.
         """
+        if len(size) != 2 or min(size) < 1:
+            raise ArgumentError(f"size must be width and height in pixels (got {size})")
         self.size = size
         self.camera = camera or scene_camera(scene, target_mass, size)
         self._scene = scene

@@ -1,51 +1,56 @@
-"""What the leaderboard shows: tables of entries that were judged alike, with the paper's and plab's own."""
+"""Tables of the leaderboard: entries judged alike, with the paper's and plab's own."""
 
 from __future__ import annotations
 
 import functools
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
-from plab.config import Config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.families import GRADIENT
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.series import BUDGETS
-from plab.results import ResultsError, Row, config_dict
+from plab.results import ResultsError, Row
 from plab.results.examples import example_archive
 from plab.results.table import readable_rows
 from plab.submissions.collecting import steps_to_best, submission_files
-from plab.submissions.files import read
-from plab.submissions.schema import UNSEEN, Card, Configuration, Digests, Submission, SubmissionError
+from plab.submissions.submission import (
+    UNSEEN,
+    Card,
+    Configuration,
+    Digests,
+    Submission,
+    SubmissionError,
+    read,
+)
 from plab.submissions.verifying import BROKE_OFF, HOLDS, LIES, read_verification
 from plab.targets.store import PHYSICS_VERSION
 
-__all__ = ["Board", "BoardTable", "Line", "board"]
+PAPER = Card("", ("Huang et al.",), "https://arxiv.org/abs/2104.03311", budget=0, hardware="", gradient=False)
+OWN = Card("", ("plab contributors",), "", budget=0, hardware="NVIDIA H200", gradient=True)
 
-PAPER = Card(
-    name="",
-    authors=("Huang et al.",),
-    link="https://arxiv.org/abs/2104.03311",
-    budget=0,
-    hardware="",
-    gradient=False,
-)
-OWN = replace(PAPER, authors=("plab contributors",), link="")
+_PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
+"""Environment steps of the paper's methods, with the gradient and without: its episodes have 50 steps."""
 
-_EPISODE = 50
-_PAPER_STEPS = {True: 200 * _EPISODE, False: 10_000 * _EPISODE}
-"""Environment steps of the paper's methods, with the gradient and without: their episodes are 50 steps."""
+TableKey: TypeAlias = tuple[str, str]
+"""Set of configurations (``suite``, ``unseen`` or ``authors``) and protocol (``plab`` or ``release``)."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """A score that was reached after so many environment steps, in a task and a variant; ``exact`` is that in
-    float64, or NaN."""
+    """A score in a task and variant.
+
+    Attributes:
+        configuration: Task and variant.
+        steps: Environment steps until it was reached.
+        score: The score in float32.
+        exact: The score in float64, or NaN.
+    """
 
     configuration: tuple[str, str]
     steps: int
@@ -58,7 +63,7 @@ class Line:
     """A line of a table.
 
     Attributes:
-        card: Who it is of.
+        card: The method.
         track: ``plans`` or ``policies``.
         status: ``verified``, ``claimed``, ``printed`` (the paper's) or ``own runs`` (plab's).
         covered: Number of configurations with a score.
@@ -85,7 +90,7 @@ class BoardTable:
 
     Attributes:
         title: Its heading.
-        protocol: What they are scores of.
+        protocol: Conditions of the scores, in sentences.
         expected: Number of configurations.
         lines: Best first.
     """
@@ -98,7 +103,7 @@ class BoardTable:
 
 @dataclass(frozen=True)
 class Board:
-    """All tables, and why some files are in none of them."""
+    """All tables, and a line for each file that is in none of them."""
 
     sections: tuple[BoardTable, ...]
     left_out: tuple[str, ...]
@@ -109,16 +114,21 @@ _ORIGIN = {
     "plab": "Start, numbers and floor are plab's (protocol=plab)",
     "release": "Start, numbers and floor are those of the authors' code (protocol=release)",
 }
-_SETS = {
-    "suite": ("plab's suite", "the targets of plab's own recipes"),
-    "unseen": (
-        "Unseen configurations",
-        f"drawn starts and targets ({UNSEEN[0]} to {UNSEEN[-1]}) of each task",
-    ),
-    "authors": ("The authors' suite", "the authors' target files"),
+_TARGETS = {
+    "suite": "the targets of plab's own recipes",
+    "unseen": f"drawn starts and targets ({UNSEEN[0]} to {UNSEEN[-1]}) of each task",
+    "authors": "the authors' target files",
 }
-_USUAL = (("suite", "plab"), ("unseen", "plab"), ("authors", "plab"), ("authors", "release"))
-_RARE = (("suite", "release"), ("unseen", "release"))
+_TITLES: dict[TableKey, str] = {
+    ("suite", "plab"): "plab's suite",
+    ("unseen", "plab"): "Unseen configurations",
+    ("authors", "plab"): "The authors' suite",
+    ("authors", "release"): "The authors' suite on its terms",
+    ("suite", "release"): "plab's suite on the authors' terms",
+    ("unseen", "release"): "Unseen configurations on the authors' terms",
+}
+_SHOWN_IF_EMPTY = 4
+"""Number of tables, from the first on, that are shown without lines, too."""
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
@@ -132,7 +142,7 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
     """
     if not folder.is_dir():
         raise SubmissionError(f"there is no folder {folder}")
-    tables: dict[tuple[str, str], list[Line]] = defaultdict(list)
+    tables: dict[TableKey, list[Line]] = defaultdict(list)
     left_out: list[str] = []
     for path in submission_files(folder):
         try:
@@ -140,16 +150,15 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
                 tables[table].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    for table, line in _own():
-        tables[table].append(line)
+    for archive, table in (("example", ("suite", "plab")), ("targets", ("authors", "plab"))):
+        tables[table] += _own_runs(archive, table[0])
+    tables["authors", "release"] += _own_runs("release", "authors")
     sections = []
-    for kind, terms in (*_USUAL, *(table for table in _RARE if tables[table])):
-        title, targets = _SETS[kind]
-        if terms != "plab":
-            title += " on its terms" if kind == "authors" else " on the authors' terms"
-        protocol = f"{_ORIGIN[terms]}; {targets}. {_PLAYED}"
-        lines = _best_first(tables[kind, terms])
-        sections.append(BoardTable(title, protocol, len(_expected(kind)), lines))
+    for number, ((kind, terms), title) in enumerate(_TITLES.items()):
+        if tables[kind, terms] or number < _SHOWN_IF_EMPTY:
+            protocol = f"{_ORIGIN[terms]}; {_TARGETS[kind]}. {_PLAYED}"
+            lines = _best_first(tables[kind, terms])
+            sections.append(BoardTable(title, protocol, len(_expected(kind)), lines))
     return Board((*sections, _paper()), tuple(left_out))
 
 
@@ -163,27 +172,24 @@ def _expected(kind: str) -> list[tuple[str, str]]:
 
 
 def _line(card: Card, track: str, status: str, kind: str, points: Sequence[Point]) -> Line:
-    """Sum up what was reached."""
+    """Summarise the points of a method in a table of some kind of configurations."""
     expected = _expected(kind)
     best = _best(points, math.inf)
+    within = [_best(points, limit) for limit in BUDGETS]
     exact = [point.exact for point in best.values()]
-    tasks = []
-    for task in suite_tasks():
-        own = [point.score for (name, _), point in best.items() if name == task]
-        count = sum(name == task for name, _ in expected)
-        tasks.append(sum(own) / count if own else None)
+    tasks: dict[str, list[float]] = defaultdict(list)
+    for (task, _), point in best.items():
+        tasks[task].append(point.score)
+    each = len(expected) // len(suite_tasks())
     return Line(
         card,
         track,
         status,
         covered=len(best),
-        budgets=tuple(
-            sum(point.score for point in found.values()) / len(expected) if found else None
-            for found in (_best(points, limit) for limit in BUDGETS)
-        ),
+        budgets=tuple(sum(p.score for p in f.values()) / len(expected) if f else None for f in within),
         score=sum(point.score for point in best.values()) / len(expected),
         exact=None if any(map(math.isnan, exact)) else sum(exact) / len(expected),
-        tasks=tuple(tasks),
+        tasks=tuple(sum(tasks[name]) / each if name in tasks else None for name in suite_tasks()),
     )
 
 
@@ -201,20 +207,15 @@ def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]
 
 
 @functools.cache
-def _composed(configuration: Configuration, overrides: tuple[str, ...]) -> Config:
-    return configuration.config(overrides)
-
-
-@functools.cache
 def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Digests:
-    return Digests.of(_composed(configuration, overrides))
+    return Digests.of(configuration.config(overrides))
 
 
-def _stranger(submission: Submission, overrides: tuple[str, ...]) -> str | None:
-    """Return the name of a configuration that is another one here, None if there is none."""
+def _foreign_part(submission: Submission, overrides: tuple[str, ...]) -> str | None:
+    """Return the scene or target that differs from the leaderboard's; None if all agree."""
     for entry in submission.entries:
         configuration = entry.configuration
-        # The scene is the same, and the authors' files need not be here.
+        # The scene does not depend on the target, and the authors' files need not be here.
         known = _digests(replace(configuration, targets="suite"), overrides)
         if entry.digests.scene != known.scene:
             return f"the scene of {configuration.name}"
@@ -223,8 +224,8 @@ def _stranger(submission: Submission, overrides: tuple[str, ...]) -> str | None:
     return None
 
 
-def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[str, str], Line]]:
-    """Yield the lines of a submission, with the tables that they belong to.
+def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
+    """Yield the lines of a submission, with their tables.
 
     Raises:
         ResultsError: If it belongs into none.
@@ -236,7 +237,7 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[s
         raise SubmissionError(
             f"{path} is of physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
         )
-    if other := _stranger(submission, overrides):
+    if other := _foreign_part(submission, overrides):
         raise SubmissionError(f"{path}: {other} is another one than on this leaderboard")
     verification = read_verification(submission)
     status = "claimed"
@@ -245,7 +246,7 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[s
         if wrong:
             raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
         status = "verified" if verification.outcomes == {HOLDS} else "claimed"
-    tables: dict[tuple[str, str], list[Point]] = defaultdict(list)
+    tables: dict[TableKey, list[Point]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
         scores = {} if verification is None else verification.verdicts[number].scores
         own, score = entry.configuration, scores.get("float32", entry.score)
@@ -259,39 +260,20 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[tuple[s
 
 
 @functools.cache
-def _own() -> tuple[tuple[tuple[str, str], Line], ...]:
-    """Return the lines of plab's own runs, of the archives that come with it, and their tables."""
-    found = []
-    archives = {
-        "example": ("suite", "plab"),
-        "targets": ("authors", "plab"),
-        "release": ("authors", "release"),
-    }
-    for name, table in archives.items():
-        for card, runs in _runs(name):
-            points = [Point(_which(row), steps_to_best(row), row.values["score_best"]) for row in runs]
-            found.append((table, _line(card, "plans", "own runs", table[0], points)))
-    return tuple(found)
+def _runs(archive: str) -> dict[Card, list[Row]]:
+    """Return the runs of gradient methods with seed 0 in an archive that comes with plab, by method."""
+    groups: dict[Card, list[Row]] = defaultdict(list)
+    for row in readable_rows(example_archive(archive))[0]:
+        look = method(row.values["method"])
+        if row.values["seed"] == 0 and look.kind == GRADIENT:
+            groups[replace(OWN, name=look.label)].append(row)
+    return groups
 
 
-@functools.cache
-def _runs(name: str) -> list[tuple[Card, list[Row]]]:
-    """Return the runs of an archive by method: of gradient methods with seed 0, whose targets are today's."""
-    groups: dict[str, list[Row]] = defaultdict(list)
-    for row in readable_rows(example_archive(name))[0]:
-        gradient = method(row.values["method"]).kind == GRADIENT
-        if row.values["seed"] == 0 and gradient and _of_today(row.config):
-            groups[row.values["method"]].append(row)
-    look = replace(OWN, gradient=True, hardware="NVIDIA H200")
-    return [(replace(look, name=method(own).label), rows) for own, rows in groups.items()]
-
-
-def _of_today(config: Mapping[str, Any]) -> bool:
-    """Return whether a run's target is what its task has today; those in files of the authors are."""
-    if config["targets"]["source"] is not None:
-        return True
-    today = _composed(Configuration(config["task"]["name"], str(config["variant"])), ())
-    return config["task"]["target"] == config_dict(today)["task"]["target"]
+def _own_runs(archive: str, kind: str) -> Iterator[Line]:
+    for card, runs in _runs(archive).items():
+        points = [Point(_which(row), steps_to_best(row), row.values["score_best"]) for row in runs]
+        yield _line(card, "plans", "own runs", kind, points)
 
 
 def _which(row: Row) -> tuple[str, str]:
@@ -299,7 +281,7 @@ def _which(row: Row) -> tuple[str, str]:
 
 
 def _paper() -> BoardTable:
-    """Return the paper's table, with plab's runs that were judged as it does."""
+    """Return the paper's table, with plab's runs that were judged in the same way."""
     table = paper_table("iou_per_configuration")
     lines = []
     for name, rows in table.groupby("method", sort=False):
@@ -309,7 +291,7 @@ def _paper() -> BoardTable:
         points = [Point((row.task, row.variant), steps, row.iou_mean) for row in rows.itertuples()]
         card = replace(PAPER, name=look.label, gradient=gradient)
         lines.append(_line(card, "plans" if gradient else "policies", "printed", "authors", points))
-    for card, runs in _runs("release"):
+    for card, runs in _runs("release").items():
         points = [Point(_which(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
         lines.append(_line(card, "plans", "own runs", "authors", points))
     protocol = (

@@ -1,4 +1,4 @@
-"""Where submissions come from: recordings, plab's own results, policies."""
+"""Entries of submissions from recordings, plab's own results and policies."""
 
 from __future__ import annotations
 
@@ -11,20 +11,17 @@ from plab.render import RenderError, recording
 from plab.report.series import load_rows
 from plab.results import Row
 from plab.results.table import readable_rows
-from plab.submissions.files import read
-from plab.submissions.playing import play_policy
-from plab.submissions.policies import load
-from plab.submissions.schema import (
+from plab.submissions.submission import (
     SUFFIX,
     Configuration,
     Digests,
     Entry,
     SubmissionError,
     configuration_of,
+    read,
     variant_words,
 )
-
-__all__ = ["from_policies", "from_sources", "steps_to_best", "submission_files"]
+from plab.submissions.verifying import load_policy, play
 
 
 def submission_files(source: Path) -> list[Path]:
@@ -107,7 +104,7 @@ def from_policies(
         except OSError as error:
             raise SubmissionError(f"cannot read {path}: {error.strerror or error}") from None
         cfgs = [load_config([*variant_words(task, variant), *overrides]) for variant in variants]
-        played = play_policy(cfgs, load(name, files[name]), str(path), "float32")
+        played = play(cfgs, load_policy(name, files[name]), "float32", str(path))
         for cfg, one in zip(cfgs, played, strict=True):
             configuration = configuration_of(cfg)
             if one.failure:

@@ -1,41 +1,68 @@
-"""What submissions really score: every claim is simulated again, in float32 and in float64."""
+"""Verification of submissions: every claim is simulated again, in float32 and in float64.
+
+Policies are TorchScript or ONNX. Loading one executes it, hence only where that was asked for.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy as np
 
 import plab
 from plab.config import Config
+from plab.envs.core import EpisodeBatch
+from plab.files import one_line
 from plab.results.provenance import now
 from plab.results.run_file import replace_file
 from plab.scenes import PRECISIONS
-from plab.submissions.playing import Played, play_plans, play_policy
-from plab.submissions.policies import load
-from plab.submissions.schema import SUFFIX, Configuration, Digests, Entry, Submission, SubmissionError
+from plab.submissions.submission import (
+    SUFFIX,
+    Configuration,
+    Digests,
+    Entry,
+    Submission,
+    SubmissionError,
+    is_share,
+)
 from plab.targets.store import PHYSICS_VERSION
 
-__all__ = ["TOLERANCE", "Verdict", "Verification", "read_verification", "verify", "write_verification"]
-
 TOLERANCE = 0.02
-"""How far a claimed score may be from what is simulated: on the CPU the same actions give the same bits, on
-CUDA the last digits vary and contact magnifies them."""
+"""Largest difference between a claimed score and the simulated one: on the CPU the same actions give the same
+bits, on CUDA the last digits vary and contact magnifies them."""
 
 HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
+
+_BATCH = 25
+"""Maximum number of configurations in one simulator."""
+
+Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
+"""Function of observations, float32, shape [batch, entry], that returns actions, shape [batch, action]."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """Score of an episode's last state, NaN if it broke off, and the failure."""
+
+    score: float
+    failure: str = ""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a claim.
+    """Outcome of a claim.
 
     Attributes:
         entry: The claim.
-        scores: What it really scores, by precision; empty if it was not run.
+        scores: Simulated score by precision; empty if it was not run.
         outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
         why: A line, unless it holds.
     """
@@ -48,12 +75,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Verification:
-    """What became of all claims of a file.
+    """Outcome of all claims of a file.
 
     Attributes:
         digest: SHA-256 of the submission, in hex.
         verdicts: A verdict for each entry, in the order of the file.
-        overrides: The overrides that it was simulated with.
+        overrides: Overrides that it was simulated with.
     """
 
     digest: str
@@ -62,7 +89,7 @@ class Verification:
 
     @property
     def outcomes(self) -> set[str]:
-        """Which outcomes there are."""
+        """All outcomes that occur."""
         return {verdict.outcome for verdict in self.verdicts}
 
 
@@ -91,18 +118,15 @@ def verify(
         configuration = entry.configuration
         if run_policies or not entry.policy:
             alike[configuration.task, configuration.targets, configuration.terms, entry.policy].append(number)
-    policies = {name: load(name, submission.policies[name]) for *_, name in alike if name}
+    policies = {name: load_policy(name, submission.policies[name]) for *_, name in alike if name}
     # Going from one precision to the other starts Taichi anew.
     for precision in precisions:
         for (*_, name), numbers in alike.items():
             entries = [submission.entries[number] for number in numbers]
             chosen = [cfgs[entry.configuration] for entry in entries]
-            if name:
-                played = play_policy(chosen, policies[name], name, precision)
-            else:
-                plans = [entry.actions for entry in entries if entry.actions is not None]
-                played = play_plans(chosen, plans, precision)
-            for number, one in zip(numbers, played, strict=True):
+            plans = [entry.actions for entry in entries if entry.actions is not None]
+            actor = policies[name] if name else plans
+            for number, one in zip(numbers, play(chosen, actor, precision, name), strict=True):
                 scores[number][precision] = one
     verdicts = tuple(_verdict(entry, scores[n]) for n, entry in enumerate(submission.entries))
     return Verification(submission.digest, verdicts, given)
@@ -115,13 +139,11 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
             f"{submission.path} is of physics version {submission.physics} (plab {submission.plab}), this "
             f"plab ({plab.__version__}) simulates version {PHYSICS_VERSION}"
         )
-    found: dict[Configuration, Config] = {}
-    digests: dict[Configuration, Digests] = {}
+    names = {entry.configuration for entry in submission.entries}
+    found = {configuration: configuration.config(overrides) for configuration in sorted(names)}
+    digests = {configuration: Digests.of(cfg) for configuration, cfg in found.items()}
     for entry in submission.entries:
         configuration = entry.configuration
-        if configuration not in found:
-            found[configuration] = configuration.config(overrides)
-            digests[configuration] = Digests.of(found[configuration])
         for part in ("scene", "target"):
             if getattr(entry.digests, part) != getattr(digests[configuration], part):
                 raise SubmissionError(
@@ -145,16 +167,140 @@ def _verdict(entry: Entry, played: Mapping[str, Played]) -> Verdict:
     return Verdict(entry, scores, LIES, why)
 
 
+# ---------------------------------------------------------------------------------------------- simulation
+
+
+def play(
+    cfgs: Sequence[Config], actor: Policy | Sequence[np.ndarray], precision: str, name: str = ""
+) -> list[Played]:
+    """Play plans or a policy in several configurations of one task, in the hard contact model.
+
+    Args:
+        cfgs: The configurations.
+        actor: A plan, shape [T, A], for each configuration; or a policy.
+        precision: ``float32`` or ``float64``; observations are float32 in both.
+        name: Name of the policy in messages.
+
+    Raises:
+        SubmissionError: If a plan has not as many steps or components as its task, or the policy cannot be
+            run, gives actions that do not fit, or answers the same observation twice differently.
+    """
+    played: list[Played] = []
+    for start in range(0, len(cfgs), _BATCH):
+        some = cfgs[start : start + _BATCH]
+        batch = EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
+        shape = (batch.horizon, *(batch.action_space.shape or ()))
+        if callable(actor):
+            choose = _by_policy(actor, name, shape[1])
+        else:
+            choose = _by_plans(some, actor[start : start + _BATCH], shape)
+        observations, _ = batch.reset()
+        for t in range(batch.horizon):
+            step = batch.step(choose(t, observations), strict=False)
+            observations = step.observation
+        batch.close()
+        played += [
+            Played(math.nan, step.failures[n]) if n in step.failures else Played(float(score))
+            for n, score in enumerate(step.info["score"])
+        ]
+    return played
+
+
+Choice: TypeAlias = Callable[[int, np.ndarray], np.ndarray]
+
+
+def _by_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], shape: tuple[int, ...]) -> Choice:
+    for cfg, plan in zip(cfgs, plans, strict=True):
+        if plan.shape != shape:
+            where, has = f"{cfg.task.name}-v{cfg.variant}", list(plan.shape)
+            raise SubmissionError(f"{where}: the plan has shape {has}, its task takes {list(shape)}")
+    whole = np.stack(plans)
+    return lambda t, _: whole[:, t]
+
+
+def _by_policy(policy: Policy, name: str, components: int) -> Choice:
+    def choose(t: int, observations: np.ndarray) -> np.ndarray:
+        actions = policy(observations)
+        if actions.shape[1] != components:
+            given = f"{name} gives actions of {actions.shape[1]} components"
+            raise SubmissionError(f"{given}, its task takes {components}")
+        if t == 0 and not np.array_equal(actions, policy(observations)):
+            raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
+        return actions
+
+    return choose
+
+
+def load_policy(name: str, content: bytes) -> Policy:
+    """Load a policy, TorchScript (``.pt``) or ONNX (``.onnx``) by the ending of its file's name.
+
+    It returns as many finite actions as there are observations, in [-1, 1], or raises SubmissionError.
+
+    Raises:
+        SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.
+    """
+    policy = (_torchscript if name.endswith(".pt") else _onnx)(name, content)
+
+    def answer(observations: np.ndarray) -> np.ndarray:
+        try:
+            actions = np.asarray(policy(observations), np.float64)
+        # Whatever its author's code or the runtime raises.
+        except Exception as error:
+            raise SubmissionError(f"{name} cannot be run ({_first(error)})") from None
+        if actions.ndim != 2 or len(actions) != len(observations):
+            raise SubmissionError(f"{name} gives actions of shape {list(actions.shape)}, not [batch, action]")
+        if not np.isfinite(actions).all():
+            raise SubmissionError(f"{name} gives actions that are not finite")
+        return np.clip(actions, -1.0, 1.0)
+
+    return answer
+
+
+def _torchscript(name: str, content: bytes) -> Policy:
+    import torch
+
+    try:
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+    except (RuntimeError, ValueError, OSError) as error:
+        raise SubmissionError(f"{name} is no TorchScript module ({_first(error)})") from None
+
+    def policy(observations: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return module(torch.from_numpy(observations)).numpy()
+
+    return policy
+
+
+def _onnx(name: str, content: bytes) -> Policy:
+    if find_spec("onnxruntime") is None:
+        raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
+    import onnxruntime
+
+    try:
+        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        (given,) = session.get_inputs()
+    # ONNX Runtime has exceptions of its own, each derived from Exception alone.
+    except Exception as error:
+        raise SubmissionError(f"{name} is no ONNX model of one input ({_first(error)})") from None
+    return lambda observations: session.run(None, {given.name: observations})[0]
+
+
+def _first(error: Exception) -> str:
+    """Return the last line of an error's message: PyTorch puts the reason there, below its trace."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1][:200] if lines else type(error).__name__
+
+
 # ------------------------------------------------------------------------------------------------------ files
 
 
 def verification_path(submission: Path) -> Path:
-    """Return the file that keeps what became of a submission, beside it."""
+    """Return the file beside a submission that keeps its verification."""
     return submission.with_name(submission.name.removesuffix(SUFFIX) + ".verified.json")
 
 
 def write_verification(verification: Verification, submission: Path) -> Path:
-    """Write what became of a submission beside it; return the file.
+    """Write a verification beside its submission; return the file.
 
     Raises:
         plab.results.ResultsError: If it cannot be written.
@@ -183,7 +329,7 @@ def write_verification(verification: Verification, submission: Path) -> Path:
 
 
 def read_verification(submission: Submission) -> Verification | None:
-    """Return what became of a submission, None if nobody has verified this very file with these physics.
+    """Return the verification of a submission; None if this very file was not verified with these physics.
 
     Raises:
         SubmissionError: If the file beside it cannot be read.
@@ -196,16 +342,24 @@ def read_verification(submission: Submission) -> Verification | None:
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
             return None
         verdicts = tuple(
-            Verdict(
-                entry,
-                {name: math.nan if v is None else float(v) for name, v in own["scores"].items()},
-                own["outcome"],
-                own["why"],
-            )
-            for entry, own in zip(submission.entries, record["entries"], strict=True)
+            _kept(entry, own) for entry, own in zip(submission.entries, record["entries"], strict=True)
         )
-        return Verification(record["submission"], verdicts, tuple(record["overrides"]))
+        return Verification(record["submission"], verdicts, tuple(map(str, record["overrides"])))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SubmissionError(f"{path} cannot be read ({error}): verify the submission again") from None
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise SubmissionError(
+            f"{path} cannot be read ({one_line(error)}): verify the submission again"
+        ) from None
+
+
+def _kept(entry: Entry, record: Any) -> Verdict:
+    """Return a verdict that was read from a file; raise ValueError if a value is wrong."""
+    scores = {name: value for name, value in record["scores"].items() if name in PRECISIONS}
+    if not all(value is None or is_share(value) for value in scores.values()):
+        raise ValueError("a score is not in [0, 1]")
+    outcome, why = record["outcome"], record["why"]
+    if outcome not in (HOLDS, LIES, BROKE_OFF, NOT_RUN) or not (isinstance(why, str) and why.isprintable()):
+        raise ValueError("an outcome is unknown")
+    numbers = {name: math.nan if value is None else float(value) for name, value in scores.items()}
+    return Verdict(entry, numbers, outcome, why)

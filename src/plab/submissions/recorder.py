@@ -1,4 +1,4 @@
-"""A Gymnasium wrapper that keeps what an agent reaches: the best plan of each budget, in a file.
+"""Gymnasium wrappers that keep an agent's best plan within each budget in a file.
 
 from plab.submissions import record
 
@@ -21,20 +21,28 @@ from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
 from plab.report.series import BUDGETS
 from plab.results import ResultsError
-from plab.submissions.files import encode, write
-from plab.submissions.schema import SUFFIX, Digests, Entry, Submission, SubmissionError, configuration_of
+from plab.submissions.submission import (
+    SUFFIX,
+    Digests,
+    Entry,
+    Submission,
+    SubmissionError,
+    configuration_of,
+    encode,
+    write,
+)
 
 __all__ = ["Recorder", "VectorRecorder", "record"]
 
 _ledgers: dict[Path, _Ledger] = {}
-"""Those of this process: environments of one configuration share one, and their steps add up."""
+"""Ledgers of this process by file: environments of one configuration share one, and their steps add up."""
 
 Observation = TypeVar("Observation")
 Action = TypeVar("Action")
 
 
 class _Ledger:
-    """The best episodes of one configuration, one within each budget, in a file.
+    """Best episodes of one configuration, one within each budget, in a file.
 
     Attributes:
         steps: Environment steps simulated so far.
