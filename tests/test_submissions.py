@@ -153,7 +153,7 @@ def test_members_that_are_refused(path: Path) -> None:
     place = content.index(b"PK\x01\x02") + 8
     content[place : place + 2] = struct.pack("<H", 1)
     path.write_bytes(content)
-    assert "'secret' is encrypted" in why(read, path)
+    assert "encrypted" in why(read, path)
 
 
 def test_sizes_are_bounded_before_anything_is_unpacked(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

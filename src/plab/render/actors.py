@@ -143,7 +143,7 @@ class Target:
         """Hide the ghost where it runs along the plasticine's surface, not where it crosses it."""
 
         def density(points: np.ndarray) -> np.ndarray:
-            return sum(field.at(points) for field in bodies)
+            return np.sum([field.at(points) for field in bodies], axis=0)
 
         points, normals = self.mesh.points, self.mesh.point_normals
         here, ahead, behind = (density(points + way * _NEAR * normals) for way in (0.0, 1.0, -1.0))
