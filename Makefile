@@ -94,16 +94,16 @@ tex-packages:
 	apt-get install -y --no-install-recommends texlive-latex-base texlive-latex-recommended
 
 tables: $(VENV)/.run.stamp
-	$(BIN)/python -m plab.report tables --results $(RESULTS) --out $(REPORTS)/tables
+	$(BIN)/python -m plab.report tables $(RESULTS) --out $(REPORTS)/tables
 
 curves: $(VENV)/.run.stamp
-	$(BIN)/python -m plab.report curves --results $(RESULTS) --out $(REPORTS)/curves
+	$(BIN)/python -m plab.report curves $(RESULTS) --out $(REPORTS)/curves
 
 report: $(VENV)/.report.stamp
-	$(BIN)/python -m plab.report notebooks --results $(RESULTS) --out $(REPORTS)/notebooks
+	$(BIN)/python -m plab.report notebooks $(RESULTS) --out $(REPORTS)/notebooks
 
 html: $(VENV)/.report.stamp
-	$(BIN)/python -m plab.report html --results $(RESULTS) --out $(REPORTS)/html
+	$(BIN)/python -m plab.report html $(RESULTS) --out $(REPORTS)/html
 
 clean:
 	rm -rf $(VENV) build dist site src/*.egg-info .coverage htmlcov

@@ -12,7 +12,7 @@ import pytest
 
 from browsing import browser  # noqa: F401
 from plab.config import Config
-from plab.config.checks import cuda_is_usable
+from plab.config.compose import cuda_devices
 from plab.outcomes import Outcome
 from plab.runners.simulator_cache import SimulatorCache
 from refusals import ending, refusal, snapshot
@@ -122,6 +122,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if DEVICE == "cuda" and item.nodeid.startswith(OF_ANY_DEVICE):
             item.add_marker("gpu")
     needing = [item for item in items if "gpu" in item.keywords]
-    if needing and not cuda_is_usable():
+    if needing and not cuda_devices():
         for item in needing:
             item.add_marker(pytest.mark.skip(reason="no usable CUDA device"))

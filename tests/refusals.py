@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 
-from hydra.core.plugins import Plugins
-
-__all__ = ["ending", "plugin", "refusal", "snapshot"]
-
-
-def plugin() -> ModuleType:
-    """The module of plab's launchers as Hydra has imported it."""
-    Plugins.instance()
-    return sys.modules["hydra_plugins.plab_launcher"]
+__all__ = ["ending", "refusal", "snapshot"]
 
 
 def snapshot(folder: Path) -> dict[str, bytes | None]:

@@ -106,7 +106,7 @@ def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstratio
     worse = {v: 0.0 * load_actions("Move", v) for v in VARIANTS}
     for variant, actions in worse.items():
         save_actions("Move", variant, actions, MOVE_NAMES, 0.0)
-    assert main(["--task", "Move", "--from", str(results), *coarse]) == 0
+    assert main(["--task", "Move", str(results), *coarse]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()[-5:]]
     assert [float(row[-2]) > 0 for row in rows] == [True, False, False, False, False]
     assert np.array_equal(load_actions("Move", "1"), worse["1"])  # only --record writes

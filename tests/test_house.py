@@ -23,7 +23,7 @@ assert [main(["--help"]), main(["--cfg", "job"]), main(["task=Ropee"])] == [0, 0
 """
 
 RUNNING = """
-import plab.cli.next_steps
+import plab.cli.run
 import plab.runners.trajectory
 from plab.config import load_config
 from plab.results import RunFile
@@ -34,7 +34,7 @@ run.finish({"score": 0.5}, {})
 assert RunFile(cfg).result.score == 0.5
 """
 
-TABLES = "from plab.cli.report import main; assert main(['tables', '--results', 'example']) == 0"
+TABLES = "from plab.cli.report import main; assert main(['tables', 'example']) == 0"
 
 
 def test_imports_point_one_way(monkeypatch):

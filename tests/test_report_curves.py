@@ -190,7 +190,7 @@ def test_all_figures_are_drawn_with_embedded_fonts(folder: Path, tmp_path: Path,
     assert {value: len(paths) for value, paths in found.paths.items()} == {10.0: 2, 200.0: 2, 1000.0: 2}
 
     words = ["task=Rope,Move", "variant=1,2,3", "method=ppo,adam,sac"]
-    assert main(["curves", *words, "--results", str(folder), str(more), "--out", str(out)]) == 0
+    assert main(["curves", *words, str(folder), str(more), "--out", str(out)]) == 0
     assert "11 figures" in capsys.readouterr().out
     for suffix in (".pdf", ".png", ".json"):
         assert len({path.stem for path in out.glob(f"*{suffix}")} - {"runs"}) == 11

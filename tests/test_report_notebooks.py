@@ -153,7 +153,7 @@ def test_notebooks_show_what_there_is(name: str, results: Path, tmp_path: Path, 
 
 
 def test_a_folder_without_runs_is_named(tmp_path: Path, told) -> None:
-    words = ["--results", str(tmp_path), "--out", str(tmp_path / "out")]
+    words = [str(tmp_path), "--out", str(tmp_path / "out")]
     for form in ("notebooks", "html"):
         assert str(tmp_path) in told([form, *words], main)
 
@@ -163,7 +163,7 @@ def test_notebooks_become_pages(tmp_path: Path) -> None:
     """Execute all four in Jupyter's own way on what comes with plab."""
     pytest.importorskip("nbclient")
     out = tmp_path / "out"
-    assert main(["notebooks", "--results", "example", "--out", str(out)]) == 0
+    assert main(["notebooks", "example", "--out", str(out)]) == 0
     for name in NOTEBOOKS:
         page = (out / f"{name}.html").read_text()
         assert "data:image/png;base64" in page and "python -m plab.report notebooks" in page

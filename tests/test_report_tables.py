@@ -233,7 +233,7 @@ def test_two_values_of_a_setting_are_put_side_by_side(tmp_path: Path, told) -> N
     # Both are compared with what the paper has for the method; the key is no setting that needs a note.
     assert set(tables["paper"].cells.iloc[0][["Adam, lr 0.01", "Adam, lr 0.1"]]) == {"0.59 ± 0.13"}
     assert "method.lr" not in tables["ours"].notes[-1]
-    words = ["tables", "--results", str(tmp_path), "--split", "sim.grid_size"]
+    words = ["tables", str(tmp_path), "--split", "sim.grid_size"]
     assert "sim.grid_size" in told(words, main)
     runs = gather(tmp_path, "task=Rope", "variant=1", "method.lr=0.1", split="seed")
     assert [name for name in runs.methods if "seed" in name][:2] == ["adam seed=0", "adam seed=1"]
@@ -325,7 +325,7 @@ AGREEMENT = {
     "name", ["authors", *(pytest.param(n, marks=pytest.mark.nightly) for n in EXAMPLES if n != "authors")]
 )
 def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
-    assert main(["tables", "--results", name, "--out", str(tmp_path)]) == 0
+    assert main(["tables", name, "--out", str(tmp_path)]) == 0
     # The runs with other yield stresses are for a figure of their own.
     count = len(load(example_archive(name))) - 5 * (name == "release")
     tables = 16 if name == "authors" else 17  # no method of the paper: none of agreement

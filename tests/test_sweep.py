@@ -14,16 +14,15 @@ import pytest
 import plab.sweep.plan as planning
 import toy_runner
 from plab.cli.run import main
-from plab.config import Config, build_scene, conf_folder, load_config
+from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.outcomes import Outcome
 from plab.results import RunFile, config_hash, read, result_path
 from plab.results.locks import acquire
 from plab.runners.jobs import TogetherError
 from plab.sim.memory import batch_limit, kept_states
-from plab.sweep.carry import look_up
-from plab.sweep.compose import Refused, compose_jobs
 from plab.sweep.plan import plan
-from refusals import plugin
+from plab.sweep.running import compose_jobs, look_up
 from same_runs import raising
 from toy_runner import COARSE, WHY, assert_complete, computed, configs
 
@@ -259,17 +258,10 @@ def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> N
 
     queue = SimpleNamespace(launch=launch)
     launchers = SimpleNamespace(instantiate_launcher=lambda **settings: queue)
-    monkeypatch.setattr(plugin(), "Plugins", SimpleNamespace(instance=lambda: launchers))
+    monkeypatch.setattr("plab.sweep.running.Plugins", SimpleNamespace(instance=lambda: launchers))
     code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:2}")
     assert (code, counts) == (1, {"runs": 6, "not under way": 6})
     assert asked == [2] and "RuntimeError: nobody is there" in lines[0]
-
-
-def compose(overrides: list[str]):
-    from hydra import compose, initialize_config_dir
-
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        return compose("config", overrides=overrides, return_hydra_config=True)
 
 
 JOBS = [
@@ -283,7 +275,7 @@ JOBS = [
 
 @pytest.mark.parametrize("jobs", JOBS, ids=lambda jobs: jobs[0][0])
 def test_jobs_are_composed_as_hydra_does(jobs: list[list[str]]) -> None:
-    assert compose_jobs(jobs, compose) == [load_config(job) for job in jobs]
+    assert compose_jobs(jobs) == [load_config(job) for job in jobs]
 
 
 def test_mistaken_jobs_are_refused_one_by_one() -> None:
@@ -293,8 +285,8 @@ def test_mistaken_jobs_are_refused_one_by_one() -> None:
         "method.lrr=0.1": "method.lrr",
         "task=Ropee": "Ropee",
     }
-    good, *bad = compose_jobs([["variant=1"], *([override] for override in wrong)], compose)
+    good, *bad = compose_jobs([["variant=1"], *([override] for override in wrong)])
     assert good == load_config(["variant=1"])
     for one, (override, named) in zip(bad, wrong.items(), strict=True):
-        assert isinstance(one, Refused) and one.overrides == (override,)
-        assert named in one.reason and "\n" not in one.reason
+        assert isinstance(one, Outcome) and (one.title, one.status) == (override, "refused")
+        assert named in one.message and "\n" not in one.message

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import subprocess
@@ -12,7 +11,6 @@ import time
 from dataclasses import replace
 from multiprocessing import Pipe
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from hydra.core.config_store import ConfigStore
@@ -36,38 +34,10 @@ def test_a_process_keeps_to_the_kind_of_batch_whose_simulator_it_has() -> None:
     assert choose(waiting, move, []) == 1
     assert choose(waiting, None, [("Move", "rl")]) == 1
     assert choose(waiting, None, [("Move", "rl"), move]) == 0
-    # Else the kind with most batches per process that has it; one less where a process will be free soon.
     waiting = [[load_config([f"task={task}"])] for task in ("Move", "Rope", "Rope")]
-    assert choose(waiting, None, [move, rope]) == 1
-    assert choose(waiting, None, [move, rope, rope, rope]) == 0
-    assert choose(waiting, None, [move, rope], [rope]) == 0
-    assert choose(waiting, None, [move, rope], [move]) == 1
-    assert choose(waiting, move, [rope], [rope]) == 0
-    assert choose(waiting[:1], rope, [move], [move]) is None
-    assert choose(waiting[:1], rope, [writer], [writer]) == 0
-
-
-def test_the_time_left_and_the_time_of_compiling_follow_from_the_progress(monkeypatch) -> None:
-    monkeypatch.setattr(_Worker, "_start", lambda self: None)
-    worker, now = _Worker("0", "GPU 0"), [100.0]
-    monkeypatch.setattr("plab.sweep.gpus.time", SimpleNamespace(monotonic=lambda: now[0]))
-    said = [("progress", "Move", 0, 200, 10, done, "") for done in (1, 51)]
-    worker.process = SimpleNamespace(is_alive=lambda: True)
-    worker.connection = SimpleNamespace(
-        send=lambda _: None, poll=lambda: bool(said), recv=lambda: said.pop(0)
-    )
-    for first in (12.0, 1.0):
-        worker.give([load_config(["task=Move"])], "")
-        messages, now[0] = worker.messages(), now[0] + first
-        next(messages)
-        assert worker.setup == 12.0 and worker.left == math.inf
-        now[0] += 5.0
-        next(messages)
-        # Fifty steps took five seconds, 149 are left; the time of compiling is that of the first batch.
-        assert worker.setup == 12.0 and worker.left == pytest.approx(14.9)
-        said += [("ended", []), *(("progress", "Move", 0, 200, 10, done, "") for done in (1, 51))]
-        next(messages)
-        assert worker.batch == [] and worker.left == math.inf
+    assert choose(waiting, None, [move, writer]) == 1
+    assert choose(waiting, writer, [move, rope]) == 0
+    assert choose(waiting, None, [move, move, rope]) == 1
 
 
 @pytest.fixture

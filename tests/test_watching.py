@@ -93,10 +93,9 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     assert "Rope-v1 adam seed 0 build" in seen and "Rope-v1 adam seed 0 final evaluation" in seen
     assert re.search(r"compiling \w+, \d+ s", seen)
     assert re.search(r"loss [\d.]+ soft score \d\.\d{3} best", seen)
-    *_, score, picture, full = capsys.readouterr().out.splitlines()
+    *_, score, hint = capsys.readouterr().out.splitlines()
     assert score.startswith("finished: score 0.0000, results/Rope-v1/adam/seed0-")
-    assert f"python -m plab.render {score.rpartition(' ')[2]};" in picture
-    assert full.endswith("python -m plab.run task=Rope")
+    assert f"plab render {score.rpartition(' ')[2]};" in hint
     assert main([*argv, "progress=false"]) == 0
     assert capsys.readouterr().out == f"finished before: {score.partition(': ')[2]}\n"
 

@@ -29,7 +29,13 @@ LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>(?<![^\s(])'[^']{400})[^']+(
 
 
 class PlabError(Exception):
-    """Something that whoever uses plab can put right; the message is one line that says what would do."""
+    """A mistake that the user can put right; the message is one line with the remedy.
+
+    Attributes:
+        exit_code: Exit code of a command that raises it.
+    """
+
+    exit_code = 2
 
     def __str__(self) -> str:
         """Return the message, long values cut short."""

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plab.config import Config, ConfigError, build_scene
-from plab.config.words import shortened
 from plab.losses import make_terms
 from plab.objective import (
     Scores,
@@ -330,7 +329,7 @@ def _require_alike(cfgs: Sequence[Config]) -> None:
         raise ConfigError("there is no configuration: give one per environment, as load_config() makes them")
     for number, cfg in enumerate(cfgs):
         if not isinstance(cfg, Config):
-            raise ConfigError(f"configurations are what load_config() returns, not {shortened(repr(cfg))}")
+            raise ConfigError(f"configurations are what load_config() returns, not {cfg!r}")
         for part in ("protocol", "sim", "method.loss_weights", "method.loss_terms", "targets"):
             first, this = (_entries(attrgetter(part)(one)) for one in (cfgs[0], cfg))
             if differing := [f"{part}.{key}" for key in first | this if first.get(key) != this.get(key)]:

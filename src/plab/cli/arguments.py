@@ -1,12 +1,12 @@
-"""Arguments of command lines: a parser; numbers, words and files, checked before anything is computed."""
+"""Arguments of commands: a parser, options that several commands share, and types of values."""
 
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, ArgumentTypeError, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from plab.config.suite import suite_tasks
 from plab.errors import ArgumentError, pick
@@ -14,39 +14,99 @@ from plab.results.examples import EXAMPLES, resolve
 
 __all__ = [
     "Parser",
+    "add_forms",
+    "add_sources",
+    "add_tasks",
     "folder",
-    "name_flag",
     "positive",
-    "refuse_task",
+    "refuse_idle",
+    "require_writable",
     "results_source",
     "seed",
     "sources_and_words",
     "task_list",
     "to_write",
-    "told",
 ]
+
+SOURCE = f"folder, file or archive of results, or one of {', '.join(EXAMPLES)}"
 
 
 class Parser(ArgumentParser):
-    """The parser of a command line: a docstring is its help, a mistake an ArgumentError."""
+    """The parser of a command: a docstring is its help, a mistake an ArgumentError."""
 
-    def __init__(self, name: str, text: str) -> None:
-        """Make it without arguments, of a module's name and docstring: what it does, a blank line, whatever
+    def __init__(self, name: str, text: str, **options: Any) -> None:
+        """Make it without arguments, of a command's name and docstring: its purpose, a blank line, whatever
         helps, such as examples."""
-        what, _, more = text.partition("\n\n")
+        purpose, _, more = text.partition("\n\n")
         formed = RawDescriptionHelpFormatter
-        super().__init__(f"python -m {name}", description=what, epilog=more, formatter_class=formed)
+        super().__init__(f"plab {name}", description=purpose, epilog=more, formatter_class=formed, **options)
 
     def error(self, message: str) -> NoReturn:
-        """Raise what is wrong with the arguments, in one line; the usage is what ``--help`` is for."""
-        raise ArgumentError(name_flag(self, message))
+        """Raise the mistake in one line, with the flags that there are where one is unknown."""
+        unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
+        flags = [flag for action in self._actions for flag in action.option_strings if flag[:2] == "--"]
+        if unknown.startswith("-"):
+            message = f"unknown flag {unknown}; {pick(unknown, flags)}"
+        raise ArgumentError(message)
 
 
-def name_flag(parser: ArgumentParser, message: str) -> str:
-    """Return a parser's message with the flags that there are, where it is about one that there is not."""
-    unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0]
-    flags = [flag for action in parser._actions for flag in action.option_strings if flag.startswith("--")]
-    return f"unknown flag {unknown}; {pick(unknown, flags)}" if unknown.startswith("-") else message
+def add_sources(parser: ArgumentParser, words: str = "") -> None:
+    """Add the argument ``sources``: results, and words that choose among their runs, in any order."""
+    more = f"; {words}" if words else ""
+    what = f"{SOURCE} (default: results), by its name or as results=NAME{more}"
+    shown = "RESULTS | KEY=VALUE" if words else "RESULTS"
+    parser.add_argument("sources", nargs="*", metavar=shown, help=what)
+
+
+def add_tasks(parser: ArgumentParser) -> None:
+    """Add the option ``--task``, tasks of the suite, and the argument ``overrides``."""
+    parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
+    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+
+
+def refuse_idle(options: Namespace, idle: Sequence[str], what: str) -> None:
+    """Refuse overrides of task and variant, of which :func:`add_tasks` takes all, and of idle keys, which
+    have no effect on ``what``."""
+    # Imported here: other commands need no Hydra.
+    from plab.config.words import require_effect
+
+    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
+        raise ArgumentError(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    require_effect(options.overrides, idle, what)
+
+
+def add_forms(parser: ArgumentParser) -> Any:
+    """Add the options ``--csv`` and ``--json``, which set ``form``; ``text`` without either. Return the group
+    of options that exclude each other."""
+    form = parser.add_mutually_exclusive_group()
+    for name, what in (("csv", "CSV"), ("json", "JSON")):
+        what = f"print {what}, for scripts"
+        form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
+    parser.set_defaults(form="text")
+    return form
+
+
+def sources_and_words(
+    arguments: Sequence[str], default: str | None = "results"
+) -> tuple[list[Path], list[str]]:
+    """Tell results from words that choose among their runs, as ``task=Rope`` does.
+
+    Args:
+        arguments: Names of results, as they are or as ``results=NAME``, and words. A folder with an equals
+            sign in its name is a source if it exists.
+        default: Source where none is named; None: none.
+
+    Returns:
+        The sources, and the words.
+
+    Raises:
+        ArgumentError: If the name of a folder is empty.
+    """
+    words = [one for one in arguments if "=" in one and one[:8] != "results=" and not os.path.exists(one)]
+    named = [one.removeprefix("results=") for one in arguments if one not in words]
+    if not all(one.strip() for one in named):
+        raise ArgumentError("the name of a folder is empty: give one, or . for this one")
+    return [results_source(one) for one in named or [default] if one is not None], words
 
 
 def positive(text: str, least: int = 1) -> int:
@@ -61,25 +121,8 @@ def seed(text: str) -> int:
     return positive(text, 0)
 
 
-def sources_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Tell folders and archives from words that choose among their runs, as ``task=Rope`` does.
-
-    Returns:
-        The sources, named as they are or as ``results=NAME``, and the words. A folder with an equals sign in
-        its name is a source if it exists.
-
-    Raises:
-        ArgumentError: If the name of a folder is empty.
-    """
-    named = [argument.removeprefix("results=") for argument in arguments]
-    if not all(argument.strip() for argument in named):
-        raise ArgumentError("the name of a folder is empty: give one, or . for this one")
-    words = [name for name in named if name in arguments and "=" in name and not os.path.exists(name)]
-    return [name for name in named if name not in words], words
-
-
 def task_list(text: str) -> list[str]:
-    """Parse names of tasks with commas between them."""
+    """Read names of tasks with commas between them."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in suite_tasks():
@@ -91,7 +134,7 @@ def folder(text: str) -> Path:
     """Read the name of a folder: an empty one would be the working directory."""
     if not text.strip():
         raise ArgumentTypeError("is empty: give the name of a folder, or . for this one")
-    return Path(text)
+    return Path(text).expanduser()
 
 
 def results_source(text: str) -> Path:
@@ -117,13 +160,9 @@ def to_write(text: str) -> Path:
     return path
 
 
-def refuse_task(parser: ArgumentParser, overrides: Sequence[str]) -> None:
-    """Refuse overrides of task and variant, where all variants of the tasks of ``--task`` are taken."""
-    if taken := [word for word in overrides if word.partition("=")[0] in ("task", "variant")]:
-        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
-
-
-def told(error: OSError) -> str:
-    """Return one line about a file that could not be written after all; not every error names it."""
-    reason = error.strerror or str(error)
-    return reason if error.filename is None else f"cannot write {error.filename}: {reason}"
+def require_writable(path: Path) -> None:
+    """Raise ArgumentError if a file cannot be written, before anything is computed."""
+    try:
+        to_write(str(path))
+    except ArgumentTypeError as error:
+        raise ArgumentError(str(error)) from None

@@ -1,9 +1,9 @@
 """Replay and record demonstrations.
 
-python -m plab.demonstrations                          replay all and print a table
-python -m plab.demonstrations --task Torus,Rope        only these
-python -m plab.demonstrations --from results           the best runs of some results where they score more
-python -m plab.demonstrations --record                 record what is replayed and what it reaches
+plab demonstrations                          replay all and print a table
+plab demonstrations --task Torus,Rope        only these
+plab demonstrations results                  the best runs of some results where they score more
+plab demonstrations --record                 record what is replayed and what it reaches
 
 More overrides of the configuration, such as sim.device=cuda, may follow.
 """
@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from plab.cli.arguments import Parser, refuse_task, results_source, task_list, to_write
+from plab.cli.arguments import Parser, add_tasks, refuse_idle, sources_and_words, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import print_table, write_markdown
 from plab.config import Config, ConfigError, build_scene, load_config
-from plab.config.checks import check_sources
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.config.words import IDLE, require_effect
+from plab.config.compose import check_sources
+from plab.config.suite import SUITE_VARIANTS
+from plab.config.words import IDLE
 from plab.demonstrations import action_names, known_actions, save_actions
 from plab.objective import Scores
 from plab.problem import Problem
@@ -37,8 +37,8 @@ __all__ = ["ReplayedDemonstration", "main", "replay"]
 HEADING = """\
 # Demonstrations
 
-Look up what the best actions known score in each variant, in the hard contact model; made by `python -m
-plab.demonstrations --markdown docs/demonstrations.md`, which prints more.
+Look up what the best actions known score in each variant, in the hard contact model; made by `plab
+demonstrations --markdown docs/demonstrations.md`, which prints more.
 [suite.md](suite.md#demonstrations) explains.
 
 """
@@ -56,7 +56,7 @@ class ReplayedDemonstration:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     args = _parse(argv)
     rows = []
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     ]
     for cfgs in tasks:
         check_sources(cfgs[0])
-    runs = [] if args.source is None else readable_rows(args.source)[0]
+    runs = readable_rows(args.sources)[0] if args.sources else []
     for cfgs in tasks:
         own = [f"task={cfgs[0].task.name}", f"variant={cfgs[0].variant}"]
         if args.record and build_scene(cfgs[0]) != build_scene(load_config(own)):
@@ -138,15 +138,12 @@ def _show(rows: Sequence[dict[str, object]], path: Path | None) -> None:
         write_markdown(path, HEADING, ("task", "target", *SUITE_VARIANTS), by_task.values())
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser("plab.demonstrations", __doc__)
-    parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("demonstrations", __doc__)
+    add_tasks(parser)
     parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
-    what = "of these results the best runs, where they score more than what is known (geometric targets)"
-    parser.add_argument("--from", dest="source", type=results_source, metavar="RESULTS", help=what)
     parser.add_argument("--record", action="store_true", help="record what is replayed")
     options = parser.parse_intermixed_args(argv)
-    refuse_task(parser, options.overrides)
-    require_effect(options.overrides, ("method", "seed", *IDLE), "demonstrations")
+    options.sources, options.overrides = sources_and_words(options.overrides, default=None)
+    refuse_idle(options, ("method", "seed", *IDLE), "demonstrations")
     return options

@@ -1,7 +1,7 @@
 """The rollout of a run's best actions, or of the best actions known for a task, for ParaView or Blender.
 
-python -m plab.export RESULT_FILE [--format vtk|ply] [--output FOLDER]
-python -m plab.export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
+plab export RESULT_FILE [--format vtk|ply] [--output FOLDER]
+plab export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
 
 What is written into the folder:
   vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
@@ -9,8 +9,8 @@ What is written into the folder:
 Both hold the target's surface, too.
 
 EXAMPLES
-  python -m plab.export results/Rope-v1/adam/seed0-12ab34cd.h5
-  python -m plab.export task=Torus variant=2 --format ply --output torus
+  plab export results/Rope-v1/adam/seed0-12ab34cd.h5
+  plab export task=Torus variant=2 --format ply --output torus
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from plab.cli.arguments import folder
+from plab.cli.arguments import folder, require_writable
 from plab.cli.command import command_line
-from plab.cli.rollouts import make_parser, require_writable, rollout, settle
+from plab.cli.rollouts import make_parser, rollout, settle
 from plab.render.graphics import RenderError, require_packages
 
 __all__ = ["main"]
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     arguments = _parse(argv)
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
@@ -46,9 +46,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(output)
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without simulating."""
-    parser = make_parser("plab.export", __doc__, "the series")
+    parser = make_parser("export", __doc__, "the series")
     add = parser.add_argument
     add("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
     add("--output", type=folder, metavar="FOLDER", help="by default named like the result or the task")

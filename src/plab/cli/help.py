@@ -13,18 +13,18 @@ from plab.families import schemas
 __all__ = ["full_help_text", "help_text"]
 
 _USAGE = """\
-python -m plab.run [KEY=VALUE ...] [-m]
+plab run [KEY=VALUE ...] [-m]
 
 Runs one task, variant, method and seed of PlasticineLab; writes one result file into results_dir.
 A run that was stopped goes on when the same command is given again; one that has finished is not
 repeated.
 
 EXAMPLES
-  python -m plab.run task=Rope method=adam seed=0
-  python -m plab.run task=Move variant=3 method=gd method.lr=50
-  python -m plab.run sim.particles_scale=0.2 method.iterations=20      a quick try
-  python -m plab.run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs that share a simulator
-  python -m plab.run +experiment=yield_ablation                a sweep that a file describes
+  plab run task=Rope method=adam seed=0
+  plab run task=Move variant=3 method=gd method.lr=50
+  plab run sim.particles_scale=0.2 method.iterations=20      a quick try
+  plab run -m variant=1,2,3,4,5 seed=0,1,2           fifteen runs that share a simulator
+  plab run +experiment=yield_ablation                a sweep that a file describes
 """
 
 _FLAGS = """\
@@ -38,12 +38,12 @@ FLAGS
 
 _MORE_EXAMPLES = """\
 MORE EXAMPLES
-  python -m plab.run sim=reference sim.device=cuda             float64 on the GPU
-  python -m plab.run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
-  python -m plab.run -m variant=random 'seed_scene=range(10)'  ten drawn configurations
-  python -m plab.run task=Torus method=ppo method.profile=paper            reinforcement learning
-  python -m plab.run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
-  python -m plab.run +experiment=smoke hydra/launcher=batch_joblib         in several processes
+  plab run sim=reference sim.device=cuda             float64 on the GPU
+  plab run 'task.variants.1.manipulators.pillar.position=[0.4,0,0.5]'
+  plab run -m variant=random 'seed_scene=range(10)'  ten drawn configurations
+  plab run task=Torus method=ppo method.profile=paper            reinforcement learning
+  plab run --config-dir mine task=Dumbbell           the task of mine/task/Dumbbell.yaml
+  plab run +experiment=smoke hydra/launcher=batch_joblib         in several processes
 """
 
 _OFTEN = (

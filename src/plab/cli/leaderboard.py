@@ -1,7 +1,7 @@
 """One static page from a folder of submissions: tracks, equal budgets, one table for each protocol.
 
-python -m plab.leaderboard submissions
-python -m plab.leaderboard submissions --out public/leaderboard
+plab leaderboard submissions
+plab leaderboard submissions --out public/leaderboard
 
 Run plab.verify on the folder before: what it has kept is shown. The page is index.html; it needs no server.
 """
@@ -9,7 +9,6 @@ Run plab.verify on the folder before: what it has kept is shown. The page is ind
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,18 +30,17 @@ _PACKAGE = "plab.submissions"
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    parser = Parser("plab.leaderboard", __doc__)
+    parser = Parser("leaderboard", __doc__)
     parser.add_argument("folder", type=folder, help="folder of submissions")
     what = "settings of a leaderboard of your own, such as sim.grid_size=32"
     parser.add_argument("overrides", nargs="*", help=what)
     what = "folder to write to (default: reports/leaderboard)"
     parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
-    options = parser.parse_intermixed_args(arguments)
+    options = parser.parse_intermixed_args(argv)
     origin = {
-        "command": shlex.join(["python", "-m", "plab.leaderboard", *arguments]),
+        "command": shlex.join(["plab", "leaderboard", *argv]),
         "plab": plab.__version__,
         "physics": PHYSICS_VERSION,
         "overrides": options.overrides,

@@ -12,18 +12,16 @@ plab targets                              targets of tasks
 plab submit, verify, leaderboard          results to publish, and tables of them
 plab bench speed                          benchmarks of speed, accuracy and stability
 
-Each has a --help of its own, and is also a module: python -m plab.run.
+Each has a --help of its own.
 """
 
 from __future__ import annotations
 
-import gc
 import importlib
 import sys
 from collections.abc import Sequence
 
-from plab.cli.command import command_line
-from plab.errors import ArgumentError, pick
+from plab.errors import PlabError, pick, tell
 
 __all__ = ["COMMANDS", "main"]
 
@@ -44,16 +42,14 @@ COMMANDS = (
 )
 
 
-@command_line
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand; return its exit code."""
-    # Compilation allocates many long-lived objects: collecting them often takes seconds.
-    gc.set_threshold(100_000)
     name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
         print((__doc__ or "").partition("\n\n")[2].rstrip())
         return 0
     if name not in COMMANDS:
-        raise ArgumentError(f"unknown command {name}; {pick(name, COMMANDS)}")
+        tell(f"unknown command {name}; {pick(name, COMMANDS)}")
+        return PlabError.exit_code
     module = importlib.import_module("plab.bench" if name == "bench" else f"plab.cli.{name}")
     return int(module.main(rest))

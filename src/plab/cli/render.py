@@ -1,10 +1,10 @@
 """Pictures and films of a run's best actions, of the best actions known for a task, or of all tasks.
 
-python -m plab.render RESULT_FILE [--output FILE]
-python -m plab.render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
-python -m plab.render KEY=VALUE ... [--output FILE]
-python -m plab.render --contact-sheet FILE [KEY=VALUE ...]
-python -m plab.render --film-strip FILE [KEY=VALUE ...]
+plab render RESULT_FILE [--output FILE]
+plab render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
+plab render KEY=VALUE ... [--output FILE]
+plab render --contact-sheet FILE [KEY=VALUE ...]
+plab render --film-strip FILE [KEY=VALUE ...]
 
 Draws the best actions of a run, those of the run with the highest score in folders and archives, the best
 actions known for a task, start and target of every task and variant, or a few frames of the best actions
@@ -15,9 +15,9 @@ The suffix of FILE decides what is written:
   .gif, .mp4   the rollout, with the target's ghost in it
 
 EXAMPLES
-  python -m plab.render results/Rope-v1/adam/seed0-12ab34cd.h5
-  python -m plab.render example task=Rope method=adam --output rope.gif
-  python -m plab.render task=Torus variant=2 --output torus.gif
+  plab render results/Rope-v1/adam/seed0-12ab34cd.h5
+  plab render example task=Rope method=adam --output rope.gif
+  plab render task=Torus variant=2 --output torus.gif
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from plab.cli.arguments import folder
+from plab.cli.arguments import folder, require_writable
 from plab.cli.command import command_line
-from plab.cli.rollouts import WITHOUT_EFFECT, make_parser, require_writable, rollout, settle
+from plab.cli.rollouts import WITHOUT_EFFECT, make_parser, rollout, settle
 from plab.config import choices, load_config
 from plab.config.words import require_effect
 from plab.render.graphics import RenderError, require_graphics
@@ -46,7 +46,7 @@ _LARGEST = 4096
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     arguments = _parse(argv)
     require_graphics()
@@ -102,13 +102,13 @@ def _draw_film_strip(arguments: argparse.Namespace) -> None:
 # -------------------------------------------------------------------------------------------------- arguments
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without drawing.
 
     Adds ``draw``, what carries them out; ``all_tasks``, whether it shows all tasks; and what
     :func:`plab.cli.rollouts.settle` adds.
     """
-    parser = make_parser("plab.render", __doc__, "a film")
+    parser = make_parser("render", __doc__, "a film")
     add = parser.add_argument
     add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
@@ -122,11 +122,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         if path:
             _check_sheet(arguments, option, path, suffix)
             arguments.output, arguments.draw, arguments.all_tasks = path, draw, True
-            break
-    else:
-        settle(arguments, ".png")
-        arguments.draw, arguments.all_tasks = _draw_rollout, False
+            require_writable(path)
+            return arguments
+    settle(arguments, ".png")
     require_writable(arguments.output)
+    arguments.draw, arguments.all_tasks = _draw_rollout, False
     return arguments
 
 

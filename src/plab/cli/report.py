@@ -1,22 +1,21 @@
 """The paper's tables and curves, notebooks and a page of all results, from result files alone.
 
-python -m plab.report tables --results results --out reports/tables
-python -m plab.report curves --results runs.plab.zip.xz task=Rope,Move seed=0,1,2
-python -m plab.report notebooks --results example
-python -m plab.report tables --results first second --split folder
-python -m plab.report html --results example         real runs that come with plab
+plab report tables results --out reports/tables
+plab report curves runs.plab.zip.xz task=Rope,Move seed=0,1,2
+plab report notebooks example
+plab report tables first second --split folder
+plab report html example                   real runs that come with plab
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from plab.cli.arguments import Parser, folder, sources_and_words
+from plab.cli.arguments import Parser, add_sources, folder, sources_and_words
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.errors import tell
@@ -43,15 +42,14 @@ _QUIET = 2
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    options = _parse(arguments)
-    command = shlex.join(["python", "-m", "plab.report", *arguments])
+    options = _parse(argv)
+    command = shlex.join(["plab", "report", *argv])
     out = options.out or Path("reports") / options.what
     before, quiet = None, 0
     while True:
-        runs = collect(options.results, select(options.words, NAMES), options.split)
+        runs = collect(options.sources, select(options.words, NAMES), options.split)
         quiet = 0 if runs.under_way else quiet + 1
         now = (runs.digest, quiet == 0)
         if now != before and not (options.follow and runs.table.empty and not quiet):
@@ -72,14 +70,14 @@ def _make_tables(runs: Runs, options: argparse.Namespace, out: Path, command: st
 
 
 def _make_curves(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
-    ablation = collect_ablation(options.results, select(options.words, NAMES), YIELD_STRESS)
+    ablation = collect_ablation(options.sources, select(options.words, NAMES), YIELD_STRESS)
     errors = None if options.accuracy is None else measured(options.accuracy, ACCURACY)
     return f"{len(write_curves(runs, ablation, out, command, errors))} figures"
 
 
 def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
-    _require_runs(runs, options.results)
-    given = {"RESULTS": [str(source) for source in options.results], "WORDS": options.words}
+    _require_runs(runs, options.sources)
+    given = {"RESULTS": [str(source) for source in options.sources], "WORDS": options.words}
     given |= {"BENCH": str(options.bench), "COMMAND": command}
     require_packages()
     with show_progress("notebooks", 0, len(NOTEBOOKS), plain_every=1) as report:
@@ -87,7 +85,7 @@ def _make_notebooks(runs: Runs, options: argparse.Namespace, out: Path, command:
 
 
 def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str) -> str:
-    _require_runs(runs, options.results)
+    _require_runs(runs, options.sources)
     page = Page(runs, out, origin(runs, command, deep=False), every_run=options.every_run)
     wanted = lacking(page.shown, out) if options.pictures else {}
     # It is complete but for pictures before the first of them is drawn.
@@ -115,21 +113,19 @@ def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:
     if runs.table.empty:
         where = ", ".join(map(str, sources))
         raise ResultsError(
-            f"there are no finished runs to show in {where}: python -m plab.run task=Move makes one, "
-            "and --results example shows those that come with plab"
+            f"there are no finished runs to show in {where}: plab run task=Move makes one, "
+            "and results=example shows those that come with plab"
         )
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("plab.report", __doc__)
+    parser = Parser("report", __doc__)
     parser.add_argument("what", choices=list(_MAKERS), help="what to make")
-    parser.add_argument("words", nargs="*", help="runs to take, e.g. task=Rope,Move seed=0,1,2")
-    what = f"folder of results, archive, or several; {', '.join(EXAMPLES)}: real runs (default: results)"
-    parser.add_argument("--results", nargs="+", default=["results"], help=what)
+    add_sources(parser, "runs to take, e.g. task=Rope,Move seed=0,1,2")
     parser.add_argument("--out", type=folder, help="folder to write to (default: reports/<what>)")
-    what = "file written by python -m plab.bench.speed --paper --csv, for the table of times"
+    what = "file written by plab bench speed --paper --csv, for the table of times"
     parser.add_argument("--speed", type=Path, help=what)
-    what = "file written by python -m plab.bench.accuracy, for the figure of run time against error"
+    what = "file written by plab bench accuracy, for the figure of run time against error"
     parser.add_argument("--accuracy", type=Path, help=what)
     what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv; example: those that come with "
     what += "plab (default: reports/bench; example where the results come with plab)"
@@ -143,13 +139,10 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     what = "html: picture and film of every method's best run, which takes several times as long"
     parser.add_argument("--every-run", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
-    # Words after --results are taken for folders.
-    sources, words = sources_and_words(options.results)
-    options.words += words
-    sources = sources or ["results"]
+    options.sources, options.words = sources_and_words(options.sources)
     if options.bench is None:
-        options.bench = measurements("reports/bench" if set(sources) - set(EXAMPLES) else EXAMPLES[0])
-    options.results = [resolve(item) for item in sources]
+        shipped = options.sources[0] in map(resolve, EXAMPLES)
+        options.bench = measurements(EXAMPLES[0] if shipped else "reports/bench")
     return options
 
 

@@ -1,10 +1,10 @@
 """Show, query, check, pack and unpack result files.
 
-python -m plab.results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
-python -m plab.results sql "select ..." [results ...]         any question to the tables of docs/results.md
-python -m plab.results check [results ...]                    check every file against the schema
-python -m plab.results pack results --output runs.plab.zip.xz    put finished runs into one small file
-python -m plab.results unpack runs.plab.zip.xz --output folder   make files of them again
+plab results scores [results] [task=...] --keys a,b  runs with their scores, and settings as columns
+plab results sql "select ..." [results ...]         any question to the tables of docs/results.md
+plab results check [results ...]                    check every file against the schema
+plab results pack results --output runs.plab.zip.xz    put finished runs into one small file
+plab results unpack runs.plab.zip.xz --output folder   make files of them again
 """
 
 from __future__ import annotations
@@ -13,14 +13,21 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from plab.cli.arguments import Parser, folder, positive, results_source, sources_and_words
+from plab.cli.arguments import (
+    Parser,
+    add_forms,
+    add_sources,
+    folder,
+    positive,
+    results_source,
+    sources_and_words,
+)
 from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.errors import tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
-from plab.results.examples import EXAMPLES, resolve
 from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError
 from plab.results.table import readable_rows
@@ -31,7 +38,7 @@ SELECTABLE = ("task", "variant", "method", "seed", "status")
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Run the command line.
 
     Returns:
@@ -41,104 +48,72 @@ def main(argv: Sequence[str] | None = None) -> int:
     return options.run(options)
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser("plab.results", __doc__)
-    commands = {
-        "scores": _scores_arguments,
-        "sql": _sql_arguments,
-        "check": _check_arguments,
-        "pack": _pack_arguments,
-        "unpack": _unpack_arguments,
-    }
-    parser.add_argument("command", choices=commands, help="what to do; it has a --help of its own")
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("results", __doc__)
+    parser.add_argument("command", choices=_COMMANDS, help="what to do; it has a --help of its own")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
-    arguments = commands[first.command]
+    run, add_arguments = _COMMANDS[first.command]
     # Not by subparsers: they cannot have words on both sides of an option.
-    command = Parser(f"plab.results {first.command}", arguments.__doc__ or "")
-    arguments(command)
+    command = Parser(f"results {first.command}", add_arguments.__doc__ or "")
+    add_arguments(command)
+    command.set_defaults(run=run)
     return command.parse_intermixed_args(first.arguments)
 
 
 def _scores_arguments(parser: Parser) -> None:
     """Print runs with their scores, a line each."""
-    what = f"{_SOURCES} (default: results), and runs: task=Rope,Move seed=0,1,2; by default those finished"
-    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
+    add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default those finished")
     what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
     parser.add_argument("--keys", type=_names, default=[], help=what)
     parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
     parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
-    parser.set_defaults(run=_scores)
-    _add_forms(parser)
+    add_forms(parser)
 
 
 def _sql_arguments(parser: Parser) -> None:
     """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
     parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
-    _add_sources(parser)
-    parser.set_defaults(run=_sql)
-    _add_forms(parser)
-
-
-def _add_forms(parser: Parser) -> None:
-    form = parser.add_mutually_exclusive_group()
-    for name, what in (("csv", "CSV"), ("json", "a JSON list of objects")):
-        what = f"print {what} instead of a text"
-        form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
-    parser.set_defaults(form="text")
-
-
-def _add_sources(parser: Parser) -> None:
-    what = f"each a {_SOURCES} (default: results)"
-    parser.add_argument("sources", nargs="*", type=results_source, default=[Path("results")], help=what)
-
-
-def _names(text: str) -> list[str]:
-    return [name for name in text.split(",") if name]
-
-
-_SOURCES = f"folder, file, archive, or one of {', '.join(EXAMPLES)}"
+    add_sources(parser)
+    add_forms(parser)
 
 
 def _check_arguments(parser: Parser) -> None:
     """Check every file against the schema; exit code 1 if anything is wrong."""
-    _add_sources(parser)
-    parser.set_defaults(run=_check)
+    add_sources(parser)
 
 
 def _pack_arguments(parser: Parser) -> None:
     """Put runs into one small file."""
-    what = (
-        f"each a {_SOURCES} (default: results); runs to take: task=Rope,Move status=all (default: finished)"
-    )
-    parser.add_argument("arguments", nargs="*", metavar="results | name=value", help=what)
+    add_sources(parser, "runs to take: task=Rope,Move status=all (default: finished)")
     parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
     parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
     what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
     parser.add_argument("--digits", type=positive, help=what)
     parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
-    parser.set_defaults(run=_pack)
 
 
 def _unpack_arguments(parser: Parser) -> None:
     """Make files of the runs of an archive; files that are there stay."""
     parser.add_argument("archive", type=results_source, help="archive to read")
     parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
-    parser.set_defaults(run=_unpack)
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
 
 
 def _scores(options: argparse.Namespace) -> int:
-    sources, words = sources_and_words(options.arguments)
+    sources, words = sources_and_words(options.sources)
     chosen = _finished_unless_said(select(words, SELECTABLE))
-    given = list(map(resolve, sources or ["results"]))
-    table, unreadable = scores(given, chosen, options.keys, options.sort, descending=options.descending)
+    table, unreadable = scores(sources, chosen, options.keys, options.sort, descending=options.descending)
     _tell_left_out(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
     return 0
 
 
 def _sql(options: argparse.Namespace) -> int:
-    columns, rows, unreadable = query(options.sources, options.query)
+    columns, rows, unreadable = query(sources_and_words(options.sources)[0], options.query)
     _tell_left_out(unreadable)
     print_table(columns, rows, options.form)
     return 0
@@ -151,7 +126,7 @@ def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
 
 def _check(options: argparse.Namespace) -> int:
     count = wrong = 0
-    for source in options.sources:
+    for source in sources_and_words(options.sources)[0]:
         for _, fault in check(source):
             count += 1
             if fault is not None:
@@ -162,8 +137,8 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _pack(options: argparse.Namespace) -> int:
-    names, words = sources_and_words(options.arguments)
-    sources, chosen = list(map(resolve, names or ["results"])), select(words, SELECTABLE)
+    sources, words = sources_and_words(options.sources)
+    chosen = select(words, SELECTABLE)
     for text in chosen.choices.get("status", ()):
         if text not in (*STATUSES, "all"):
             raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
@@ -199,3 +174,13 @@ def _unpack(options: argparse.Namespace) -> int:
     there = f", {kept} there already" if kept else ""
     print(f"{options.output}: {written} run(s) written{there}")
     return 0
+
+
+_COMMANDS = {
+    "scores": (_scores, _scores_arguments),
+    "sql": (_sql, _sql_arguments),
+    "check": (_check, _check_arguments),
+    "pack": (_pack, _pack_arguments),
+    "unpack": (_unpack, _unpack_arguments),
+}
+"""Functions that carry out a command, and that add its arguments."""

@@ -1,8 +1,8 @@
 """Pack what a method produced into one file for the leaderboard.
 
-python -m plab.submit recordings --card card.yaml --output mine.plabsub.zip
-python -m plab.submit results method=adam seed=0 --card card.yaml --output adam.plabsub.zip
-python -m plab.submit --policy Move=move.pt --steps 100000 --card card.yaml --output policy.plabsub.zip
+plab submit recordings --card card.yaml --output mine.plabsub.zip
+plab submit results method=adam seed=0 --card card.yaml --output adam.plabsub.zip
+plab submit --policy Move=move.pt --steps 100000 --card card.yaml --output policy.plabsub.zip
 
 Recordings are written by plab.submissions.record; words such as method=adam choose among results. A policy
 is run here, to see what it reaches; overrides such as sim.device=cuda may follow.
@@ -18,7 +18,6 @@ from plab.cli.arguments import Parser, seed, sources_and_words, to_write
 from plab.cli.command import command_line
 from plab.config.selection import select
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.results.examples import resolve
 from plab.submissions.collecting import from_policies, from_sources
 from plab.submissions.submission import (
     CARD_BYTES,
@@ -37,7 +36,7 @@ _NAMES = ("task", "variant", "method", "seed")
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Run the command line; return the exit code."""
     options = _parse(argv)
     try:
@@ -45,8 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
     except OSError as error:
         raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
-    folders, words = sources_and_words(options.arguments)
-    sources = [resolve(folder) for folder in folders]
+    sources, words = sources_and_words(options.sources, default=None)
     if options.policy:
         variants = (*SUITE_VARIANTS, *UNSEEN) if options.unseen else SUITE_VARIANTS
         entries, files = from_policies(dict(options.policy), variants, options.steps, words)
@@ -62,10 +60,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser("plab.submit", __doc__)
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("submit", __doc__)
     what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
-    parser.add_argument("arguments", nargs="*", help=what)
+    parser.add_argument("sources", nargs="*", metavar="RESULTS | KEY=VALUE", help=what)
     parser.add_argument("--card", type=Path, required=True, help="YAML file about the method")
     parser.add_argument("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
     what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
@@ -75,7 +73,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     what = f"with --policy: act in the {len(UNSEEN)} unseen configurations of the task, too"
     parser.add_argument("--unseen", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
-    sources = [word for word in options.arguments if "=" not in word]
+    sources, _ = sources_and_words(options.sources, default=None)
     if bool(options.policy) == bool(sources):
         parser.error("give either recordings or results, or --policy")
     if bool(options.policy) != (options.steps is not None):

@@ -1,9 +1,9 @@
 """Build, cache and describe the targets of the suite.
 
-python -m plab.targets                       all fifty
-python -m plab.targets --task Torus,Rope     only these
-python -m plab.targets --rebuild             simulate even what is cached
-python -m plab.targets --csv moments.csv     write what is printed to a file, too
+plab targets                       all fifty
+plab targets --task Torus,Rope     only these
+plab targets --rebuild             simulate even what is cached
+plab targets --csv moments.csv     write what is printed to a file, too
 
 More overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it describes the
 targets of the original release.
@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from plab.cli.arguments import Parser, refuse_task, task_list, to_write
+from plab.cli.arguments import Parser, add_tasks, refuse_idle, to_write
 from plab.cli.command import command_line
 from plab.cli.tables import print_table, write_csv
 from plab.config import build_scene, load_config
-from plab.config.checks import check_sources
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.config.words import IDLE, require_effect
+from plab.config.compose import check_sources
+from plab.config.suite import SUITE_VARIANTS
+from plab.config.words import IDLE
 from plab.files import cache_dir
 from plab.objective import mass_change, target_sdf
 from plab.problem import make_targets
@@ -35,7 +35,7 @@ __all__ = ["main", "moments"]
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     args = _parse(argv)
     table = pd.concat([moments(task, args.overrides, args.rebuild) for task in args.task])
@@ -97,15 +97,13 @@ def _write(table: pd.DataFrame, path: Path) -> None:
     write_csv(path, [table.columns, *table.itertuples(index=False, name=None)], digits=6)
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser("plab.targets", __doc__)
-    parser.add_argument("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
-    parser.add_argument("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("targets", __doc__)
+    add_tasks(parser)
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
     parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
     options = parser.parse_intermixed_args(argv)
-    refuse_task(parser, options.overrides)
-    require_effect(options.overrides, ("method", "seed", "sim.memory_mb", *IDLE), "targets")
+    refuse_idle(options, ("method", "seed", "sim.memory_mb", *IDLE), "targets")
     from_files = any(word.partition("=")[0] == "targets.source" for word in options.overrides)
     if options.rebuild and from_files:
         parser.error("--rebuild has no effect with targets.source: leave one of them out")

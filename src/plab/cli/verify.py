@@ -1,7 +1,7 @@
 """Simulate submissions again and say what they really score, in float32 and in float64.
 
-python -m plab.verify mine.plabsub.zip
-python -m plab.verify submissions --run-policies sim.device=cuda
+plab verify mine.plabsub.zip
+plab verify submissions --run-policies sim.device=cuda
 
 Exit code: 0 if all claims hold, 1 if one does not or was not run, 2 if a file cannot be judged. What was
 found is kept beside each file, for plab.leaderboard. Plans are data; policies are programs of other people,
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import plab
 from plab.cli.arguments import Parser, sources_and_words
-from plab.cli.command import command_line, complain
+from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.errors import PlabError, tell
 from plab.scenes import PRECISIONS
@@ -30,18 +30,19 @@ EXIT_NOT_TRUE = 1
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Run the command line; return the exit code."""
     options = _parse(argv)
-    sources, words = sources_and_words(options.arguments)
+    sources, words = sources_and_words(options.arguments, default=None)
     precisions = PRECISIONS[:1] if options.float32 else PRECISIONS
     codes = []
-    for path in _files([Path(source) for source in sources]):
+    for path in _files(sources):
         try:
             codes.append(_run(path, words, options.run_policies, precisions))
         except PlabError as error:
             # A file that cannot be judged does not keep the others from it.
-            codes.append(complain(str(error)))
+            tell(str(error))
+            codes.append(error.exit_code)
     return max(codes)
 
 
@@ -90,8 +91,8 @@ def _show(submission: Submission, verification: Verification, precisions: Sequen
     print_table(("configuration", "steps", "claimed", *precisions, "difference"), rows)
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser("plab.verify", __doc__)
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
+    parser = Parser("verify", __doc__)
     what = (
         f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda or targets.source=..."
     )

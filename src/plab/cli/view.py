@@ -1,13 +1,13 @@
 """A page on which a run's best actions, or the best actions known for a task, are played in 3-D.
 
-python -m plab.view RESULT_FILE [--output FILE.html]
-python -m plab.view KEY=VALUE ... [--output FILE.html]
+plab view RESULT_FILE [--output FILE.html]
+plab view KEY=VALUE ... [--output FILE.html]
 
 It plays in any browser: particles, manipulators, and the target as a ghost.
 
 EXAMPLES
-  python -m plab.view results/Rope-v1/adam/seed0-12ab34cd.h5
-  python -m plab.view task=Torus variant=2 --output torus.html
+  plab view results/Rope-v1/adam/seed0-12ab34cd.h5
+  plab view task=Torus variant=2 --output torus.html
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from plab.cli.arguments import folder
+from plab.cli.arguments import folder, require_writable
 from plab.cli.command import command_line
-from plab.cli.rollouts import make_parser, require_writable, rollout, settle
+from plab.cli.rollouts import make_parser, rollout, settle
 from plab.render.graphics import RenderError, require_packages
 
 __all__ = ["main"]
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Run the command line."""
     arguments = _parse(argv)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
@@ -41,9 +41,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     print(arguments.output)
 
 
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+def _parse(argv: Sequence[str]) -> argparse.Namespace:
     """Return the arguments, checked as far as can be done without simulating."""
-    parser = make_parser("plab.view", __doc__, "the page")
+    parser = make_parser("view", __doc__, "the page")
     parser.add_argument(
         "--output", type=folder, metavar="FILE", help="by default a .html named like the result or the task"
     )

@@ -1,4 +1,4 @@
-"""The configuration of a run: composed from files and overrides, checked, and turned into a scene.
+"""Composition of a run's configuration from files and overrides, its checks, and its scene.
 
 ``conf/*.yaml`` holds every number, the dataclasses beside this module say which keys there are. Hydra
 composes the files, perhaps with a folder of the user's, and the overrides; :func:`finish` merges the chosen
@@ -8,40 +8,56 @@ OmegaConf.
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
+import pickle
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
-from hydra import compose, initialize_config_dir
+from hydra import version
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.types import OverrideType
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.composer import GROUPS, Composer
 from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.run import Config
 from plab.config.suite import conf_folder
 from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
-from plab.config.words import parse, quote_folders, require_few, shortened, unusable, word_list
+from plab.config.words import parse, prepared, quoted
 from plab.errors import ConfigError, pick
 from plab.families import family, schemas
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3
+from plab.targets import check_target, load_release_target
 
 __all__ = [
     "EXPERIMENT",
     "GROUPS",
     "build_scene",
     "check_overrides",
+    "check_sources",
     "choices",
+    "compose",
+    "compose_with_hydra",
+    "cuda_devices",
     "drawn_configs",
     "finish",
+    "hydra_app",
     "load_config",
+    "require_runnable",
 ]
+
+GROUPS = ("task", "method", "protocol", "sim")
+"""Sections of the configuration that are a choice of one file."""
 
 EXPERIMENT = "experiment"
 """Group of files that preset any keys and sweeps over them; added by ``+experiment=``."""
@@ -58,6 +74,23 @@ ConfigStore.instance().store(name="plab_schema", node=_Composed)
 # A group of its own, so that `method=` offers real methods only.
 for _name, _schema in schemas():
     ConfigStore.instance().store(group="schema/method", name=_name, node=_schema)
+
+
+TABLES = {
+    "lr_by_task": "numbers",
+    "contact_by_task": "contact",
+    "max_gradient_norm_by_numbers": "numbers",
+}
+"""Tables of a method, and the key of ``protocol`` whose value chooses a row."""
+
+
+def _by_task(table: str, default: Any = None, *, _root_: DictConfig) -> Any:
+    """Return the entry of a method's table for the protocol and the task, or for ``other`` tasks."""
+    row = _root_.method[table].get(_root_.protocol[TABLES[table]], default)
+    return row.get(_root_.task.name, row.get("other", default)) if isinstance(row, DictConfig) else row
+
+
+OmegaConf.register_new_resolver("by_task", _by_task, replace=True)
 
 
 # ------------------------------------------------------------------------------------------------ composition
@@ -78,17 +111,142 @@ def choices(group: str, config_dir: str | Path | None = None) -> dict[str, Path]
     return {path.stem: path for path in sorted(files, key=lambda path: path.stem)}
 
 
+def load_config(
+    overrides: Sequence[str] = (), config_dir: str | Path | None = None, *, alone: bool = False
+) -> Config:
+    """Compose a configuration.
+
+    Args:
+        overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
+        config_dir: Folder with files of the user's own, in subfolders named like the groups.
+        alone: Whether there is no other run, on which an override about another variant, task or profile
+            could have its effect.
+
+    Returns:
+        The checked configuration.
+
+    Raises:
+        ConfigError: If an override or a file does not fit.
+    """
+    words = prepared(overrides)
+    check_overrides(words, config_dir)
+    if several := [one.input_line for one in parse(words) if one.is_sweep_override()]:
+        raise ConfigError(
+            f"'{several[0]}' gives several values: add -m to run each, or write [a,b] for a list"
+        )
+    return finish(compose(words, config_dir), words, alone=alone)
+
+
+_KEPT: dict[tuple[str, ...], bytes] = {}
+"""Configurations composed of plab's own files, which do not change, by the overrides that choose files."""
+
+
+def compose(
+    words: Sequence[str],
+    config_dir: str | Path | None = None,
+    kept: dict[tuple[str, ...], bytes] | None = None,
+) -> DictConfig:
+    """Return what Hydra composes of prepared overrides, without Hydra's own section.
+
+    Hydra takes a tenth of a second. What differs in values only is composed once, and the values are set
+    afterwards, as Hydra does.
+
+    Args:
+        words: Prepared overrides.
+        config_dir: Folder with files of the user's own.
+        kept: What was composed before; None: of plab's own files what this process has composed.
+
+    Raises:
+        ConfigError: If an override or a file does not fit.
+    """
+    if kept is None:
+        kept = _KEPT if config_dir is None else {}
+    parsed = parse(words)
+    values = [one for one in parsed if _sets_a_value(one)]
+    files = tuple(str(one.input_line) for one in parsed if one not in values)
+    if files not in kept:
+        kept[files] = pickle.dumps(_without_hydra(compose_with_hydra(files, config_dir)))
+    config: DictConfig = pickle.loads(kept[files])
+    try:
+        for override in values:
+            OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
+    except OmegaConfBaseException:
+        # A key that does not exist, a value of the wrong type, a group of the user's: Hydra knows better.
+        return _without_hydra(compose_with_hydra(words, config_dir))
+    return config
+
+
+def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
+    """Return what Hydra composes of prepared overrides, its own section included; see :func:`compose`."""
+    folder = [] if config_dir is None else [f"file://{Path(config_dir).expanduser().resolve()}"]
+    try:
+        return hydra_app().compose_config(
+            config_name="config",
+            overrides=[*words, *(f"hydra.searchpath=[{quoted(one)}]" for one in folder)],
+            run_mode=RunMode.RUN,
+            from_shell=False,
+            with_log_configuration=False,
+        )
+    except COMPOSE_ERRORS as error:
+        raise ConfigError(explain(error)) from None
+
+
+def hydra_app() -> Hydra:
+    """Return a Hydra application of plab's files, beside any other that there is."""
+    version.setbase("1.3")
+    return Hydra("plab", ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_folder()))))
+
+
+def _without_hydra(composed: DictConfig) -> DictConfig:
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed
+
+
+def _sets_a_value(override: Override) -> bool:
+    """Whether an override is ``key=value``: no choice of files, addition, removal or setting of Hydra's."""
+    group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
+    return override.type is OverrideType.CHANGE and not group and not override.is_hydra_override()
+
+
+def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
+    """Refuse what Hydra takes but what makes no sense here, before it composes anything.
+
+    Args:
+        words: Prepared overrides.
+        config_dir: Folder with files of the user's own; modules that they name are found there from now on,
+            see :mod:`plab.plugins`.
+
+    Raises:
+        ConfigError: If a key is to be removed, a group is not given exactly one choice, or the folder does
+            not do.
+    """
+    if config_dir is not None:
+        _check_config_dir(config_dir)
+        search_in(Path(config_dir).expanduser())
+    for override in parse(words):
+        key, text = override.key_or_group, str(override.input_line)
+        if not key:
+            raise ConfigError(f"cannot read '{text}': write key=value")
+        if override.is_delete():
+            raise ConfigError(f"'{text}': keys cannot be removed, only set")
+        if key in GROUPS and override.package is None and override.type is not OverrideType.CHANGE:
+            raise ConfigError(f"'{text}': write {text.lstrip('+')}")
+        if key == EXPERIMENT and not override.is_add():
+            raise ConfigError(f"'{text}': write +{text}")
+        one = isinstance(override.value(), str) or (override.is_sweep_override() and key != EXPERIMENT)
+        if key in (*GROUPS, EXPERIMENT) and override.package is None and not one:
+            raise ConfigError(f"'{text}': name one {key}; choose from: {', '.join(choices(key, config_dir))}")
+
+
 def _check_config_dir(config_dir: str | Path) -> None:
-    """Raise ConfigError for a missing folder of the user's, a file in it that is no text, and one with a name
-    of plab's own, which Hydra would ignore."""
-    if not isinstance(config_dir, str | Path):
-        raise ConfigError(f"a config folder is named by a text or a path, not {config_dir!r}")
-    if not str(config_dir).strip():
-        raise ConfigError("the config folder's name is empty: give one, or . for this one")
-    if not Path(config_dir).is_dir():
+    """Raise ConfigError for a missing folder, a file in it that is no text, and one with a name of plab's
+    own, which Hydra would ignore."""
+    folder = Path(config_dir).expanduser()
+    if not str(config_dir).strip() or not folder.is_dir():
         raise ConfigError(f"config folder '{config_dir}' does not exist")
     for group in (*GROUPS, EXPERIMENT):
-        for path in (Path(config_dir) / group).glob("*.yaml"):
+        for path in (folder / group).glob("*.yaml"):
             if path.stem in choices(group):
                 raise ConfigError(f"{path}: plab has a {group} of this name, give the file another one")
             try:
@@ -97,55 +255,46 @@ def _check_config_dir(config_dir: str | Path) -> None:
                 raise ConfigError(f"{path}: cannot be read as a text in UTF-8") from None
 
 
-def load_config(overrides: Sequence[str] = (), config_dir: str | Path | None = None) -> Config:
-    """Compose a configuration, for notebooks and tests.
+def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = True) -> Config:
+    """Turn what Hydra composed into a checked configuration.
+
+    The chosen variant is merged over the task. The result keeps no other variant: what a run does not use is
+    no part of its configuration.
 
     Args:
-        overrides: As on the command line: ``["task=Move", "seed=3", "method.lr=0.05"]``.
-        config_dir: Folder with files of the user's own, in subfolders named like the groups.
+        composed: The composed configuration, without Hydra's own section.
+        words: Prepared overrides; one that has no effect is an error.
+        alone: Whether there is no other run, on which an override about another variant, task or profile
+            could have its effect.
 
     Returns:
         The checked configuration.
 
     Raises:
-        ConfigError: If an override or a file does not fit.
+        ConfigError: If a value is missing, of the wrong type or out of range.
     """
-    overrides = quote_folders(word_list(overrides))
-    # Several configurations may share a list of overrides.
-    return finish(_composed(overrides, config_dir), overrides, alone=False)
-
-
-def _composed(overrides: Sequence[str], config_dir: str | Path | None) -> DictConfig:
-    """Return what Hydra makes of overrides, as :func:`load_config` takes them."""
     try:
-        check_overrides(overrides, config_dir)
-        if config_dir is None:
-            return _OWN(parse(overrides))
-        quoted = str(Path(config_dir).resolve()).replace("'", "\\'")
-        return _by_hydra([*overrides, f"hydra.searchpath=['file://{quoted}']"])
-    except COMPOSE_ERRORS as error:
+        composed.method = _typed_method(composed.method)
+        _reject_unknown(composed, "")
+        # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
+        OmegaConf.set_struct(composed, None)
+        _require_effect(composed, parse(words), alone)
+        _choose_profile(composed.method)
+        if "lr_by_task" in composed.method:
+            _resolve(composed.method, TABLES)
+        _choose_numbers(composed, words)
+        _choose_variant(composed, words)
+        merge_variant(composed.task, composed.variant)
+        parts = vars(OmegaConf.to_object(composed))
+    except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
-    except ConfigError:
-        raise
-    except Exception as error:
-        if (reason := unusable(error, overrides)) is None:
-            raise
-        raise ConfigError(reason) from error
-
-
-def _by_hydra(overrides: list[str]) -> DictConfig:
-    """Compose within a Hydra application, too, and leave it as it was."""
-    surrounding = GlobalHydra.instance().hydra
-    try:
-        GlobalHydra.instance().clear()
-        with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            return compose("config", overrides=overrides)
-    finally:
-        GlobalHydra.instance().hydra = surrounding
-
-
-_OWN = Composer(_by_hydra)
-"""Composes of plab's own files, which do not change."""
+    cfg = Config(**parts)
+    cfg.check()
+    cfg.results_dir = str(Path(cfg.results_dir).expanduser())
+    if cfg.targets.source is not None:
+        cfg.targets.source = str(Path(cfg.targets.source).expanduser())
+    cfg.task.pin_files()
+    return cfg
 
 
 def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
@@ -170,91 +319,7 @@ def drawn_configs(cfg: Config, seeds: Iterable[int]) -> list[Config]:
     return [replace(cfg, task=one.task, variant=one.variant, seed_scene=one.seed_scene) for one in drawn]
 
 
-def check_overrides(overrides: Sequence[str], config_dir: str | Path | None = None) -> None:
-    """Refuse what Hydra takes but what makes no sense here, before it composes anything.
-
-    Args:
-        overrides: As on the command line.
-        config_dir: Folder with files of the user's own, in subfolders named like the groups; modules that
-            they name are found there from now on, see :mod:`plab.plugins`.
-
-    Raises:
-        ConfigError: If a key is to be removed, a group is not given exactly one choice, or the folder does
-            not do.
-        hydra.errors.HydraException: If an override cannot be parsed.
-    """
-    if config_dir is not None:
-        _check_config_dir(config_dir)
-        search_in(config_dir)
-    parsed = parse(overrides)
-    require_few(parsed)
-    for override in parsed:
-        key, text = override.key_or_group, str(override.input_line)
-        if not key:
-            raise ConfigError(f"cannot read '{text}': write key=value")
-        if override.is_hydra_override():
-            if (
-                key.startswith("hydra/")
-                and not isinstance(override.value(), str)
-                and not override.is_delete()
-            ):
-                raise ConfigError(f"'{text}': name one, such as hydra/launcher=batch_joblib")
-            continue
-        if override.is_delete():
-            raise ConfigError(f"'{text}': keys cannot be removed, only set")
-        changes = override.type is OverrideType.CHANGE and not key.startswith("task.variants.")
-        if changes and override.value() == {}:
-            raise ConfigError(f"'{text}' has no effect: sections are changed key by key")
-        if key == EXPERIMENT and not override.is_add():
-            raise ConfigError(f"'{text}': write +{text.lstrip('+')}")
-        if key == EXPERIMENT and not isinstance(override.value(), str):
-            names = ", ".join(choices(key, config_dir))
-            raise ConfigError(f"'{text}': name one experiment, itself a sweep; choose from: {names}")
-        if key in GROUPS and override.package is None:
-            if override.is_add() or override.is_force_add():
-                raise ConfigError(f"'{text}': write {text.lstrip('+')}")
-            if not override.is_sweep_override() and not isinstance(override.value(), str):
-                names = ", ".join(choices(key, config_dir))
-                raise ConfigError(f"'{text}': name one {key}; choose from: {names}")
-
-
-def finish(composed: DictConfig, overrides: Sequence[str] = (), *, alone: bool = True) -> Config:
-    """Turn what Hydra composed into a checked configuration.
-
-    The chosen variant is merged over the task. The result keeps no other variant: what a run does not use is
-    no part of its configuration.
-
-    Args:
-        composed: The composed configuration, without Hydra's own section.
-        overrides: The command line's overrides; one that has no effect is an error.
-        alone: Whether there is no other run, on which an override about another variant, task or profile
-            could have its effect.
-
-    Returns:
-        The checked configuration.
-
-    Raises:
-        ConfigError: If a value is missing, of the wrong type or out of range.
-    """
-    try:
-        composed.method = _typed_method(composed.method)
-        _reject_unknown(composed, "")
-        # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
-        OmegaConf.set_struct(composed, None)
-        _require_tables(composed.method)
-        _require_effect(composed, overrides, alone)
-        _choose_profile(composed.method)
-        _choose_by_task(composed.method)
-        _choose_numbers(composed, overrides)
-        _choose_variant(composed, overrides)
-        merge_variant(composed.task, composed.variant)
-        parts = vars(OmegaConf.to_object(composed))
-    except OmegaConfBaseException as error:
-        raise ConfigError(explain(error)) from None
-    cfg = Config(**parts)
-    cfg.check()
-    cfg.task.pin_files()
-    return cfg
+# ------------------------------------------------------------------------------------------ scene and devices
 
 
 def build_scene(cfg: Config) -> Scene:
@@ -300,6 +365,39 @@ def build_scene(cfg: Config) -> Scene:
     return scene
 
 
+def check_sources(cfg: Config) -> None:
+    """Find mistakes in the scene, its memory and its target: ConfigError, SceneError or TargetError."""
+    # Imported here: Taichi takes a second.
+    from plab.sim.memory import require_memory
+
+    scene, source = build_scene(cfg), cfg.targets.source
+    require_memory([scene], cfg.sim.precision, cfg.sim.device)
+    if source is None:
+        check_target(scene, cfg.task.target)
+    else:
+        load_release_target(source, scene, cfg.variant)
+
+
+def require_runnable(cfg: Config) -> None:
+    """Raise ConfigError unless this computer has the device and the optional packages that a run uses."""
+    if cfg.sim.device == "cuda" and not cuda_devices():
+        raise ConfigError("sim.device=cuda: this computer has no usable CUDA device; choose sim.device=cpu")
+    if cfg.logger != "none" and find_spec(cfg.logger) is None:
+        name = {"tensorboard": "TensorBoard", "wandb": "Weights & Biases"}[cfg.logger]
+        raise ConfigError(f"logger={cfg.logger} needs {name}: pip install 'plab[{cfg.logger}]'")
+
+
+def cuda_devices() -> int:
+    """Return the number of CUDA devices, as the driver counts them: there is no library to import."""
+    count = ctypes.c_int(0)
+    try:
+        driver = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return 0
+    answered = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    return count.value if answered else 0
+
+
 # ---------------------------------------------------------------------------------------------------- details
 
 
@@ -322,46 +420,29 @@ def _typed_method(method: DictConfig) -> DictConfig:
     return method
 
 
-_BY_TASK = {"lr_by_task": "numbers", "contact_by_task": "contact"}
-"""Tables of a method that hold values by a choice of the protocol, and task."""
-
-
-def _require_tables(method: DictConfig) -> None:
-    """Refuse a value where those of the tasks belong."""
-    for section in _BY_TASK:
-        for choice, tasks in method.get(section, {}).items():
-            if not isinstance(tasks, DictConfig):
-                raise ConfigError(f"method.{section}.{choice} must be a table of tasks, not {tasks}")
-
-
-def _require_effect(composed: DictConfig, overrides: Sequence[str], alone: bool) -> None:
+def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: bool) -> None:
     """Refuse overrides of what goes with another variant, profile or task than the chosen ones."""
     task, method, variant = composed.task, composed.method, composed.variant
     used: dict[str, tuple[str, str | None]] = {}
     if alone:
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
-        for section, key in _BY_TASK.items():
-            chosen = composed.protocol[key]
-            used[f"method.{section}."] = f"protocol.{key}={chosen}", chosen
-            tasks = method.get(section, {}).get(chosen, {})
-            used[f"method.{section}.{chosen}."] = (
-                f"task={task.name}",
-                "other" if "other" in tasks and task.name not in tasks else task.name,
-            )
-        numbers = composed.protocol.numbers
-        used["method.max_gradient_norm_by_numbers."] = f"protocol.numbers={numbers}", numbers
+        for table, key in TABLES.items():
+            chosen, tasks = composed.protocol[key], method.get(table, {}).get(composed.protocol[key])
+            used[f"method.{table}."] = f"protocol.{key}={chosen}", chosen
+            if isinstance(tasks, DictConfig):
+                own = "other" if "other" in tasks and task.name not in tasks else task.name
+                used[f"method.{table}.{chosen}."] = f"task={task.name}", own
     if alone or variant == RANDOM:
         # Of the variants a random one uses that which gives what is not drawn, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant
         used |= dict.fromkeys(("task.variants.", "task.release.variants."), (f"variant={variant}", chosen))
-    for override in parse(overrides):
+    for override in overrides:
+        key = override.key_or_group
         for section, (choice, name) in used.items():
-            key = override.key_or_group
             if key.startswith(section) and key.removeprefix(section).partition(".")[0] != name:
-                raise ConfigError(f"'{shortened(str(override.input_line))}' has no effect with {choice}")
-        if composed.targets.source is not None and f"{override.key_or_group}.".startswith("task.target."):
-            line = shortened(str(override.input_line))
-            raise ConfigError(f"'{line}' has no effect with targets.source: leave one of them out")
+                raise ConfigError(f"'{override.input_line}' has no effect with {choice}")
+        if composed.targets.source is not None and f"{key}.".startswith("task.target."):
+            raise ConfigError(f"'{override.input_line}' has no effect with targets.source")
 
 
 def _choose_profile(method: DictConfig) -> None:
@@ -374,14 +455,7 @@ def _choose_profile(method: DictConfig) -> None:
     _resolve(method, ["profiles"])
 
 
-def _choose_by_task(method: DictConfig) -> None:
-    """Put learning rate, contact weight and limit of the norm where they are referred to, and forget those of
-    other tasks and numbers."""
-    if "lr_by_task" in method:
-        _resolve(method, [*_BY_TASK, "max_gradient_norm_by_numbers"])
-
-
-def _resolve(section: DictConfig, tables: Sequence[str]) -> None:
+def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
     """Put values where they are referred to, except in tables, which are empty afterwards."""
     for key, node in section.items_ex(resolve=False):
         if OmegaConf.is_interpolation(section, str(key)):
@@ -427,13 +501,9 @@ def _reject_unknown(node: Any, path: str) -> None:
     if not isinstance(node, DictConfig):
         return
     kind = OmegaConf.get_type(node)
-    known = _field_names(kind) if dataclasses.is_dataclass(kind) else None
+    known = [field.name for field in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else None
     for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
         if known is not None and key not in known:
             raise ConfigError(f"unknown key '{path}{key}'; {pick(key, known)}")
         if isinstance(below, DictConfig) and not (below._is_missing() or below._is_interpolation()):
             _reject_unknown(below, f"{path}{key}.")
-
-
-def _field_names(kind: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(kind)]

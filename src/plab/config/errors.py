@@ -17,7 +17,7 @@ from omegaconf.errors import (
 )
 from yaml import MarkedYAMLError, YAMLError
 
-from plab.errors import ConfigError, pick
+from plab.errors import pick
 
 __all__ = ["COMPOSE_ERRORS", "explain"]
 
@@ -35,15 +35,11 @@ LAUNCHER_EXTRAS = {
 
 
 def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:
-    """Return one line, without a full stop, on what is wrong with a configuration whose composition raised
-    an error."""
+    """Return one line, without a full stop, on an error of Hydra's, OmegaConf's or YAML's."""
     if isinstance(error, RecursionError):
         return (
             "the configuration refers to itself, or is nested too deeply: look at defaults, ${...}, brackets"
         )
-    if isinstance(error.__cause__, ConfigError):
-        # Of plab's launcher or sweeper, which Hydra makes.
-        return str(error.__cause__)
     launcher = re.search(r"Could not (?:load|find) 'hydra/launcher/(\w+)'", str(error))
     if launcher and launcher[1] in LAUNCHER_EXTRAS:
         return f"this launcher is not installed: pip install 'plab[{LAUNCHER_EXTRAS[launcher[1]]}]'"
@@ -67,14 +63,8 @@ def explain(error: HydraException | OmegaConfBaseException | YAMLError | Recursi
         return f"{cause.full_key} has no value: give one"
     if cause is not None:
         place = f"{cause.full_key}: " if cause.full_key else ""
-        return place + _first_line(cause.msg or str(cause))
+        return place + (cause.msg or str(cause)).strip().splitlines()[0]
     message = str(error)
-    if message.startswith("Ambiguous value for argument"):
-        argument = message.split("'")[1]
-        return f"'{argument}' gives several values: add -m to run each of them, or write [a,b] for a list"
-    if message.startswith("Could not override"):
-        # A choice for a group that the defaults do not have.
-        return _first_line(message)
     return "; ".join(line.strip() for line in message.splitlines() if line.strip())
 
 
@@ -108,7 +98,3 @@ def _paths(node: object, prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}"
             if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
                 yield from _paths(node[key], f"{prefix}{key}.")
-
-
-def _first_line(text: str) -> str:
-    return text.strip().splitlines()[0]

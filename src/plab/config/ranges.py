@@ -1,4 +1,4 @@
-"""Ranges that values have to be in; ``path`` is the key that an error message names."""
+"""Ranges of values, checked by functions that take the key for their message, ``path``, and the value."""
 
 from __future__ import annotations
 
@@ -32,18 +32,6 @@ __all__ = [
 ]
 
 
-MOST_THREADS = 256
-"""Threads of torch, at most: more than there are cores only wait."""
-
-
-def _shown(value: float) -> str:
-    """Return a number for a message; whole numbers may be beyond what a float can hold."""
-    try:
-        return f"{value:g}"
-    except OverflowError:
-        return f"a number of {len(str(value))} digits"
-
-
 def folder_name(path: str, value: str) -> None:
     """Raise :class:`ConfigError` unless a name can be that of a folder."""
     if not value.replace("_", "").replace("-", "").isalnum():
@@ -60,37 +48,29 @@ def positive(path: str, value: float) -> None:
     """Raise :class:`ConfigError` unless a value is positive and finite."""
     # Written so that nan fails it too, here and below.
     if not 0 < value < math.inf:
-        raise ConfigError(f"{path} must be positive and finite, not {_shown(value)}")
+        raise ConfigError(f"{path} must be positive and finite, not {value:g}")
 
 
 def at_least(path: str, value: float, low: float, *, finite: bool = False) -> None:
     """Raise :class:`ConfigError` if a value is below ``low``, or if it has to be finite and is not."""
     if not value >= low or (finite and value == math.inf):
         limit = f"{low:g}{' and finite' if finite else ''}"
-        raise ConfigError(f"{path} must be at least {limit}, not {_shown(value)}")
-    if isinstance(value, int) and value >= 2**63:
-        raise ConfigError(f"{path} must be below 2^63, not {_shown(value)}")
+        raise ConfigError(f"{path} must be at least {limit}, not {value:g}")
 
 
 def _fraction(path: str, value: float) -> None:
     if not 0 <= value < 1:
-        raise ConfigError(f"{path} must be in [0, 1), not {_shown(value)}")
+        raise ConfigError(f"{path} must be in [0, 1), not {value:g}")
 
 
 def _share(path: str, value: float) -> None:
     if not 0 < value <= 1:
-        raise ConfigError(f"{path} must be in (0, 1], not {_shown(value)}")
+        raise ConfigError(f"{path} must be in (0, 1], not {value:g}")
 
 
 def _unit(path: str, value: float) -> None:
     if not 0 <= value <= 1:
-        raise ConfigError(f"{path} must be in [0, 1], not {_shown(value)}")
-
-
-def _threads(path: str, value: int) -> None:
-    at_least(path, value, 1)
-    if value > MOST_THREADS:
-        raise ConfigError(f"{path} must be at most {MOST_THREADS}, not {_shown(value)}")
+        raise ConfigError(f"{path} must be in [0, 1], not {value:g}")
 
 
 def vector(path: str, value: Sequence[float], length: int) -> None:
@@ -120,7 +100,7 @@ COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
 FINITE = within(at_least, 0, finite=True)
 FRACTION, SHARE, UNIT = within(_fraction), within(_share), within(_unit)
 POINT, DECAYS = within(vector, 3), within(_decays)
-NAME, THREADS, WIDTHS = within(folder_name), within(_threads), within(_widths)
+NAME, THREADS, WIDTHS = within(folder_name), COUNT, within(_widths)
 """What fields have to be; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
 
 

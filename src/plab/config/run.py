@@ -1,4 +1,4 @@
-"""Types of a whole configuration and of its sections ``sim`` and ``targets``."""
+"""Types of a whole configuration and of its sections ``sim``, ``protocol`` and ``targets``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,6 @@ from plab.scenes import CONVENTIONS, DEVICES, PRECISIONS
 
 __all__ = ["Config", "ProtocolConfig", "SimConfig", "TargetsConfig"]
 
-MOST_MEMORY_MB = 1e9
-"""A petabyte: more is a slip of the unit."""
-
 LOGGERS = ("none", "tensorboard", "wandb")
 
 Method = TypeVar("Method", bound=MethodConfig)
@@ -24,7 +21,7 @@ Method = TypeVar("Method", bound=MethodConfig)
 
 @dataclass
 class SimConfig(ranges.Section):
-    """How the scene is simulated.
+    """Discretisation, precision and device.
 
     Attributes:
         precision: ``float32`` or ``float64``.
@@ -48,31 +45,23 @@ class SimConfig(ranges.Section):
     horizon: int = field(metadata=ranges.COUNT)
     particles_scale: float = field(metadata=ranges.POSITIVE)
 
-    def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
-        super().check(path)
-        if self.memory_mb > MOST_MEMORY_MB:
-            raise ConfigError(
-                f"{path}.memory_mb must be at most {MOST_MEMORY_MB:g}, not {self.memory_mb:g}: it is in MB"
-            )
-
 
 SCORES = ("best", "last")
-"""What a run's score is of: ``protocol.score``."""
+"""Iterations whose score is that of the run: ``protocol.score``."""
 
 
 @dataclass
 class ProtocolConfig(ranges.Section):
-    """What is done as the PlasticineLab release does it, where that is not what the paper says.
+    """Conventions of the paper or of the PlasticineLab release, where the two differ.
 
     Attributes:
         name: Name of the protocol in results and reports; runs of different names are never pooled.
-        start: Whose generator draws the particles' positions, ``plab`` or ``release``.
-        numbers: Whose digits the task's numbers have, likewise; the release's are in ``task.release``.
-        floor: Whose stencil particles at the lower faces have, likewise.
-        score: What a run's score is of, ``best`` or ``last``; changes what is read from a result, nothing in
-            it. See :attr:`plab.results.RunResult.score`.
-        contact: Which term ``method.loss_terms.contact`` is, unless that says so itself.
+        start: Generator of the particles' initial positions, ``plab`` or ``release``.
+        numbers: Source of the task's numbers, likewise; the release's are in ``task.release``.
+        floor: Stencil of particles at the lower faces, likewise.
+        score: Iteration that gives a run's score, ``best`` or ``last``; changes what is read from a result,
+            nothing in it. See :attr:`plab.results.RunResult.score`.
+        contact: Default of ``method.loss_terms.contact``.
     """
 
     name: str = field(metadata=ranges.NAME)
@@ -90,7 +79,7 @@ class ProtocolConfig(ranges.Section):
 
 @dataclass
 class TargetsConfig:
-    """Where the targets come from.
+    """Source of the targets.
 
     Attributes:
         source: Folder of the original release's target files; None builds the task's recipe.
@@ -105,23 +94,22 @@ class Config:
 
     Attributes:
         task: Scene, target and variants.
-        method: How the actions are found.
-        protocol: What is done as the PlasticineLab release does it.
-        sim: How the scene is simulated.
-        targets: Where the targets come from.
-        variant: Name of the task's variant, such as ``1``; of one that was drawn, ``random7``.
-        seed_scene: Which random variant was drawn; None of other variants.
-        seed_particles: Which draw of the particles the start is. Simulated targets are made from draw 0.
-        observe_particles: Particles that observations of environments hold, at least: every (particle
-            count // this)-th.
-        observe_target: Whether observations of environments end with
-            :func:`plab.objective.target_observation`, for policies that are to serve several targets.
+        method: Method and its hyperparameters.
+        protocol: Conventions of the paper or of the release.
+        sim: Discretisation, precision and device.
+        targets: Source of the targets.
+        variant: Name of the task's variant, such as ``1``, or ``random7`` of one that was drawn.
+        seed_scene: Seed of a random variant; None of other variants.
+        seed_particles: Seed of the particles' initial positions. Simulated targets are made with 0.
+        observe_particles: Least number of particles in an observation: every (particle count // this)-th.
+        observe_target: Whether observations end with :func:`plab.objective.target_observation`, for policies
+            that are to serve several targets.
         seed: Seed of the method's random numbers.
         results_dir: Folder of the result files, relative to the working directory.
         force: Compute again although a result exists.
-        progress: Show a progress bar, and what to do next at the end.
-        logger: Where the rows go beside the result file: ``none``, ``tensorboard`` or ``wandb``.
-        checkpoint_seconds: Time between two writings of the state from which a killed run goes on [s].
+        progress: Show a progress bar, and hints at the end.
+        logger: Further destination of the rows: ``none``, ``tensorboard`` or ``wandb``.
+        checkpoint_seconds: Time between two checkpoints, from which a killed run resumes [s].
     """
 
     task: TaskConfig

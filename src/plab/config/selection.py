@@ -1,7 +1,4 @@
-"""Which runs are meant: the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``.
-
-What no run can be of is a mistake, not an empty table.
-"""
+"""Selection of runs by the words of a sweep, such as ``task=Rope,Move method=adam seed=0,1,2``."""
 
 from __future__ import annotations
 
@@ -9,13 +6,10 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
-from plab.config.suite import group_names, suite_tasks
-from plab.errors import ConfigError, PlabError
-
-if TYPE_CHECKING:
-    from hydra.core.override_parser.types import Override
+from plab.config.suite import SUITE_VARIANTS, group_names
+from plab.errors import PlabError, pick
 
 __all__ = ["OBSERVED", "Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
 
@@ -58,50 +52,34 @@ class Selection:
 
 
 def select(words: Sequence[str], names: Sequence[str]) -> Selection:
-    """Read the words of a command line, ``name=value``, with several values as in a sweep: ``seed=0,1,2``
-    or ``seed=range(3)``. Every dotted name is a key of the configuration; SelectionError if a word cannot
-    be read, or its name is neither that nor one of ``names``."""
+    """Read the words of a command line, ``name=value``, with several values as in a sweep.
+
+    Args:
+        words: Such as ``seed=0,1,2`` or ``seed=range(3)``.
+        names: Names that runs are chosen by; every dotted name is a key of the configuration.
+
+    Raises:
+        SelectionError: If a word is of another name, or changes more than a value.
+        ConfigError: If a word cannot be read, or gives no value.
+    """
     if not words:
         return Selection()
     # Imported here: without words nobody should have to wait for Hydra.
-    from hydra.errors import HydraException
+    from hydra.core.override_parser.types import OverrideType
 
-    from plab.config.words import parse, shortened
+    from plab.config.words import parse, prepared, swept
 
-    choices: dict[str, list[str]] = {}
-    keys: dict[str, list[str]] = {}
-    for word in words:
-        try:
-            (override,) = parse([word])
-            name = override.key_or_group
-            if "." not in name and name not in names:
-                raise SelectionError(
-                    f"'{shortened(word)}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
-                )
-            (keys if "." in name else choices)[name] = _texts(override)
-        except HydraException:
+    chosen = Selection()
+    for override in parse(prepared(words)):
+        name, word = override.key_or_group, override.input_line
+        if "." not in name and name not in names:
             raise SelectionError(
-                f"cannot read '{shortened(word)}': write name=value or name=value,value"
-            ) from None
-    return Selection(choices, keys)
-
-
-def _texts(override: Override) -> list[str]:
-    """Return the values that a word gives, as texts; SelectionError if there are none, ConfigError if too
-    many, HydraException if they cannot be enumerated."""
-    from hydra.core.override_parser.types import Glob, OverrideType
-
-    from plab.config.words import require_few
-
-    word, value = override.input_line, override.value()
-    if override.type is not OverrideType.CHANGE or override.package is not None:
-        raise SelectionError(f"'{word}' selects nothing: write name=value or name=value,value")
-    if isinstance(value, Glob):
-        if not (texts := value.filter(group_names(override.key_or_group))):
-            raise SelectionError(f"'{word}' matches nothing")
-        return texts
-    require_few([override])
-    return list(override.sweep_string_iterator()) if override.is_sweep_override() else [str(value)]
+                f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
+            )
+        if override.type is not OverrideType.CHANGE or override.package is not None:
+            raise SelectionError(f"'{word}' selects nothing: write name=value or name=value,value")
+        (chosen.keys if "." in name else chosen.choices)[name] = swept(override, group_names(name))
+    return chosen
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
@@ -133,60 +111,21 @@ def _same(value: Any, text: str) -> bool:
 
 
 def require_possible(chosen: Selection, found: Iterable[_Run]) -> None:
-    """Refuse a choice among the runs found as ``plab.run`` would refuse it: ConfigError if plab could
-    compose no run with one of its values; says what would do. What some run has is possible, such as a
-    task of somebody's own, which only the command line of that run could compose."""
+    """Raise SelectionError for a value that no run has and none of the suite could have, such as a misspelt
+    task: it is a mistake, not an empty table."""
     runs = list(found) if chosen.choices or chosen.keys else []
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
+        known = list(SUITE_VARIANTS) if name == "variant" else group_names(name)
         for text in texts:
-            if text not in present:
-                _require_composed(_attempts(name, text, chosen.choices))
-    for key, texts in chosen.keys.items():
-        for text in texts:
-            if not any(_same(lookup(run.config, key), text) for run in runs):
-                _require_composed(_attempts(key, text, chosen.choices))
+            if text in present or text in known or re.fullmatch(_OPEN.get(name, "(?!)"), text):
+                continue
+            advice = pick(text, sorted({*known, *present})) if known or present else "there are no runs"
+            raise SelectionError(f"{name} '{text}' does not exist; {advice}")
+    for key in chosen.keys:
+        if runs and not any(lookup(run.config, key) == lookup(run.config, key) for run in runs):
+            raise SelectionError(f"no run has the key '{key}'")
 
 
-def _attempts(key: str, text: str, choices: Mapping[str, Sequence[str]]) -> list[list[str]]:
-    """Return overrides of which some have to compose; none where only the user's own files could say."""
-    # Imported here: who chooses nothing should not have to wait for Hydra.
-    from plab.config.variants import RANDOM
-
-    tasks, methods = choices.get("task", suite_tasks()), choices.get("method", group_names("method"))
-    word = _word(key, text)
-    if key == "variant" or key.startswith("task."):
-        drawn = re.fullmatch(rf"{RANDOM}(\d+)", text) if key == "variant" else None
-        words = [f"variant={RANDOM}", f"seed_scene={drawn[1]}"] if drawn else [word]
-        return [[f"task={task}", *words] for task in tasks] if {*tasks} <= {*suite_tasks()} else []
-    if key.startswith("method."):
-        return [[f"method={one}", word] for one in methods] if {*methods} <= {*group_names("method")} else []
-    return [[word]]
-
-
-def _word(key: str, text: str) -> str:
-    from hydra.errors import HydraException
-
-    from plab.config.words import parse, quoted
-
-    try:
-        (override,) = parse([f"{key}={text}"])
-    except HydraException:
-        return f"{key}={quoted(text)}"
-    return f"{key}={quoted(text)}" if override.is_sweep_override() else f"{key}={text}"
-
-
-def _require_composed(attempts: Sequence[list[str]]) -> None:
-    """Compose until one of the attempts succeeds; if none can, raise the ConfigError of the one that came
-    closest."""
-    from plab.config.compose import load_config
-
-    errors = []
-    for words in attempts:
-        try:
-            load_config(words)
-            return
-        except ConfigError as error:
-            errors.append(error)
-    if errors:
-        raise next((error for error in errors if not str(error).startswith("unknown key")), errors[0])
+_OPEN = {"variant": r"random\d+", "seed": r"\d+"}
+"""Values that runs may have beside those that are listed."""

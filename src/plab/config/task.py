@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -245,6 +246,6 @@ def _pin(node: Any, path: str) -> None:
         _pin(value, f"{path}.{key}")
     if isinstance(node.get("file"), str):
         try:
-            node["file"], node["sha256"] = pinned(node["file"], node.get("sha256"))
+            node["file"], node["sha256"] = pinned(os.path.expanduser(node["file"]), node.get("sha256"))
         except ShapeError as error:
             raise ConfigError(f"{path}: {error}") from None

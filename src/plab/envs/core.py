@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
 from plab.config.selection import OBSERVED
-from plab.config.words import word_list
+from plab.config.words import prepared
 from plab.envs.observations import Observer, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
@@ -91,7 +91,7 @@ def compose_configs(
     if len(own) != num_envs:
         raise ArgumentError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
     for entries in (overrides, *own):
-        if own_task := [word for word in word_list(entries) if word.partition("=")[0] == "task"]:
+        if own_task := [word for word in prepared(entries) if word.partition("=")[0] == "task"]:
             raise ArgumentError(
                 f"'{own_task[0]}' in an environment of task {task}: make that task's environment"
             )

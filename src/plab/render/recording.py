@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
-from plab.config.checks import cuda_is_usable
+from plab.config.compose import cuda_devices
 from plab.errors import tell
 from plab.objective import scores_from_iou, soft_iou
 from plab.problem import Problem, build_scenes, make_simulator
@@ -75,7 +75,7 @@ class RecordedRollout:
 def result(path: Path) -> tuple[Config, np.ndarray]:
     """Return what :func:`stored` does, for this computer: on the CPU where there is no CUDA device."""
     cfg, actions = stored(path)
-    if cfg.sim.device == "cuda" and not cuda_is_usable():
+    if cfg.sim.device == "cuda" and not cuda_devices():
         say("the run used CUDA, which this computer has not: replaying it on the CPU")
         cfg.sim.device = "cpu"
     return cfg, actions

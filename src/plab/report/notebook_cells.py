@@ -38,7 +38,7 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
     if runs.table.empty:
         say(
             f"There are no finished runs in {', '.join(map(str, results))}: `python -m plab.run task=Move` "
-            "makes one, and `--results example` shows those that come with plab."
+            "makes one, and `results=example` shows those that come with plab."
         )
     return runs
 

@@ -70,7 +70,9 @@ class NewerSchemaError(ResultsError):
 
 
 class RunBusyError(ResultsError):
-    """A run that somebody else computes at this moment."""
+    """A run that another process computes at this moment."""
+
+    exit_code = 1
 
 
 @dataclasses.dataclass

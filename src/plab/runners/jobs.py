@@ -34,6 +34,8 @@ USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
 class RunError(PlabError, RuntimeError):
     """A run that cannot go on; the message says in which iteration and why."""
 
+    exit_code = 1
+
 
 class TogetherError(RuntimeError):
     """Runs that cannot be simulated together, for the reason that is the cause of this error."""

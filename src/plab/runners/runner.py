@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from plab.config import Config, ConfigError
-from plab.config.checks import check_packages
+from plab.config.compose import require_runnable
 from plab.families import SOLVED, family
 from plab.problem import Episodes, Problem
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
@@ -302,7 +302,7 @@ class Runner:
         self.enter("build")
         try:
             for track in self.tracks:
-                check_packages(track.cfg)
+                require_runnable(track.cfg)
             with simulation_errors():
                 self.build()
         except Exception as error:

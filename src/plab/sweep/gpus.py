@@ -1,15 +1,12 @@
-"""A sweep on all GPUs of this computer: processes of which each is given a batch whenever it is free."""
+"""Processes on all GPUs of this computer, each of which is given a batch whenever it is free."""
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -17,18 +14,16 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeAlias
 
 from plab import runners
-from plab.config import Config
-from plab.config.checks import cuda_devices
-from plab.errors import ConfigError
+from plab.config import Config, ConfigError
+from plab.config.compose import cuda_devices
 from plab.outcomes import Outcome
 from plab.progress import forward_to, show_several
 from plab.runners.simulator_cache import SimulatorCache
-from plab.sweep.carry import Carrier, look_up
 
-__all__ = ["choose", "gpus", "processes_on"]
+__all__ = ["choose", "gpu_workers"]
 
 Kind: TypeAlias = tuple[str, str]
-"""Task and family of methods."""
+"""Task and family of methods: batches of one kind may share a simulator."""
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 """The variable that tells a process which GPUs it has."""
@@ -37,35 +32,35 @@ PATIENCE = 30.0
 """How long processes may take to close their files after Ctrl-C [s]."""
 
 
-def gpus() -> list[str]:
-    """Return the names of the GPUs that this process may use; ConfigError if there are none."""
+@contextmanager
+def gpu_workers(
+    per_gpu: int, most: int, look_up: Callable[[Config], Outcome]
+) -> Iterator[tuple[Callable[..., Iterator[Outcome]], int]]:
+    """Start processes on all GPUs that this process may use; afterwards they end.
+
+    Args:
+        per_gpu: Processes of each GPU.
+        most: Processes of all, at most.
+        look_up: Says how a run ended whose process was killed.
+
+    Yields:
+        What carries out batches by them, and the number of processes.
+
+    Raises:
+        ConfigError: If there is no GPU.
+    """
     named = os.environ.get(VISIBLE)
     found = range(cuda_devices()) if named is None else filter(None, named.split(","))
     if not (names := [str(one).strip() for one in found]):
         raise ConfigError("hydra/launcher=batch_gpus: this computer has no usable CUDA device; leave it out")
-    return names
-
-
-@contextmanager
-def processes_on(names: Sequence[str], per_gpu: int, most: int) -> Iterator[Carrier]:
-    """Start processes on some GPUs, and yield what carries out batches by them; afterwards they end.
-
-    They load what they need while the batches are still being made.
-
-    Args:
-        names: The GPUs, as ``CUDA_VISIBLE_DEVICES`` names them.
-        per_gpu: Processes of each.
-        most: Processes of all, at most.
-    """
     # One process for each GPU before any has its second.
-    places = [
-        (name, f"GPU {name}" if per_gpu == 1 else f"GPU {name}, {k + 1}")
-        for k in range(per_gpu)
-        for name in names
+    places = [(name, k) for k in range(per_gpu) for name in names]
+    workers = [
+        _Worker(name, f"GPU {name}" if per_gpu == 1 else f"GPU {name}, {k + 1}", look_up)
+        for name, k in places[:most]
     ]
-    workers = [_Worker(*place) for place in places[:most]]
     try:
-        yield partial(_carry, workers)
+        yield partial(_carry, workers), len(places)
     finally:
         for worker in workers:
             worker.dismiss()
@@ -84,12 +79,8 @@ def _carry(
         while waiting or any(worker.batch for worker in used):
             for worker in used:
                 if waiting and not worker.batch:
-                    others = [other for other in used if other is not worker]
-                    soon = [_kind(other.batch) for other in others if other.left < other.setup]
-                    number = choose(waiting, worker.kind, [other.kind for other in others], soon)
-                    if number is not None:
-                        worker.give(waiting.pop(number), progress())
-            # Until one that is at work has said something.
+                    others = [other.kind for other in used if other is not worker]
+                    worker.give(waiting.pop(choose(waiting, worker.kind, others)), progress())
             heard = wait([worker.connection for worker in used if worker.batch])
             for worker in (worker for worker in used if worker.connection in heard):
                 for kind, *content in worker.messages():
@@ -102,34 +93,20 @@ def _carry(
                         yield one
 
 
-def choose(
-    waiting: Sequence[Sequence[Config]],
-    own: Kind | None,
-    others: Sequence[Kind | None],
-    soon: Sequence[Kind] = (),
-) -> int | None:
-    """Return which batch a process takes: the first of the kind it had before, whose simulator it has; else
-    the first of a kind that no other process has; else of the kind of which most wait per process that has
-    it. Processes that will be free sooner than another has compiled what they have are left a batch each, so
-    that there may be none to take.
+def choose(waiting: Sequence[Sequence[Config]], own: Kind | None, others: Sequence[Kind | None]) -> int:
+    """Return the number of the batch that a process takes: the first of the kind whose simulator it has, else
+    the first of the kind that the fewest other processes have.
 
     Args:
         waiting: Batches, at least one.
-        own: What kind this process had before, if any.
-        others: What kinds the others have, or had before.
-        soon: What kinds those have that will be free so soon.
+        own: The kind that the process had before, if any.
+        others: The kinds that the others have, or had before.
     """
     kinds = [_kind(batch) for batch in waiting]
-    if own in kinds:
-        return kinds.index(own)
-    left, having = Counter(kinds), Counter(others)
-    left.subtract(soon)
-    free = [number for number, kind in enumerate(kinds) if left[kind] > 0]
-    return max(free, key=lambda n: left[kinds[n]] / (having[kinds[n]] or 1e-9), default=None)
+    return kinds.index(own if own in kinds else min(kinds, key=others.count))
 
 
 def _kind(batch: Sequence[Config]) -> Kind:
-    """Return what batches have in common that may share a simulator."""
     return batch[0].task.name, batch[0].method.family
 
 
@@ -141,16 +118,12 @@ class _Worker:
         label: What stands before its progress.
         batch: What it is carrying out, empty if nothing.
         kind: Of what kind that is, or what it has carried out last.
-        setup: How long the first batch of that kind took until its first step was done [s].
-        left: For how long it will be busy yet, by its pace since the first step [s]; infinite if not known.
     """
 
-    def __init__(self, name: str, label: str) -> None:
-        self.name, self.label = name, label
+    def __init__(self, name: str, label: str, look_up: Callable[[Config], Outcome]) -> None:
+        self.name, self.label, self._look_up = name, label, look_up
         self.batch: list[Config] = []
         self.kind: Kind | None = None
-        self.setup, self.left = 0.0, math.inf
-        self._first: tuple[float, int] | None = None
         self._start()
 
     def _start(self) -> None:
@@ -167,9 +140,7 @@ class _Worker:
         """Let it carry out a batch."""
         if not self.process.is_alive():
             self._start()
-        self._same = self.kind == _kind(batch)
         self.batch, self.kind = batch, _kind(batch)
-        self._given, self._first = time.monotonic(), None
         self.connection.send((batch, note))
 
     def messages(self) -> Iterator[tuple[Any, ...]]:
@@ -178,26 +149,14 @@ class _Worker:
             while self.connection.poll():
                 message = self.connection.recv()
                 if message[0] == "ended":
-                    self.batch, self.left = [], math.inf
-                elif message[0] == "progress":
-                    self._note(*message[1:])
+                    self.batch = []
                 yield message
         except (EOFError, OSError):
             # Killed: the files know how far it came.
             self.process.join()
-            outcomes = [look_up(cfg) for cfg in self.batch]
-            self.batch, self.left = [], math.inf
+            outcomes = [self._look_up(cfg) for cfg in self.batch]
+            self.batch = []
             yield "ended", outcomes
-
-    def _note(self, _title: str, _start: int, total: int, _every: int, done: int, _text: str) -> None:
-        """Note how far it has come."""
-        now = time.monotonic()
-        if self._first is None:
-            self._first = now, done
-            self.setup = self.setup if self._same else now - self._given
-        else:
-            begin, before = self._first
-            self.left = (now - begin) / max(1, done - before) * (total - done)
 
     def dismiss(self) -> None:
         """Let it end; one that is at work is interrupted."""

@@ -1,0 +1,280 @@
+"""Sweeps: all combinations of values as runs, composed, batched, carried out, and how each ended."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any
+
+from hydra._internal.callbacks import Callbacks
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.types import HydraContext
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from plab import runners
+from plab.config import Config, ConfigError
+from plab.config.compose import check_sources, choices, compose, finish, hydra_app, require_runnable
+from plab.config.words import combinations, parse
+from plab.errors import tell
+from plab.outcomes import Outcome, report
+from plab.plugins import passed_on
+from plab.results import ResultsError, RunFile, read, result_path
+from plab.results.locks import held, lock_path
+from plab.results.schema import PARTIAL_SUFFIX
+from plab.runners.jobs import outcome
+from plab.runners.simulator_cache import SimulatorCache
+from plab.scenes import SceneError
+from plab.sweep.gpus import gpu_workers
+from plab.sweep.plan import plan
+from plab.targets import TargetError
+
+__all__ = ["compose_jobs", "jobs_of", "look_up", "run_batches", "sweep"]
+
+Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
+"""Carries out batches: takes them and a function that says how far the sweep has come, yields outcomes."""
+
+
+def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = None) -> int:
+    """Run all combinations of the values that overrides give, and say how the runs ended.
+
+    Args:
+        words: Prepared overrides.
+        master: Configuration with Hydra's own section, which has the parameters of an experiment and the
+            settings of the launcher.
+        config_dir: Folder with files of the user's own.
+
+    Returns:
+        Exit code: 0 if every result is there, 2 if a run was refused, else 1.
+
+    Raises:
+        ConfigError: If the overrides give no runs, or all of them are refused for the same reason.
+    """
+    settings = _launcher_settings(master.hydra.launcher)
+    jobs = jobs_of(words, master.hydra.sweeper.params or {}, config_dir)
+    entries = compose_jobs(jobs, config_dir)
+    by_path = {
+        str(result_path(one)): job for one, job in zip(entries, jobs, strict=True) if isinstance(one, Config)
+    }
+    cfgs = [one for one in entries if isinstance(one, Config)]
+    ended = [one for one in entries if isinstance(one, Outcome)]
+    if not cfgs and len({one.message for one in ended}) == 1:
+        # A mistake in what all jobs have in common.
+        raise ConfigError(ended[0].message)
+    with ExitStack() as stack:
+        carry, processes = _carry_here, 1
+        if settings["inner"] is not None:
+            carry, processes = _Elsewhere(master, settings["inner"], by_path), _processes(settings["inner"])
+        else:
+            for cfg in cfgs:
+                require_runnable(cfg)
+            if settings["per_gpu"]:
+                carry, processes = stack.enter_context(gpu_workers(settings["per_gpu"], len(cfgs), look_up))
+        try:
+            for one in run_batches(cfgs, carry, settings["batch_size"], processes, settings["per_gpu"] or 1):
+                ended.append(one)
+        finally:
+            code = report(ended)
+    return code
+
+
+def _launcher_settings(launcher: DictConfig) -> Mapping[str, Any]:
+    if "_target_" in launcher:
+        # One of Hydra's: a job per run.
+        return {"inner": launcher, "batch_size": 1, "per_gpu": 0}
+    for name, least in (("batch_size", 1), ("per_gpu", 0)):
+        value = launcher[name]
+        if value is not None and (type(value) is not int or value < least):
+            raise ConfigError(f"hydra.launcher.{name} must be at least {least}, not {value}")
+    inner = launcher.inner
+    if inner is not None and not (OmegaConf.is_dict(inner) and "_target_" in inner):
+        raise ConfigError("hydra.launcher.inner: choose one, such as hydra/launcher=batch_joblib")
+    return launcher
+
+
+# --------------------------------------------------------------------------------------------- configurations
+
+
+def jobs_of(
+    words: Sequence[str], parameters: Mapping[str, Any], config_dir: str | None = None
+) -> list[list[str]]:
+    """Return the overrides of each run of a sweep.
+
+    Args:
+        words: Prepared overrides; those of Hydra's settings are left out.
+        parameters: Values by key of an experiment, which overrides narrow.
+        config_dir: Folder with files of the user's own.
+    """
+    parsed = parse([*(f"{key}={value}" for key, value in parameters.items()), *words])
+    # The last value of a key counts.
+    given = {one.get_key_element(): one for one in parsed if not one.is_hydra_override()}
+    return combinations((one, choices(one.key_or_group, config_dir)) for one in given.values())
+
+
+def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
+    """Compose and check the runs of a sweep; what several of them share, once.
+
+    Args:
+        jobs: Prepared overrides of each.
+        config_dir: Folder with files of the user's own.
+
+    Returns:
+        Configuration of each job, or why there is none.
+    """
+    kept: dict[tuple[str, ...], bytes] = {}
+    finished: dict[tuple[str, ...], Config | str] = {}
+    entries: list[Config | Outcome] = []
+    for job in jobs:
+        # Nothing else in a configuration depends on the seed.
+        seeds = [word for word in job if re.fullmatch(r"seed=\d{1,9}", word)]
+        words = tuple(word for word in job if word not in seeds)
+        if words not in finished:
+            finished[words] = _checked(words, config_dir, kept)
+        made = finished[words]
+        if isinstance(made, str):
+            entries.append(Outcome(" ".join(job), "", "refused", message=made))
+        else:
+            entries.append(replace(made, seed=int(seeds[-1].partition("=")[2])) if seeds else made)
+    return entries
+
+
+def _checked(
+    words: Sequence[str], config_dir: str | None, kept: dict[tuple[str, ...], bytes]
+) -> Config | str:
+    """Return the configuration of some overrides, or what is wrong with it, its scene or its target."""
+    try:
+        cfg = finish(compose(words, config_dir, kept), words, alone=False)
+        check_sources(cfg)
+    except (ConfigError, SceneError, TargetError) as error:
+        return str(error)
+    return cfg
+
+
+# ---------------------------------------------------------------------------------------------------- batches
+
+
+def run_batches(
+    cfgs: Sequence[Config], carry: Carrier, size: int | None = None, processes: int = 1, sharing: int = 1
+) -> Iterator[Outcome]:
+    """Carry out the runs of a sweep that are not finished, and yield how each ended.
+
+    Runs that another process computes are left to it. Should it end before they do, they are taken up here.
+
+    Args:
+        cfgs: Their configurations.
+        carry: Carries out batches.
+        size: Runs of a batch, at most; None: as many as fit the memory.
+        processes: Batches that are carried out at a time.
+        sharing: How many of these use one device.
+    """
+    # The same run given twice is one run.
+    wanted = {str(result_path(cfg)): cfg for cfg in cfgs}
+    ended: dict[str, Outcome] = {}
+    for path, cfg in wanted.items():
+        if not cfg.force and (done := _finished_before(cfg)) is not None:
+            ended[path] = done
+            yield done
+    if ended:
+        print(f"{len(ended)} of {len(wanted)} runs finished before", flush=True)
+    todo = [cfg for path, cfg in wanted.items() if path not in ended]
+    while todo:
+        away = []
+        for one in carry(plan(todo, size, processes, sharing), lambda: f"[{len(ended)}/{len(wanted)} runs] "):
+            if one.status == "elsewhere":
+                away.append(one)
+            else:
+                ended[one.path] = one
+                yield one
+        todo = [wanted[one.path] for one in away if not held(one.path)]
+        yield from (one for one in away if held(one.path))
+
+
+def _carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
+    """Carry out batches in this process, one after the other."""
+    cache = SimulatorCache()
+    for batch in batches:
+        yield from runners.run_batch(batch, progress(), cache)
+
+
+class _Elsewhere:
+    """Hands batches to a launcher of Hydra's, one job each."""
+
+    def __init__(self, master: DictConfig, inner: DictConfig, jobs: Mapping[str, list[str]]) -> None:
+        """Keep the launcher's settings, and the overrides of each run by its result file."""
+        self._config, self._jobs = deepcopy(master), jobs
+        with open_dict(self._config.hydra):
+            self._config.hydra.launcher = inner
+
+    def __call__(self, batches: list[list[Config]], _progress: Callable[[], str]) -> Iterator[Outcome]:
+        """Carry out batches."""
+        context = HydraContext(hydra_app().config_loader, Callbacks(self._config))
+        name = self._config.hydra.launcher["_target_"].rpartition(".")[2]
+        runs = sum(len(batch) for batch in batches)
+        alone = "; hydra.launcher.batch_size=1 makes a job of each" if runs > len(batches) == 1 else ""
+        print(f"{runs} runs go to {name} in {len(batches)} jobs{alone}", flush=True)
+        try:
+            launcher = Plugins.instance().instantiate_launcher(
+                hydra_context=context, task_function=_BatchTask(batches), config=self._config
+            )
+            with passed_on():
+                # A job composes the configuration of its first run and then computes the whole batch.
+                returns = launcher.launch([self._jobs[str(result_path(batch[0]))] for batch in batches], 0)
+            yield from [one for job in returns for one in job.return_value]
+        except Exception as error:
+            # A job's process was killed, or the queue refused the jobs: the files know how far they came.
+            tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
+            yield from [look_up(cfg) for batch in batches for cfg in batch]
+
+
+class _BatchTask:
+    """The task of a launcher's jobs: each carries out the batch of its number."""
+
+    def __init__(self, batches: Sequence[Sequence[Config]]) -> None:
+        self._batches = batches
+
+    def __call__(self, _composed: DictConfig) -> list[Outcome]:
+        """Carry out a batch; called in the job's process."""
+        number = HydraConfig.get().job.num
+        note = f"[batch {number + 1}/{len(self._batches)}] " if len(self._batches) > 1 else ""
+        return runners.run_batch(self._batches[number], note, SimulatorCache())
+
+
+def _processes(inner: DictConfig) -> int:
+    """Return how many processes another launcher starts at a time, as far as its settings tell."""
+    wanted = inner.get("n_jobs", 1)
+    # As joblib counts: -1 is one for each core.
+    return wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
+
+
+def look_up(cfg: Config) -> Outcome:
+    """Say from its files how a run ended whose process cannot say it any more."""
+    path = result_path(cfg)
+    if (done := _finished_before(cfg)) is not None:
+        return outcome(cfg, "finished", done.score)
+    if held(path):
+        return outcome(cfg, "elsewhere", message=f"{path} is being computed by another process")
+    try:
+        left = read(path.with_suffix(PARTIAL_SUFFIX))
+    except ResultsError:
+        return outcome(cfg, "lost", message="no result, and no process computes it now")
+    if left.status == "failed":
+        return outcome(cfg, "failed", message=left.message)
+    return outcome(cfg, "lost", message=f"{left.rows} iterations, and no process computes it now")
+
+
+def _finished_before(cfg: Config) -> Outcome | None:
+    """Return the outcome of a run whose result is there."""
+    path = result_path(cfg)
+    try:
+        # Where there is something left of a process that was killed, RunFile clears it up.
+        left = path.exists() and any(
+            one.exists() for one in (lock_path(path), path.with_suffix(PARTIAL_SUFFIX))
+        )
+        result = RunFile(cfg).result if left else read(path)
+    except ResultsError:
+        return None
+    return outcome(cfg, "before", result.score) if result.status == "finished" else None
