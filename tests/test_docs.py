@@ -6,33 +6,30 @@ import argparse
 import ast
 import functools
 import importlib
-import itertools
 import json
 import re
 import shlex
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override
 
-from plab.cli.run import _parse as parse_run
+from plab.cli.main import COMMANDS
+from plab.cli.run import parser
 from plab.config import choices, load_config
 from plab.config.selection import select
+from plab.config.words import parse, prepared, swept
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = ("README.md", "CONTRIBUTING.md", "docs/*.md", "src/**/README.md")
 PAGES = sorted(path for pattern in FILES for path in ROOT.glob(pattern))
 NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
 WORDS = {
-    "plab.report": ("task", "variant", "method", "seed"),
-    "plab.status": ("task", "variant", "method", "seed"),
-    "plab.results": ("task", "variant", "method", "seed", "status"),
+    "report": ("task", "variant", "method", "seed"),
+    "status": ("task", "variant", "method", "seed"),
+    "results": ("task", "variant", "method", "seed", "status"),
 }
-"""Names by which modules choose runs that exist, instead of composing a configuration."""
+"""Names by which commands choose runs that exist, instead of composing a configuration."""
 
 
 def shown(page: Path) -> Iterator[str]:
@@ -50,17 +47,17 @@ def commands(pattern: str) -> list[str]:
     return sorted({match[0].partition(" #")[0].rstrip(" &") for match in found if match})
 
 
-# Three words name a program, and do not say how it is used.
+# Two words name a program, and do not say how it is used.
 PLAB = [
-    command
-    for command in commands(r"python -m plab\.\S+ .*")
-    if "..." not in command and len(command.split()) > 3
+    command.replace("python -m plab.", "plab ").replace("plab bench.", "plab bench ")
+    for command in commands(rf"(?<![\w./])(python -m plab\.|plab )({'|'.join(COMMANDS)})\b.*")
+    if "..." not in command and len(command.replace("python -m ", "").replace(".", " ").split()) > 2
 ]
 
 
 def test_commands_and_code_are_found():
     assert len(PLAB) > 60 and len(PYTHON) > 20
-    assert {command.split()[2] for command in PLAB} > {"plab.run", "plab.report", "plab.bench.speed"}
+    assert {command.split()[1] for command in PLAB} > {"run", "report", "bench"}
 
 
 @functools.cache
@@ -87,64 +84,52 @@ def star_files(tmp_path_factory):
 def test_a_command_that_is_shown_makes_sense(command, monkeypatch, star_files):
     monkeypatch.chdir(ROOT)
     monkeypatch.syspath_prepend(str(star_files))
-    module, *argv = shlex.split(command)[2:]
-    if module == "plab.run":
+    name, *argv = shlex.split(command)[1:]
+    if name == "run":
         check_run(argv)
         return
-    options = parsed(module, argv, monkeypatch)
-    names = ("words", "arguments", "overrides", "what")
+    options = parsed(name, argv, monkeypatch)
+    names = ("sources", "arguments", "overrides", "what")
     words = next((own for name in names if (own := getattr(options, name, []))), [])
     words = [word for word in words if "=" in word] if isinstance(words, list) else []
-    if module in WORDS:
-        select(words, WORDS[module])
+    if name in WORDS:
+        select(words, WORDS[name])
         return
     for method in getattr(options, "methods", [None]):
         chosen = [f"method={method}"] if method else []
         compose((*words, *chosen), getattr(options, "config_dir", None))
 
 
-def parsed(module: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
-    """Return the options of a module's command line, of which nothing else is done."""
+def parsed(name: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argparse.Namespace:
+    """Return the options of a command, of which nothing else is done."""
     options: list[argparse.Namespace] = []
-    for name in ("parse_args", "parse_intermixed_args"):
-        usual = getattr(argparse.ArgumentParser, name)
+    for way in ("parse_args", "parse_intermixed_args"):
+        usual = getattr(argparse.ArgumentParser, way)
 
         def parse(self, args=None, namespace=None, usual=usual):
             read = usual(self, args, namespace)
             if hasattr(read, "command"):
-                # That of plab.results, which reads the rest by another parser.
+                # That of plab results, which reads the rest by another parser.
                 return read
             options.append(read)
             raise Parsed
 
-        monkeypatch.setattr(argparse.ArgumentParser, name, parse)
-    found = importlib.import_module(module)
-    if hasattr(found, "__path__"):
-        found = importlib.import_module(f"{module}.__main__")
+        monkeypatch.setattr(argparse.ArgumentParser, way, parse)
     with pytest.raises(Parsed):
-        found.main(argv)
+        importlib.import_module("plab.bench" if name == "bench" else f"plab.cli.{name}").main(argv)
     return options[0]
 
 
 def check_run(argv: list[str]) -> None:
     """Compose what a run's command line asks for; of a sweep the first and the last run."""
-    _, arguments = parse_run(argv)
-    overrides = OverridesParser.create().parse_overrides(list(arguments.overrides))
-    assert arguments.multirun or not any(override.is_sweep_override() for override in overrides)
-    if "hydra/launcher=batch_ray" in arguments.overrides and find_spec("ray") is None:
-        # An extra that goes with no other launcher: docs/sweeps.md.
-        overrides = [override for override in overrides if not override.is_hydra_override()]
-    values = [swept(override) for override in overrides]
-    for words in {tuple(own[end] for own in values) for end in (0, -1)}:
-        compose(words, arguments.config_dir)
-
-
-def swept(override: Override) -> list[str]:
-    """Return the overrides that a sweep makes of one."""
-    if isinstance(override.value(), Glob):
-        names = [name for name in choices(override.key_or_group) if override.value().filter([name])]
-        return [f"{override.key_or_group}={name}" for name in names]
-    return list(itertools.chain.from_iterable(*BasicSweeper.split_arguments([override], None)))
+    options = parser().parse_intermixed_args(argv)
+    overrides = parse(prepared(options.overrides))
+    assert options.multirun or not any(one.is_sweep_override() for one in overrides)
+    # Launchers are extras.
+    overrides = [one for one in overrides if not one.is_hydra_override()]
+    values = [(one.get_key_element(), swept(one, choices(one.key_or_group))) for one in overrides]
+    for end in (0, -1):
+        compose(tuple(f"{key}={own[end]}" for key, own in values), options.config_dir)
 
 
 @pytest.mark.parametrize("command", commands(r"\bmake [a-z].*"))

@@ -106,7 +106,7 @@ def sources_and_words(
     named = [one.removeprefix("results=") for one in arguments if one not in words]
     if not all(one.strip() for one in named):
         raise ArgumentError("the name of a folder is empty: give one, or . for this one")
-    return [results_source(one) for one in named or [default] if one is not None], words
+    return [results_source(one) for one in named or ([default] if default else [])], words
 
 
 def positive(text: str, least: int = 1) -> int:

@@ -455,7 +455,7 @@ def _choose_profile(method: DictConfig) -> None:
     _resolve(method, ["profiles"])
 
 
-def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
+def _resolve(section: DictConfig, tables: Container[Any]) -> None:
     """Put values where they are referred to, except in tables, which are empty afterwards."""
     for key, node in section.items_ex(resolve=False):
         if OmegaConf.is_interpolation(section, str(key)):
