@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -86,6 +88,14 @@ def test_a_run_gets_the_configuration_and_leaves_nothing_else_behind(seen, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_sweeps_over_groups_with_keys_that_the_default_has_not(seen):
+    assert main(["-m", "task=Move", "method=sac,ppo", "method.episodes=2"]) == 0
+    assert main(["-m", "method=cem,cmaes", "method.population=70"]) == 0
+    assert main(["-m", "method=sac,td3", "method.tau=0.01"]) == 0
+    assert [cfg.method.name for cfg in seen] == ["sac", "ppo", "cem", "cmaes", "sac", "td3"]
+    assert [cfg.method.episodes for cfg in seen[:2]] == [2, 2] and seen[4].method.tau == 0.01
+
+
 def test_an_experiment_is_a_sweep(seen):
     assert main(["+experiment=yield_ablation", "method.episodes=7"]) == 0
     assert [cfg.task.yield_stress for cfg in seen] == [10, 20, 50, 100, 200, 1000]
@@ -136,10 +146,17 @@ def test_a_run_that_breaks_off_is_one_line(monkeypatch, capsys, error, code, nam
     assert line.startswith("plab: ") and line.count("\n") == 1 and named in line
 
 
+def test_sigterm_ends_a_run_as_ctrl_c_does(monkeypatch, capsys):
+    monkeypatch.setattr("plab.runners.run_config", lambda cfg: signal.raise_signal(signal.SIGTERM))
+    assert main([]) == 130 and "run the same command again" in capsys.readouterr().err
+
+
 def test_a_real_run_and_the_same_command_again(tmp_path, capsys):
     command = ("task=Rope", "method=adam", *COARSE, "method.iterations=2")
     words = [sys.executable, "-m", "plab.run", *command]
-    first = subprocess.run(words, capture_output=True, text=True, check=False)
+    # Without HOME, too, of which Taichi makes its own cache.
+    homeless = {name: value for name, value in os.environ.items() if name != "HOME"}
+    first = subprocess.run(words, capture_output=True, text=True, check=False, env=homeless)
     assert (first.returncode, first.stderr) == (0, "")
     assert main(command) == 0 and "finished before" in capsys.readouterr().out
     (result,) = (path for path in tmp_path.rglob("*") if path.is_file())

@@ -135,7 +135,7 @@ def test_particles_scale():
 
 def test_scalar_overrides_reach_the_scene():
     given = [
-        "task.yield_stress=inf",
+        "task.yield_stress=.inf",
         "task.gravity=[0,-5,0]",
         "sim.dt=1.5e-4",
         "task.manipulators.left.friction=0",
@@ -146,6 +146,12 @@ def test_scalar_overrides_reach_the_scene():
     assert scene.dt == 1.5e-4
     assert scene.manipulators[0].friction == 0
     assert scene.manipulators[1].friction == 0.9
+
+
+def test_a_tilde_is_the_home(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    cfg = load_config(["results_dir=~/my results", "targets.source=~/files"])
+    assert (cfg.results_dir, cfg.targets.source) == ("/home/me/my results", "/home/me/files")
 
 
 def test_the_variant_is_a_string_and_seed_scene_is_left_out():

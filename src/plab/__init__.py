@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 # version, platform and a number of its own to its makers.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+if os.name == "posix" and "HOME" not in os.environ:
+    # Taichi aborts without it.
+    os.environ["HOME"] = next(filter(os.path.isdir, (os.path.expanduser("~"), tempfile.gettempdir())))
 
 from plab.config.suite import suite_tasks
 from plab.envs import make, make_vec, register_suite

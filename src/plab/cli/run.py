@@ -34,12 +34,13 @@ def main(argv: Sequence[str]) -> int:
         Exit code: 0 if every result is there, 1 if a run broke off, 2 for a mistake of the user's.
     """
     options = parser().parse_intermixed_args(argv)
+    words, config_dir = prepared(options.overrides), options.config_dir
     if options.help or options.help_all:
         from plab.cli.help import full_help_text, help_text
 
-        print((full_help_text if options.help_all else help_text)(options.config_dir))
+        check_overrides([], config_dir)
+        print((full_help_text if options.help_all else help_text)(config_dir))
         return 0
-    words, config_dir = prepared(options.overrides), options.config_dir
     check_overrides(words, config_dir)
     if options.package and not options.cfg:
         raise ConfigError("--package has no effect without --cfg: write --cfg job --package sim")

@@ -455,12 +455,12 @@ def _choose_profile(method: DictConfig) -> None:
     _resolve(method, ["profiles"])
 
 
-def _resolve(section: DictConfig, tables: Container[Any]) -> None:
+def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
     """Put values where they are referred to, except in tables, which are empty afterwards."""
     for key, node in section.items_ex(resolve=False):
         if OmegaConf.is_interpolation(section, str(key)):
             section[key] = section[key]
-        elif key not in tables and OmegaConf.is_config(node):
+        elif key not in set(tables) and OmegaConf.is_config(node):
             OmegaConf.resolve(node)
     for table in tables:
         section[table] = {}
