@@ -9,7 +9,7 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 
-from plab.autograd import policy_gradient, rollout
+from plab.autograd import policy_gradient, rollout, simulate
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
@@ -74,7 +74,16 @@ def test_losses_and_gradients_are_the_simulators(problem: Problem, monkeypatch) 
         return intact(self, tried, gradient=gradient)
 
     monkeypatch.setattr(Problem, "try_out", try_out)
-    assert not rollout(problem, actions.detach()).requires_grad and wanted == [False]
+    assert not rollout(problem, actions.detach()).requires_grad
+    with torch.no_grad():
+        rollout(problem, actions)
+    assert wanted == [False, False]
+    # Integers are converted, so that losses and states are not cut to integers.
+    ones = torch.ones(actions.shape, dtype=torch.int64)
+    assert torch.equal(rollout(problem, ones), rollout(problem, ones.double()))
+    assert simulate(problem.simulator, ones).x.dtype == torch.float64
+    with pytest.raises(TypeError, match="complex"):
+        rollout(problem, ones.cfloat())
 
 
 def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBatch) -> None:
@@ -87,6 +96,8 @@ def test_environments_of_tensors_do_what_those_of_arrays_do(episodes: EpisodeBat
         np.testing.assert_array_equal(got.observation.numpy(), want.observation)
         np.testing.assert_array_equal(got.reward.numpy(), want.reward.astype(np.float32))
         assert got.info.keys() == want.info.keys() and got.truncated == want.truncated == (t == HORIZON - 1)
+    env.reset()
+    assert env.step(torch.ones((2, 6), dtype=torch.int32)).reward.dtype == torch.float64
 
 
 def test_gradient_goes_on_through_what_the_actions_are_made_of(problem: Problem) -> None:

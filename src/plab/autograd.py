@@ -16,6 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import floating
 from plab.sim.state import require_none
 
 if TYPE_CHECKING:
@@ -30,43 +31,52 @@ def rollout(problem: Problem, actions: torch.Tensor) -> torch.Tensor:
 
     The contact model is the one that the problem's simulator is set to. The gradient is that of a sequence of
     actions: what else the actions depend on, such as observations, is outside it. Where an action lies beyond
-    [-1, 1], it is clipped and has no gradient. The gradient is computed together with the losses, if the
-    actions require one, and has no derivative of its own.
+    [-1, 1], it is clipped and has no gradient. The gradient is computed together with the losses, where the
+    actions require one and PyTorch records gradients, and has no derivative of its own.
 
     Args:
         problem: Scenes, targets and simulator.
-        actions: Actions, shape [batch, T, A], of any floating-point type and on any device.
+        actions: Actions, shape [batch, T, A], on any device; integers become floating-point numbers of the
+            simulator's precision.
 
     Returns:
         Sum of the weighted step losses of each environment, shape [batch], like ``actions`` in type and
         device.
 
     Raises:
+        TypeError: If the actions are complex.
         ValueError: If the shape is wrong or an action is not finite.
         plab.sim.SimulationError: If state, loss or gradient stop being finite.
         MemoryError: If the gradient does not fit the memory budget.
     """
-    return _Rollout.apply(actions, problem)
+    actions = floating(actions, problem.simulator)
+    # Within an autograd.Function recording is always off.
+    return _Rollout.apply(actions, problem, actions.requires_grad and torch.is_grad_enabled())
 
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, actions: torch.Tensor, problem: Problem) -> torch.Tensor:
-        wanted = ctx.needs_input_grad[0]
-        given = actions.detach()
-        if not (given.is_cuda and problem.simulator.device == "cuda"):
-            given = given.cpu().double().numpy()
-        result = problem.try_out(given, gradient=wanted)
+    def forward(ctx: Any, actions: torch.Tensor, problem: Problem, gradient: bool) -> torch.Tensor:
+        result = problem.try_out(_given(actions, problem.simulator), gradient=gradient)
         require_none(result.failures)
-        if wanted:
+        if gradient:
             ctx.save_for_backward(torch.as_tensor(result.gradient).to(actions))
         return torch.as_tensor(result.measures["loss"]).to(actions)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None]:
+    def backward(ctx: Any, loss_bar: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        return loss_bar[:, None, None] * gradient, None
+        return loss_bar[:, None, None] * gradient, None, None
+
+
+def _given(tensor: torch.Tensor, simulator: Simulator) -> Any:
+    """Return a tensor as the simulator takes it: on its CUDA device as it is, else as an array."""
+    return tensor.detach() if tensor.is_cuda and simulator.device == "cuda" else _numbers(tensor)
+
+
+def _numbers(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()
 
 
 class States(NamedTuple):
@@ -105,7 +115,8 @@ def simulate(
     Args:
         simulator: The simulator; built with ``full_gradient=True`` where initial state or material require a
             gradient.
-        actions: Actions, shape [batch, T, A], of any floating-point type and on any device.
+        actions: Actions, shape [batch, T, A], on any device; integers become floating-point numbers of the
+            simulator's precision.
         every_step: Whether to return the state after every environment step, or the last one alone.
         mass: Whether to return mass tensors.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] where
@@ -117,7 +128,7 @@ def simulate(
         The states, like ``actions`` in type and device.
 
     Raises:
-        TypeError: If ``initial`` names something else.
+        TypeError: If ``initial`` names something else, or the actions are complex.
         ValueError: If a shape is wrong or an action is not finite.
         plab.scenes.SceneError: If the material cannot be simulated.
         plab.sim.SimulationError: If state or gradient stop being finite.
@@ -127,8 +138,9 @@ def simulate(
     """
     if unknown := set(initial) - set(_FIELDS):
         raise TypeError(f"'{min(unknown)}' is no part of a state: {', '.join(_FIELDS)}")
-    given = [initial.get(name) for name in _FIELDS]
-    return States(*_States.apply(simulator, every_step, mass, actions, material, *given))
+    parts = [floating(actions, simulator), material, *(initial.get(name) for name in _FIELDS)]
+    gradient = torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in parts)
+    return States(*_States.apply(simulator, every_step, mass, gradient, *parts))
 
 
 _FIELDS = ("x", "v", "C", "F", "poses")
@@ -141,6 +153,7 @@ class _States(torch.autograd.Function):
         simulator: Simulator,
         every_step: bool,
         mass: bool,
+        gradient: bool,
         actions: torch.Tensor,
         material: torch.Tensor | None,
         *initial: torch.Tensor | None,
@@ -148,12 +161,8 @@ class _States(torch.autograd.Function):
         if material is not None:
             simulator.set_material(*np.moveaxis(_numbers(material), -1, 0))
         _start(simulator, {n: _numbers(t) for n, t in zip(_FIELDS, initial, strict=True) if t is not None})
-        given = actions.detach()
-        if not (given.is_cuda and simulator.device == "cuda"):
-            given = given.cpu().double().numpy()
-        recording = simulator.record(
-            given, every_step=every_step, mass=mass, gradient=any(ctx.needs_input_grad)
-        )
+        given = _given(actions, simulator)
+        recording = simulator.record(given, every_step=every_step, mass=mass, gradient=gradient)
         ctx.simulator, ctx.recording = simulator, recording
         ctx.likes = actions, material, *initial
         ctx.set_materialize_grads(False)
@@ -165,16 +174,14 @@ class _States(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *bars: torch.Tensor | None) -> tuple[Any, ...]:
         recording: Recording = ctx.recording
-        on_cuda = ctx.simulator.device == "cuda"
-        named = zip(("x", "v", "poses", "mass"), bars, strict=True)
         held = {
-            name: bar.detach() if on_cuda and bar.is_cuda else _numbers(bar)
-            for name, bar in named
+            name: _given(bar, ctx.simulator)
+            for name, bar in zip(States._fields, bars, strict=True)
             if bar is not None and bar.numel()
         }
         actions, material, *initial = ctx.likes
         gradients: list[torch.Tensor | None] = [torch.as_tensor(recording.pullback(**held)).to(actions)]
-        if ctx.needs_input_grad[4]:
+        if ctx.needs_input_grad[5]:
             by_material = ctx.simulator.material_gradient()
             if by_material.ndim > material.ndim:
                 # One for all bodies.
@@ -182,15 +189,11 @@ class _States(torch.autograd.Function):
             gradients.append(torch.as_tensor(by_material).to(material))
         else:
             gradients.append(None)
-        wanted = ctx.needs_input_grad[5:]
+        wanted = ctx.needs_input_grad[6:]
         state: State | None = ctx.simulator.state_gradient() if any(wanted) else None
         for name, like, asked in zip(_FIELDS, initial, wanted, strict=True):
             gradients.append(torch.as_tensor(getattr(state, name)).to(like) if asked else None)
-        return None, None, None, *gradients
-
-
-def _numbers(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy()
+        return None, None, None, None, *gradients
 
 
 def _start(simulator: Simulator, parts: dict[str, np.ndarray]) -> None:

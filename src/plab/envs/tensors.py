@@ -7,8 +7,20 @@ from dataclasses import replace
 import torch
 
 from plab.envs.core import EpisodeBatch, Transition
+from plab.sim import Simulator
 
-__all__ = ["TensorEnv"]
+__all__ = ["TensorEnv", "floating"]
+
+
+def floating(actions: torch.Tensor, simulator: Simulator) -> torch.Tensor:
+    """Return actions as floating-point numbers: integers in the simulator's precision, others as they are.
+
+    Raises:
+        TypeError: If they are complex.
+    """
+    if actions.is_complex():
+        raise TypeError(f"actions must be real numbers, not {actions.dtype}")
+    return actions if actions.is_floating_point() else actions.to(getattr(torch, simulator.precision))
 
 
 class TensorEnv:
@@ -23,7 +35,7 @@ class TensorEnv:
     """
 
     def __init__(self, batch: EpisodeBatch) -> None:
-        """Give tensors' way into environments that there are."""
+        """Wrap a batch of episodes."""
         self.batch = batch
         self.device = torch.device(batch.problem.simulator.device)
         self._like = torch.empty(0, device=self.device)
@@ -42,14 +54,15 @@ class TensorEnv:
                 :meth:`plab.envs.core.EpisodeBatch.step`.
 
         Returns:
-            Tensors; observations are float32, the others have the type of the actions.
+            Tensors; observations are float32, the others have the type of the actions, or the simulator's
+            precision if those are integers.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
             gymnasium.error.ResetNeeded: If no episode has been started, or it is over.
             plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
-        actions = actions.detach().to(self.device)
+        actions = floating(actions.detach().to(self.device), self.batch.problem.simulator)
         if self.device.type == "cuda":
             return self.batch.step(actions, strict=strict)
         done = self.batch.step(actions.double().numpy(), strict=strict)
