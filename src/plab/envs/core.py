@@ -1,7 +1,7 @@
-"""What all environments share: a batch of episodes that start, advance and end together.
+"""Batch of episodes that start, advance and end together, below the environments of all libraries.
 
-The environments for Gymnasium and Stable-Baselines3 put :class:`EpisodeBatch` into the form that each library
-asks for, and add nothing of their own.
+The environments for Gymnasium, Stable-Baselines3 and PyTorch are views of an :class:`EpisodeBatch` in the
+form that each library asks for, and add nothing of their own.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numpy.typing import ArrayLike
 
 from plab.config import Config, load_config
 from plab.config.selection import OBSERVED
@@ -35,14 +34,10 @@ __all__ = [
     "PICTURE_SIZE",
     "EpisodeBatch",
     "Transition",
-    "action_array",
     "check_render_mode",
     "compose_configs",
     "refuse_options",
 ]
-
-MOST_ENVS = 100_000
-"""Sub-environments, at most; what fits into the memory is less, and found out with the scene."""
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
@@ -85,8 +80,6 @@ def compose_configs(
     """
     if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
         raise ArgumentError(f"num_envs must be a whole number of at least 1, not {num_envs!r}")
-    if num_envs > MOST_ENVS:
-        raise ArgumentError(f"num_envs={num_envs} is too many for one simulator: use at most {MOST_ENVS}")
     own = [()] * num_envs if overrides_per_env is None else list(overrides_per_env)
     if len(own) != num_envs:
         raise ArgumentError(f"overrides_per_env has {len(own)} entries, but num_envs is {num_envs}")
@@ -100,25 +93,6 @@ def compose_configs(
     return [made[entries] for entries in lists]
 
 
-def action_array(actions: ArrayLike, shape: tuple[int, ...] | None) -> np.ndarray:
-    """Return actions as an array, float64.
-
-    Args:
-        actions: What the caller gave.
-        shape: Shape that it must have.
-
-    Raises:
-        ValueError: If it has another shape or its entries are no numbers.
-    """
-    try:
-        array = np.asarray(actions, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ArgumentError(f"actions have to be numbers: {error}") from None
-    if array.shape != shape:
-        raise ArgumentError(f"actions have shape {list(array.shape)}, not {list(shape or ())}")
-    return array
-
-
 def refuse_options(options: Mapping[str, Any] | None) -> None:
     """Raise ValueError if ``reset`` was given an option: there are none."""
     if options:
@@ -126,11 +100,7 @@ def refuse_options(options: Mapping[str, Any] | None) -> None:
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """Return a render mode that exists.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Return a render mode; ValueError if there is none of this name."""
     modes = METADATA["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise ArgumentError(f"render_mode '{render_mode}' is not one of {', '.join(modes)}")
@@ -142,15 +112,15 @@ def check_render_mode(render_mode: str | None) -> str | None:
 
 @dataclass(frozen=True)
 class Transition:
-    """What one step of all sub-environments gave. The arrays are the caller's.
+    """Result of one step of all sub-environments. The arrays are the caller's.
 
     Attributes:
         observation: Observations, shape [batch, entry], float32.
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         truncated: Whether the episodes are over.
         info: The entries of ``info``, each of shape [batch], in type like the rewards.
-        failures: Environments that have broken off in the episode, and when and why; their numbers are those
-            of the step before. Empty unless the step was not ``strict``.
+        failures: Environments that have broken off in the episode, with time and reason; their numbers are
+            those of the step before. Empty if the step was ``strict``.
     """
 
     observation: Array
@@ -201,9 +171,8 @@ class EpisodeBatch:
         self._begin()
 
     def renew(self, cfgs: Sequence[Config]) -> None:
-        """Let the sub-environments be others of the same kind; the episodes start at :meth:`reset`.
-
-        Nothing is compiled anew.
+        """Replace the sub-environments by others of the same kind, without compiling; the episodes start at
+        :meth:`reset`.
 
         Args:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
@@ -220,7 +189,7 @@ class EpisodeBatch:
         scenes, simulator, problem = build_scenes(cfgs), self._simulator, self.problem
         simulator.reset()
         if kinds_of(cfgs) != kinds_of(self.configs):
-            # Of none, should there be an error half way.
+            # After an error half way, the batch belongs to no configurations.
             self.configs: tuple[Config, ...] = ()
             simulator.set_scenes(scenes)
             problem = Problem(cfgs, simulator)
@@ -228,7 +197,6 @@ class EpisodeBatch:
         self._begin()
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
-        """Be made of configurations, one per sub-environment."""
         self._close_renderers()
         self._problem: Problem | None = problem
         self.configs = tuple(cfgs)
@@ -236,10 +204,10 @@ class EpisodeBatch:
         problem.simulator.set_contact(self.contact, softness=[cfg.method.softness for cfg in cfgs])
 
     def _begin(self) -> None:
-        """Look at the initial states; no episode has started."""
+        """Observe the initial states; no episode has started."""
         self._step: int | None = None
         self._failures: dict[int, str] = {}
-        # Where environments rest that break off: observations, loss terms and IoU.
+        # Observations, loss terms and IoU of the last step, which environments that break off keep.
         self._initial = self._last = self._seen()
         self._initial_loss = Constants(self._info(*self._initial[1:])["loss"])
 
@@ -284,8 +252,8 @@ class EpisodeBatch:
             actions: Actions, shape [batch, action]; clipped to [-1, 1]. Given a CUDA tensor, what comes back
                 are tensors on the same device, and no array crosses to the host.
             strict: Whether a sub-environment that breaks off is an error. Otherwise, the same for all steps
-                of an episode, it is an entry in ``failures`` and rests: what it is seen by stays what it was
-                before, while the others go on, and it is whole again after :meth:`reset`.
+                of an episode, it is an entry in ``failures`` and keeps its last numbers while the others go
+                on; :meth:`reset` restores it.
 
         Raises:
             ValueError: If the shape is wrong or an action is not finite.
@@ -294,7 +262,7 @@ class EpisodeBatch:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
         simulator, now = self._simulator, self._now()
-        # Faults are found with the measures: one wait for the device less.
+        # The measures report faults, too: checking here would wait for the device twice.
         simulator.step(actions, check=False)
         # Queued before the wait for the measures.
         observation = self._observe(actions)
@@ -303,7 +271,7 @@ class EpisodeBatch:
         except SimulationError as error:
             if strict:
                 raise
-            # Told once a step: asked again, the measures are those of the others.
+            # Raised once a step: the second call returns the measures of the others.
             self._failures, measures = error.failures | self._failures, simulator.measure(actions)
         seen = observation, measures.terms, measures.iou
         if self._failures:
@@ -356,9 +324,7 @@ class EpisodeBatch:
 
         def reaction(t: int, actions_bar: Array) -> tuple[Array, Array] | None:
             bar = react(t, actions_bar)
-            if bar is None:
-                return None
-            return self._observer.pull_back(bar)
+            return None if bar is None else self._observer.pull_back(bar)
 
         terms = self._simulator.closed_loop(
             steps, chosen, reaction, stride=self._observer.stride, discount=discount, like=like
@@ -367,7 +333,7 @@ class EpisodeBatch:
         return terms
 
     def _now(self, steps: int = 1) -> int:
-        """Return the number of the step that is next, of which so many have to be left."""
+        """Return the index of the next step; ResetNeeded if fewer steps are left."""
         if self._step is None or self._step + steps > self.horizon:
             what = "no episode has started" if self._step is None else "the episode is over"
             raise ResetNeeded(f"{what}: call reset() before step()")
@@ -391,7 +357,7 @@ class EpisodeBatch:
         return tuple(r.frame(x[e], poses[e]) for e, r in enumerate(self._renderers))
 
     def close(self) -> None:
-        """Let go of the simulator and the renderers; closing twice is allowed."""
+        """Release the simulator and the renderers; closing twice is allowed."""
         self._close_renderers()
         self._problem = None
 
@@ -406,7 +372,7 @@ class EpisodeBatch:
         return joined.float() if on_device(joined) else joined
 
     def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
-        """Return what the current states are seen by: observations, loss terms and IoU."""
+        """Return observations, loss terms and IoU of the current states."""
         measures = self._simulator.measure(like)
         return self._observe(like), measures.terms, measures.iou
 
@@ -422,14 +388,14 @@ class EpisodeBatch:
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
-    """See that observations hold the same things."""
+    """Refuse configurations whose observations hold different entries."""
     for key in OBSERVED:
         if len({getattr(cfg, key) for cfg in cfgs}) > 1:
             raise ArgumentError(f"{key} differs between sub-environments: they share one space")
 
 
 def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
-    """Replace some rows of a table by those of one before, both arrays or CUDA tensors."""
+    """Replace some rows of a table by those of another, both arrays or CUDA tensors."""
     kept = before[rows]
     if on_device(table):
         kept = kept.to(table) if on_device(kept) else table.new_tensor(kept)

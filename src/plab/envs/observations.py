@@ -1,4 +1,4 @@
-"""What an environment is seen by: the entries of an observation, and the spaces that hold them."""
+"""Observations of environments: their entries, the spaces that hold them, and the derivatives by them."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Array: TypeAlias = Any
 
 
 class Observer:
-    """What the environments of a batch are seen by.
+    """Observations of the environments of a batch.
 
     Attributes:
-        stride: Distance of the observed particles' numbers.
+        stride: Every so many-th particle is observed.
     """
 
     def __init__(self, problem: Problem, cfg: Config) -> None:
-        """Take over which entries a configuration asks for, and what is constant."""
+        """Choose the entries that a configuration asks for, and compute the constant ones."""
         scene = problem.scenes[0]
         self.stride = _stride(scene, cfg.observe_particles)
         self._count, self._poses = _count(scene, cfg.observe_particles), _pose_entries(scene)
@@ -49,14 +49,14 @@ class Observer:
         manipulator, 8], from those by observations, shape [batch, entry]."""
         size, particles = len(bar), 6 * self._count
         whole = bar.new_zeros(size, self._numbers) if on_device(bar) else np.zeros((size, self._numbers))
-        # What comes behind the poses is constant.
+        # The entries after the poses are constant.
         whole[:, self._poses] = bar[:, particles : particles + len(self._poses)]
         return bar[:, :particles].reshape(size, self._count, 6), whole.reshape(size, -1, 8)
 
 
 def _joined(rows: Sequence[Array], dtype: type) -> Array:
     if on_device(rows[0]):
-        # Whoever gave a tensor has imported torch.
+        # The caller's tensor means that torch is imported already.
         import torch
 
         return torch.cat(list(rows), dim=1)
@@ -64,10 +64,10 @@ def _joined(rows: Sequence[Array], dtype: type) -> Array:
 
 
 def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
-    """Return which entries of an observation are positions along x and along z, shape [2, position]: those of
-    the observed particles, of the manipulators and, if it is seen, of the target."""
+    """Return the indices of the entries that are positions along x and along z, shape [2, position]: of the
+    observed particles, of the manipulators and, if it is observed, of the target."""
     particles, poses = 6 * _count(scene, cfg.observe_particles), _pose_entries(scene)
-    # What has to leave, then what has to arrive: a share, a centroid and deviations.
+    # Of the mass that has to leave, then of that which has to arrive: share, centroid (3), deviations (3).
     centroids = [1, 8] if cfg.observe_target else []
     along_x = [
         *range(0, particles, 6),
@@ -78,24 +78,22 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return which of the manipulators' 8 numbers each are observed: the gap only of chopsticks."""
+    """Return the indices of the observed ones of the manipulators' 8 numbers: the gap only of chopsticks."""
     observed = np.ones((len(scene.manipulators), 8), bool)
     observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
     return np.flatnonzero(observed)
 
 
 def _stride(scene: Scene, least: int) -> int:
-    """Return the distance of the observed particles' numbers, of so many at least."""
     return max(scene.particle_count // least, 1)
 
 
 def _count(scene: Scene, least: int) -> int:
-    """Return how many particles are observed, of so many at least."""
     return len(range(0, scene.particle_count, _stride(scene, least)))
 
 
 def _target_observations(problem: Problem) -> np.ndarray:
-    """Return what is seen of each environment's target, shape [batch, 14]."""
+    """Return the description of each environment's target, shape [batch, 14]."""
     found: dict[bytes, np.ndarray] = {}
     rows = []
     for masses in zip(problem.initial_mass, problem.target_mass, strict=True):
@@ -108,10 +106,10 @@ def _target_observations(problem: Problem) -> np.ndarray:
 
 
 def spaces(cfg: Config, scenes: Sequence[Scene]) -> tuple[Box, Box]:
-    """Return the spaces that hold the observations, of which a configuration says what they hold, and the
-    actions of all scenes."""
+    """Return the spaces of observations, with the entries that a configuration asks for, and of actions; each
+    holds those of all scenes."""
     observed = _count(scenes[0], cfg.observe_particles)
-    # A particle that crosses the domain in one substep is a fault that ends the simulation.
+    # A faster particle crosses the domain in one substep, which is a SimulationError.
     speed = 1.0 / scenes[0].dt
     low, high = [0.0] * 3 + [-speed] * 3, [1.0] * 3 + [speed] * 3
     bounds = np.array([_pose_bounds(scene) for scene in scenes])[:, :, _pose_entries(scenes[0])]
@@ -129,6 +127,6 @@ def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
     for m in scene.manipulators:
         widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.shape == "Chopsticks" else m.gap
         low += [*m.lower_bound, *[-1.0] * 4, min(m.gap, m.minimal_gap)]
-        # Opened all the way step by step, the gap is off by some rounding.
+        # A margin for the rounding of steps.
         high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]
     return low, high

@@ -16,7 +16,6 @@ from plab.envs.core import (
     METADATA,
     PICTURE_SIZE,
     EpisodeBatch,
-    action_array,
     check_render_mode,
     compose_configs,
     refuse_options,
@@ -53,23 +52,15 @@ def make_sb3(
         ValueError: If an argument does not fit, or the id is not one of plab's; see also
             :class:`plab.envs.core.EpisodeBatch`.
     """
-    spec = _spec(env_id)
-    cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
-    batch = EpisodeBatch(cfgs, contact=contact)
-    batch.picture_size, batch.picture_target = render_size, render_target
-    return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
-
-
-def _spec(env_id: str) -> EnvSpec:
-    """Return the specification of one of plab's environments, of the suite or registered since."""
-    if not isinstance(env_id, str):
-        raise ArgumentError(f"an environment is named by a text, such as plab/Rope-v1, not {env_id!r}")
     spec = gymnasium.spec(env_id)
     if spec.entry_point != ENTRY_POINT:
         raise ArgumentError(
             f"'{env_id}' is no environment of plab's: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
-    return spec
+    cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
+    batch = EpisodeBatch(cfgs, contact=contact)
+    batch.picture_size, batch.picture_target = render_size, render_target
+    return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
 
 
 class PlabVecEnv(VecEnv):
@@ -78,9 +69,10 @@ class PlabVecEnv(VecEnv):
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if there is one.
-        truncates: Whether infos say that it is a limit of time which ends the episodes.
-        strict: Whether a sub-environment that breaks off is an error; otherwise it rests until its episode
-            ends, see :meth:`plab.envs.core.EpisodeBatch.step`, and its infos say why under ``broken``.
+        truncates: Whether infos report the end of an episode as a time limit (``TimeLimit.truncated``).
+        strict: Whether a sub-environment that breaks off is an error; otherwise it keeps its last numbers
+            until its episode ends, see :meth:`plab.envs.core.EpisodeBatch.step`, and its infos hold the
+            reason under ``broken``.
     """
 
     truncates = True
@@ -118,12 +110,8 @@ class PlabVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the next step, shape [env, action].
-
-        Raises:
-            ValueError: If the shape is wrong.
-        """
-        self._actions = action_array(actions, (self.num_envs, *self.batch.action_space.shape))
+        """Keep the actions of the next step, shape [env, action]."""
+        self._actions = np.asarray(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Advance all sub-environments by one step, and reset them if that ends their episodes.
@@ -132,7 +120,7 @@ class PlabVecEnv(VecEnv):
             Observations, rewards, whether the episodes are over, and an info per sub-environment.
 
         Raises:
-            ValueError: If an action is not finite.
+            ValueError: If the actions' shape is wrong or one is not finite.
             plab.sim.SimulationError: If a state stops being finite and ``strict`` is set.
         """
         result = self.batch.step(self._actions, strict=self.strict)
@@ -153,7 +141,7 @@ class PlabVecEnv(VecEnv):
         return self.batch.frames()
 
     def close(self) -> None:
-        """Let go of the simulator; closing twice is allowed."""
+        """Release the simulator; closing twice is allowed."""
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

@@ -14,7 +14,6 @@ from plab.envs.core import (
     METADATA,
     PICTURE_SIZE,
     EpisodeBatch,
-    action_array,
     check_render_mode,
     compose_configs,
     refuse_options,
@@ -103,7 +102,7 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             gymnasium.error.ResetNeeded: If the episode is over.
             plab.sim.SimulationError: If the state stops being finite.
         """
-        result = self.batch.step(action_array(action, self.action_space.shape)[None])
+        result = self.batch.step(np.asarray(action)[None])
         return result.observation[0], float(result.reward[0]), False, result.truncated, _only(result.info)
 
     def render(self) -> np.ndarray | None:
@@ -114,7 +113,7 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.batch.frames()[0]
 
     def close(self) -> None:
-        """Let go of the simulator; closing twice is allowed."""
+        """Release the simulator; closing twice is allowed."""
         self.batch.close()
 
 

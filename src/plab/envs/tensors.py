@@ -1,4 +1,4 @@
-"""A batch of episodes with tensors in and out, for loops of your own in PyTorch."""
+"""Batch of episodes with tensors in and out, for your own loops in PyTorch."""
 
 from __future__ import annotations
 

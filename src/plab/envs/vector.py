@@ -16,7 +16,6 @@ from plab.envs.core import (
     METADATA,
     PICTURE_SIZE,
     EpisodeBatch,
-    action_array,
     check_render_mode,
     compose_configs,
     refuse_options,
@@ -129,7 +128,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ValueError: If the shape is wrong or an entry is not finite.
             plab.sim.SimulationError: If a state stops being finite.
         """
-        result = self.batch.step(action_array(actions, self.action_space.shape))
+        result = self.batch.step(np.asarray(actions))
         observation, info = result.observation, self._masked(result.info)
         if result.truncated:
             ended = self._masked({"final_obs": _array_of_arrays(observation), "final_info": info})
@@ -147,7 +146,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.batch.frames()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Let go of the simulator."""
+        """Release the simulator."""
         self.batch.close()
 
     def _masked(self, info: dict[str, Any]) -> dict[str, Any]:
