@@ -1,0 +1,292 @@
+"""Depth, segmentation and colour pictures of all environments of a simulator, on its device.
+
+Two passes per camera: one ray per pixel finds the floor in closed form and manipulators by sphere tracing
+their signed distances; then each particle writes the ball of its share of the volume to the pixels that it
+covers. A pixel is one integer, depth in the upper bits and label in the lower ones, so that an atomic
+minimum keeps what is nearest, whatever the order. Pictures are the same on every run and in every batch.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import taichi as ti
+
+from plab.scenes.camera import SensorCamera
+from plab.sim.tensors import Array, on_device
+
+if TYPE_CHECKING:
+    import torch
+
+    from plab.sim.simulator import Simulator
+
+__all__ = ["BACKGROUND", "FIRST_BODY", "FIRST_MANIPULATOR", "FLOOR", "CameraSensor"]
+
+BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
+"""Labels of segmentation; manipulators and bodies are numbered from the last two on."""
+
+BALL_RADIUS = 0.85
+"""Radius of a particle's ball [mean particle spacings]: the smallest without holes between particles."""
+
+TRACING_STEPS = 64
+"""Steps of sphere tracing along a ray, at most."""
+
+PALETTE = np.array(
+    [
+        [246, 244, 240],
+        [222, 218, 210],
+        [120, 128, 140],
+        [213, 94, 0],
+        [0, 114, 178],
+        [0, 158, 115],
+        [204, 121, 167],
+    ]
+)
+"""Colours of background, floor, manipulators and bodies, which take the last ones in turn [0 to 255]."""
+
+
+@ti.data_oriented
+class CameraSensor:
+    """A camera in every environment of a simulator."""
+
+    def __init__(self, simulator: "Simulator", camera: SensorCamera) -> None:
+        """Allocate the pictures.
+
+        Args:
+            simulator: Its current states are what is seen.
+            camera: The camera, the same for all environments.
+        """
+        self.camera = camera
+        self._simulator, self.engine = simulator, simulator._engine
+        self.batch, self.particles = simulator.batch, simulator.particle_count
+        self.width, self.height = camera.size
+        self.pixels = self.width * self.height
+        self._keys = ti.ndarray(ti.i64, shape=self.batch * self.pixels)
+        axes = camera.axes()
+        self._frame = ti.ndarray(ti.f32, shape=12)
+        self._frame.from_numpy(np.concatenate([camera.position, axes.reshape(-1)]).astype(np.float32))
+        self._balls = ti.ndarray(ti.f32, shape=self.batch * self.particles)
+        self._labels = ti.ndarray(ti.i32, shape=self.batch * self.particles)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Follow a change of the simulator's scenes."""
+        scenes = self._simulator.scenes
+        spacings = [[(b.volume / b.particles) ** (1 / 3) for b in scene.bodies] for scene in scenes]
+        balls = [
+            BALL_RADIUS * np.array(own)[scene.particle_bodies]
+            for own, scene in zip(spacings, scenes, strict=True)
+        ]
+        labels = np.concatenate([FIRST_BODY + scene.particle_bodies for scene in scenes])
+        self._balls.from_numpy(np.concatenate(balls).astype(np.float32))
+        self._labels.from_numpy(labels.astype(np.int32))
+
+    def capture(
+        self, *names: str, like: "torch.Tensor | None" = None
+    ) -> "dict[str, np.ndarray | torch.Tensor]":
+        """Take pictures of the current states.
+
+        Args:
+            names: Of ``depth``, ``segmentation`` and ``rgb``; all if none is given.
+            like: Given a CUDA tensor, pictures are CUDA tensors and stay on the device.
+
+        Returns:
+            ``depth``: along the optical axis [domain units], ``camera.far`` where nothing is, shape [batch,
+            height, width], float32. ``segmentation``: labels, see :data:`BACKGROUND`, same shape, int32.
+            ``rgb``: shape [batch, height, width, 3], uint8.
+        """
+        simulator, camera = self._simulator, self.camera
+        simulator._require_runtime()
+        particles = simulator._particles
+        self._trace(self._frame, self._keys, camera.focal_length, camera.near, camera.far)
+        self._splat(
+            particles.current,
+            particles.order.numbers,
+            self._frame,
+            self._balls,
+            self._labels,
+            self._keys,
+            camera.focal_length,
+            camera.near,
+        )
+        out = {}
+        for name in names or ("depth", "segmentation", "rgb"):
+            shape = (self.batch, self.height, self.width, *((3,) if name == "rgb" else ()))
+            picture = _empty(shape, name, like)
+            flat = picture.reshape(-1)
+            if name == "depth":
+                self._write_depth(self._keys, flat)
+            elif name == "segmentation":
+                self._write_labels(self._keys, flat)
+            else:
+                self._write_colours(self._keys, self._frame, flat, camera.focal_length, camera.far)
+            out[name] = picture
+        if on_device(like):
+            ti.sync()
+        return out
+
+    # -- kernels --------------------------------------------------------------------------------------
+
+    @ti.func
+    def key(self, depth, label):
+        """Depth and label as an integer that grows with the depth, which is positive."""
+        return (ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64) << 32) | ti.cast(label, ti.i64)
+
+    @ti.func
+    def depth_of(self, key):
+        """Depth of a key."""
+        return ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
+
+    @ti.func
+    def axis(self, frame: ti.template(), k: ti.template()):
+        """Position (0) of the camera, and its axes to the right (1), up (2) and backwards (3)."""
+        return ti.Vector([frame[3 * k], frame[3 * k + 1], frame[3 * k + 2]])
+
+    @ti.func
+    def ray(self, frame: ti.template(), row, column, focal):
+        """Direction of a pixel's ray, along which depth is the parameter."""
+        right = (ti.cast(column, ti.f32) + 0.5 - 0.5 * self.width) / focal
+        up = (0.5 * self.height - ti.cast(row, ti.f32) - 0.5) / focal
+        return right * self.axis(frame, 1) + up * self.axis(frame, 2) - self.axis(frame, 3)
+
+    @ti.kernel
+    def _trace(self, frame: Array, keys: Array, focal: ti.f32, near: ti.f32, far: ti.f32):
+        """Write floor and manipulators."""
+        for q in range(self.batch * self.pixels):
+            e, pixel = q // self.pixels, q % self.pixels
+            origin = self.axis(frame, 0)
+            ray = self.ray(frame, pixel // self.width, pixel % self.width, focal)
+            length = ray.norm()
+            best, label = far, BACKGROUND
+            if ray[1] < 0.0 and origin[1] > 0.0:
+                depth = -origin[1] / ray[1]
+                if depth > near and depth < best:
+                    best, label = depth, FLOOR
+            for shape, start, stop in ti.static(self.engine.shape_ranges):
+                for m in range(start, stop):
+                    depth = near
+                    for _step in range(TRACING_STEPS):
+                        point = ti.cast(origin + depth * ray, self.engine.real)
+                        distance = ti.cast(self.engine.end_distance(shape, e, m, point), ti.f32)
+                        if distance < 1e-4:
+                            best, label = depth, FIRST_MANIPULATOR + m
+                            break
+                        depth += distance / length
+                        if depth >= best:
+                            break
+            keys[q] = self.key(best, label)
+
+    @ti.kernel
+    def _splat(
+        self,
+        state: Array,
+        order: Array,
+        frame: Array,
+        balls: Array,
+        labels: Array,
+        keys: Array,
+        focal: ti.f32,
+        near: ti.f32,
+    ):
+        """Write the particles' balls over what is behind them."""
+        for q in range(self.engine.batch * self.engine.tiles * self.engine.lanes):
+            e, place = self.engine.particle_of(q)
+            if place < self.engine.particles:
+                entry = self.engine.tile_entry(0, e, place // self.engine.lanes)
+                own = ti.cast(self.engine.vector(state, entry, place % self.engine.lanes), ti.f32)
+                number = e * self.engine.particles + order[q]
+                radius, label = balls[number], labels[number]
+                offset = own - self.axis(frame, 0)
+                depth = -offset.dot(self.axis(frame, 3))
+                if depth - radius > near:
+                    across = offset.dot(self.axis(frame, 1)) / depth * focal + 0.5 * self.width
+                    down = 0.5 * self.height - offset.dot(self.axis(frame, 2)) / depth * focal
+                    # A ball's outline is an ellipse, longest away from the middle of the picture.
+                    slant = offset.norm() / depth
+                    reach = slant * radius / (depth - radius) * focal + 0.5
+                    left = ti.max(0, ti.cast(ti.floor(across - reach), ti.i32))
+                    right = ti.min(self.width - 1, ti.cast(ti.floor(across + reach), ti.i32))
+                    top = ti.max(0, ti.cast(ti.floor(down - reach), ti.i32))
+                    bottom = ti.min(self.height - 1, ti.cast(ti.floor(down + reach), ti.i32))
+                    beyond = offset.dot(offset) - radius * radius
+                    for row in range(top, bottom + 1):
+                        for column in range(left, right + 1):
+                            ray = self.ray(frame, row, column, focal)
+                            along, square = ray.dot(offset), ray.dot(ray)
+                            inside = along * along - square * beyond
+                            if inside > 0.0:
+                                hit = (along - ti.sqrt(inside)) / square
+                                pixel = (e * self.height + row) * self.width + column
+                                ti.atomic_min(keys[pixel], self.key(hit, label))
+
+    @ti.kernel
+    def _write_depth(self, keys: Array, out: Array):
+        for q in range(self.batch * self.pixels):
+            out[q] = self.depth_of(keys[q])
+
+    @ti.kernel
+    def _write_labels(self, keys: Array, out: Array):
+        for q in range(self.batch * self.pixels):
+            out[q] = ti.cast(keys[q] & 0xFFFF, ti.i32)
+
+    @ti.func
+    def point(self, keys: ti.template(), frame: ti.template(), e, row, column, focal):
+        """Position that a pixel shows, relative to the camera."""
+        depth = self.depth_of(keys[(e * self.height + row) * self.width + column])
+        return depth * self.ray(frame, row, column, focal)
+
+    @ti.func
+    def slope(self, keys: ti.template(), frame: ti.template(), e, row, column, down: ti.template(), focal):
+        """Difference of positions between a pixel and its neighbour to the right or below, or on the other
+        side if that is nearer in depth."""
+        here = self.point(keys, frame, e, row, column, focal)
+        across = ti.static(0 if down else 1)
+        after = self.point(
+            keys,
+            frame,
+            e,
+            ti.min(row + down, self.height - 1),
+            ti.min(column + across, self.width - 1),
+            focal,
+        )
+        before = self.point(keys, frame, e, ti.max(row - down, 0), ti.max(column - across, 0), focal)
+        forward, backward = after - here, here - before
+        use_backward = (backward.norm() < forward.norm() and backward.norm() > 0.0) or forward.norm() == 0.0
+        return ti.select(use_backward, backward, forward)
+
+    @ti.kernel
+    def _write_colours(self, keys: Array, frame: Array, out: Array, focal: ti.f32, far: ti.f32):
+        """Colours by label, shaded by the angle between the surface and a lamp beside the camera."""
+        for q in range(self.batch * self.pixels):
+            e, pixel = q // self.pixels, q % self.pixels
+            row, column = pixel // self.width, pixel % self.width
+            label = ti.cast(keys[q] & 0xFFFF, ti.i32)
+            colour = ti.Vector(PALETTE[0].tolist(), ti.f32)
+            light = 1.0
+            if label >= FIRST_BODY:
+                for k in ti.static(range(3, len(PALETTE))):
+                    if (label - FIRST_BODY) % (len(PALETTE) - 3) == k - 3:
+                        colour = ti.Vector(PALETTE[k].tolist(), ti.f32)
+            elif label >= FIRST_MANIPULATOR:
+                colour = ti.Vector(PALETTE[2].tolist(), ti.f32)
+            elif label == FLOOR:
+                colour = ti.Vector(PALETTE[1].tolist(), ti.f32)
+            if label >= FIRST_MANIPULATOR:
+                along = self.slope(keys, frame, e, row, column, 0, focal)
+                down = self.slope(keys, frame, e, row, column, 1, focal)
+                normal = down.cross(along)
+                lamp = self.axis(frame, 3) + 0.5 * self.axis(frame, 2) - 0.3 * self.axis(frame, 1)
+                cosine = normal.dot(lamp) / ti.max(normal.norm() * lamp.norm(), 1e-20)
+                light = 0.35 + 0.65 * ti.max(cosine, 0.0)
+            for i in ti.static(range(3)):
+                out[3 * q + i] = ti.cast(ti.round(light * colour[i]), ti.u8)
+
+
+def _empty(shape: tuple[int, ...], name: str, like: "torch.Tensor | None") -> "np.ndarray | torch.Tensor":
+    """Allocate a picture."""
+    if not on_device(like):
+        kinds = {"depth": np.float32, "segmentation": np.int32, "rgb": np.uint8}
+        return np.empty(shape, kinds[name])
+    import torch
+
+    kinds = {"depth": torch.float32, "segmentation": torch.int32, "rgb": torch.uint8}
+    return torch.empty(shape, dtype=kinds[name], device=like.device)
