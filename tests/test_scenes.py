@@ -11,7 +11,7 @@ import pytest
 
 from plab.config import build_scene, load_config
 from plab.envs.observations import level_entries
-from plab.scenes import SceneError, make_body
+from plab.scenes import Camera, SceneError, make_body
 
 
 def test_the_volume_of_a_sphere_is_that_of_its_formula():
@@ -33,3 +33,22 @@ def test_entries_along_x_and_z_are_two_apart():
     cfg = load_config(["task=Move", "observe_target=true"])
     along_x, along_z = level_entries(build_scene(cfg), cfg)
     np.testing.assert_array_equal(along_z - along_x, 2)
+
+
+def test_a_camera_projects_what_it_sees_back_from_any_side():
+    for position in ((0.5, 2.0, 0.5), (0.5, -1.0, 0.5), (1.5, 0.9, -0.4)):
+        camera = Camera(position, (0.5, 0.1, 0.5), 40.0, (32, 24))
+        axes = camera.axes()
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        seen = camera.points(np.full((24, 32), 0.7))
+        rows, columns = np.mgrid[:24, :32] + 0.5
+        np.testing.assert_allclose(camera.project(seen), np.stack([columns, rows], axis=-1), atol=1e-9)
+        np.testing.assert_allclose(camera.intrinsics()[:2, 2], camera.project(np.array(camera.target)))
+    for wrong in (
+        {"field_of_view": 180.0},
+        {"size": (0, 4)},
+        {"near": 2.0, "far": 1.0},
+        {"target": (0.5, 1, 0.5)},
+    ):
+        with pytest.raises(SceneError, match=next(iter(wrong))):
+            Camera(**{"position": (0.5, 1, 0.5), "target": (0.5, 0, 0.5), **wrong})

@@ -5,8 +5,9 @@ PyVista, which draws, is optional: ``pip install 'plab[render]'``. docs/renderin
 
 from typing import Any
 
-from plab.render.camera import Camera, View, fit_camera
+from plab.render.camera import View, fit_camera
 from plab.render.graphics import RenderError, require_graphics
+from plab.scenes import Camera
 
 __all__ = ["Camera", "RenderError", "Renderer", "View", "fit_camera"]
 

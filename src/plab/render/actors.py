@@ -9,11 +9,10 @@ import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkRenderer
 
 from plab.objective import TARGET_MASS
-from plab.render.camera import Camera
 from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud, hidden_share
 from plab.render.shapes import Part, manipulator_parts, pose_matrix, transform
 from plab.render.surface import Field, target_field
-from plab.scenes import Manipulator, Scene
+from plab.scenes import Camera, Manipulator, Scene
 
 __all__ = [
     "MANIPULATOR_COLOR",

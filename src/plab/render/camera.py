@@ -1,4 +1,4 @@
-"""Where the camera stands."""
+"""Cameras that just hold a scene, from the direction that shows its task best."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from plab.objective import TARGET_MASS
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
-from plab.scenes import Scene, sample_particles
+from plab.scenes import Camera, Scene, sample_particles
 
-__all__ = ["DEFAULT_VIEW", "VIEWS", "Camera", "View", "fit_camera", "scene_camera"]
+__all__ = ["DEFAULT_VIEW", "VIEWS", "View", "fit_camera", "scene_camera"]
 
 
 @dataclass(frozen=True)
@@ -44,47 +44,8 @@ VIEWS: dict[str, View] = {
 }
 """Views by task name."""
 
-
-@dataclass(frozen=True)
-class Camera:
-    """A perspective camera that stands upright.
-
-    Attributes:
-        position: Where it stands [domain units].
-        look_at: The point in the middle of its pictures [domain units].
-        angle: Vertical field of view [degrees].
-    """
-
-    position: tuple[float, float, float]
-    look_at: tuple[float, float, float]
-    angle: float = 24.0
-
-    def axes(self) -> np.ndarray:
-        """Return the unit vectors to the right, up and backwards, in rows, shape [3, 3]."""
-        back = np.subtract(self.position, self.look_at)
-        back /= np.linalg.norm(back)
-        right = np.cross((0.0, 1.0, 0.0), back)
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(back, right), back])
-
-    def pixel(self, height: int) -> float:
-        """Return the size of a pixel at the point looked at [domain units], in pictures of some height."""
-        distance = math.dist(self.position, self.look_at)
-        return 2 * math.tan(math.radians(self.angle) / 2) * distance / height
-
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return where points of the scene are in a picture.
-
-        Args:
-            points: Positions [domain units], shape [..., 3].
-            size: Width and height of the picture [pixels].
-
-        Returns:
-            Column and row [pixels] from the upper left corner, shape [..., 2].
-        """
-        right, up, back = np.moveaxis((points - np.array(self.position)) @ self.axes().T, -1, 0)
-        scale = size[1] / 2 / math.tan(math.radians(self.angle) / 2)
-        return np.stack([size[0] / 2 - scale * right / back, size[1] / 2 + scale * up / back], axis=-1)
+FIELD_OF_VIEW = 24.0
+"""Vertical field of view of pictures of tasks [degrees]."""
 
 
 def scene_camera(
@@ -134,13 +95,13 @@ def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
     level = math.cos(elevation)
     back = np.array([level * math.sin(azimuth), math.sin(elevation), level * math.cos(azimuth)])
     look_at = (points.min(axis=0) + points.max(axis=0)) / 2
-    camera = Camera(tuple(look_at + back), tuple(look_at))
+    camera = Camera(tuple(look_at + back), tuple(look_at), FIELD_OF_VIEW)
     screen = camera.axes()[:2]
-    slope = math.tan(math.radians(camera.angle) / 2) * np.array([aspect, 1.0])
+    slope = math.tan(math.radians(FIELD_OF_VIEW) / 2) * np.array([aspect, 1.0])
     for _ in range(_ROUNDS):
         across, toward = (points - look_at) @ screen.T, (points - look_at) @ back
         distance = (np.abs(across) / slope + toward[:, None]).max()
         # Perspective makes near things larger: centre what is seen, not what is there.
         seen = across / (distance - toward)[:, None]
         look_at = look_at + (seen.max(axis=0) + seen.min(axis=0)) / 2 * distance @ screen
-    return Camera(tuple(look_at + _MARGIN * distance * back), tuple(look_at))
+    return Camera(tuple(look_at + _MARGIN * distance * back), tuple(look_at), FIELD_OF_VIEW)

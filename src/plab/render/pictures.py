@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from plab.render.camera import Camera, scene_camera
+from plab.render.camera import scene_camera
 from plab.render.graphics import RenderError
 from plab.render.recording import RecordedRollout
 from plab.render.renderer import INK, PAPER, Renderer
+from plab.scenes import Camera
 
 __all__ = [
     "STEPS_PER_SECOND",

@@ -10,10 +10,10 @@ from vtkmodules.vtkRenderingCore import vtkRenderer
 
 from plab.errors import ArgumentError
 from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
-from plab.render.camera import Camera, scene_camera
+from plab.render.camera import scene_camera
 from plab.render.shadows import AmbientLight, Cloud, floor_light
 from plab.render.surface import body_slices, body_surfaces
-from plab.scenes import Scene, sample_particles
+from plab.scenes import Camera, Scene, sample_particles
 
 __all__ = ["BODY_COLORS", "INK", "PAPER", "Renderer"]
 
@@ -69,7 +69,7 @@ class Renderer:
         plotter = self._open_window()
         self._plotter: pv.Plotter | None = plotter
         self._light = _add_lights(plotter, self.camera)
-        self._floor = Floor(plotter, PAPER, INK, self.camera.pixel(size[1]))
+        self._floor = Floor(plotter, PAPER, INK, self.camera.pixel_size(size[1]))
         rest = sample_particles(scene)
         self._bodies = [
             Clay(self._plotter, surface_mesh(surface.field(rest[at])), BODY_COLORS[number % len(BODY_COLORS)])
@@ -177,8 +177,8 @@ class Renderer:
         # VTK's order-independent pass for what is translucent knows no anti-aliasing.
         plotter.renderer.SetUseOIT(False)
         camera = plotter.camera
-        camera.position, camera.focal_point = self.camera.position, self.camera.look_at
-        camera.up, camera.view_angle = (0.0, 1.0, 0.0), self.camera.angle
+        camera.position, camera.focal_point = self.camera.position, self.camera.target
+        camera.up, camera.view_angle = self.camera.axes()[1], self.camera.field_of_view
         plotter.camera_set = True
         return plotter
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import cKDTree
 
-from plab.render.camera import Camera
+from plab.scenes import Camera
 
 __all__ = ["FLOOR_EDGE", "FLOOR_LOW", "AmbientLight", "Cloud", "floor_light", "hidden_share"]
 
@@ -97,7 +97,7 @@ def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
     near = clay[np.all((clay > low) & (clay < high), axis=1)]
     near = near[cKDTree(front).query(near, distance_upper_bound=_CONTACT)[0] < _CONTACT]
     right, up, back = ((np.concatenate([front, near]) - np.array(camera.position)) @ camera.axes().T).T
-    scale = math.dist(camera.position, camera.look_at) / _VIEW_CELL
+    scale = math.dist(camera.position, camera.target) / _VIEW_CELL
     _, cell = np.unique((scale * np.stack([right, up]) / back).astype(np.int64), axis=1, return_inverse=True)
     count = len(front)
     nearest = np.full(cell.max() + 1, np.inf)

@@ -1,4 +1,7 @@
-"""Scenes: bodies, materials, meshes, manipulators, and the particles sampled from them."""
+"""Scenes: bodies, materials, meshes, manipulators, cameras, and the particles sampled from bodies."""
 
+from plab.scenes import scene
+from plab.scenes.camera import Camera
 from plab.scenes.scene import *  # noqa: F403
-from plab.scenes.scene import __all__  # noqa: F401
+
+__all__ = ["Camera", *scene.__all__]

@@ -9,12 +9,12 @@ import numpy as np
 
 from plab.scenes.bodies import SceneError, Vec3, vector3
 
-__all__ = ["SensorCamera"]
+__all__ = ["Camera"]
 
 
 @dataclass(frozen=True)
-class SensorCamera:
-    """A perspective camera that observes an environment.
+class Camera:
+    """A perspective camera, of an environment's observations or of rendered pictures.
 
     Attributes:
         position: Position [domain units].
@@ -66,20 +66,34 @@ class SensorCamera:
     @property
     def focal_length(self) -> float:
         """Focal length [pixels]."""
-        return self.size[1] / 2 / math.tan(math.radians(self.field_of_view) / 2)
+        return self._focal_length(self.size[1])
+
+    def _focal_length(self, height: int) -> float:
+        return height / 2 / math.tan(math.radians(self.field_of_view) / 2)
+
+    def pixel_size(self, height: int) -> float:
+        """Return the size of a pixel at the target [domain units], in pictures of some height [pixels]."""
+        return math.dist(self.position, self.target) / self._focal_length(height)
 
     def intrinsics(self) -> np.ndarray:
         """Return the matrix from camera coordinates (x right, y down, z forward) to pixels, shape [3, 3]."""
         width, height = self.size
         return np.array([[self.focal_length, 0, width / 2], [0, self.focal_length, height / 2], [0, 0, 1]])
 
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Return column, row [pixels] and depth [domain units] of points [domain units], shape [..., 3]."""
+    def project(self, points: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+        """Return where points of the scene are in a picture.
+
+        Args:
+            points: Positions [domain units], shape [..., 3].
+            size: Width and height of the picture [pixels]; the camera's own if None.
+
+        Returns:
+            Column and row [pixels] from the upper left corner, shape [..., 2].
+        """
+        width, height = size or self.size
         right, up, back = np.moveaxis((points - np.array(self.position)) @ self.axes().T, -1, 0)
-        width, height = self.size
-        column = width / 2 - self.focal_length * right / back
-        row = height / 2 + self.focal_length * up / back
-        return np.stack([column, row, -back], axis=-1)
+        scale = self._focal_length(height)
+        return np.stack([width / 2 - scale * right / back, height / 2 + scale * up / back], axis=-1)
 
     def points(self, depth: np.ndarray) -> np.ndarray:
         """Return the positions [domain units] that pixels show, shape [..., height, width, 3], from their

@@ -6,12 +6,13 @@ covers. A pixel is one integer, depth in the upper bits and label in the lower o
 minimum keeps what is nearest, whatever the order. Pictures are the same on every run and in every batch.
 """
 
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import taichi as ti
 
-from plab.scenes.camera import SensorCamera
+from plab.scenes import Camera
 from plab.sim.tensors import Array, on_device
 
 if TYPE_CHECKING:
@@ -24,23 +25,21 @@ __all__ = ["BACKGROUND", "FIRST_BODY", "FIRST_MANIPULATOR", "FLOOR", "CameraSens
 BACKGROUND, FLOOR, FIRST_MANIPULATOR, FIRST_BODY = 0, 1, 2, 64
 """Labels of segmentation; manipulators and bodies are numbered from the last two on."""
 
-BALL_RADIUS = 0.85
-"""Radius of a particle's ball [mean particle spacings]: the smallest without holes between particles."""
+BALL_RADIUS = 0.7
+"""Radius of a particle's ball [mean particle spacings], for which the depth of plasticine has no bias."""
 
-TRACING_STEPS = 64
+TRACING_STEPS = 96
 """Steps of sphere tracing along a ray, at most."""
 
-PALETTE = np.array(
-    [
-        [246, 244, 240],
-        [222, 218, 210],
-        [120, 128, 140],
-        [213, 94, 0],
-        [0, 114, 178],
-        [0, 158, 115],
-        [204, 121, 167],
-    ]
-)
+PALETTE = [
+    [246, 244, 240],
+    [222, 218, 210],
+    [120, 128, 140],
+    [213, 94, 0],
+    [0, 114, 178],
+    [0, 158, 115],
+    [204, 121, 167],
+]
 """Colours of background, floor, manipulators and bodies, which take the last ones in turn [0 to 255]."""
 
 
@@ -48,7 +47,7 @@ PALETTE = np.array(
 class CameraSensor:
     """A camera in every environment of a simulator."""
 
-    def __init__(self, simulator: "Simulator", camera: SensorCamera) -> None:
+    def __init__(self, simulator: "Simulator", camera: Camera) -> None:
         """Allocate the pictures.
 
         Args:
@@ -110,19 +109,29 @@ class CameraSensor:
         )
         out = {}
         for name in names or ("depth", "segmentation", "rgb"):
-            shape = (self.batch, self.height, self.width, *((3,) if name == "rgb" else ()))
-            picture = _empty(shape, name, like)
-            flat = picture.reshape(-1)
             if name == "depth":
-                self._write_depth(self._keys, flat)
-            elif name == "segmentation":
-                self._write_labels(self._keys, flat)
+                out[name] = self._filled(self._write_depth, np.float32, like)
             else:
-                self._write_colours(self._keys, self._frame, flat, camera.focal_length, camera.far)
-            out[name] = picture
+                out[name] = self._filled(self._write_labels, np.int32, like)
+            if name == "rgb":
+                light = self._filled(self._write_light, np.float32, like, self._frame, camera.focal_length)
+                out[name] = _colours(out[name], light)
+        return out
+
+    def _filled(self, write: Any, kind: type, like: Any, *arguments: Any) -> Any:
+        """Return a picture that a kernel writes, as an array or a CUDA tensor like ``like``."""
+        shape = self.batch, self.height, self.width
+        if on_device(like):
+            real = kind is np.float32
+            picture: Any = like.new_empty(
+                shape, dtype=getattr(sys.modules["torch"], "float32" if real else "int32")
+            )
+        else:
+            picture = np.empty(shape, kind)
+        write(self._keys, *arguments, picture.reshape(-1))
         if on_device(like):
             ti.sync()
-        return out
+        return picture
 
     # -- kernels --------------------------------------------------------------------------------------
 
@@ -167,7 +176,7 @@ class CameraSensor:
                     for _step in range(TRACING_STEPS):
                         point = ti.cast(origin + depth * ray, self.engine.real)
                         distance = ti.cast(self.engine.end_distance(shape, e, m, point), ti.f32)
-                        if distance < 1e-4:
+                        if distance < 2e-5:
                             best, label = depth, FIRST_MANIPULATOR + m
                             break
                         depth += distance / length
@@ -254,39 +263,25 @@ class CameraSensor:
         return ti.select(use_backward, backward, forward)
 
     @ti.kernel
-    def _write_colours(self, keys: Array, frame: Array, out: Array, focal: ti.f32, far: ti.f32):
-        """Colours by label, shaded by the angle between the surface and a lamp beside the camera."""
+    def _write_light(self, keys: Array, frame: Array, focal: ti.f32, out: Array):
+        """Light on manipulators and bodies, by the angle of their surface to a lamp beside the camera."""
         for q in range(self.batch * self.pixels):
             e, pixel = q // self.pixels, q % self.pixels
             row, column = pixel // self.width, pixel % self.width
-            label = ti.cast(keys[q] & 0xFFFF, ti.i32)
-            colour = ti.Vector(PALETTE[0].tolist(), ti.f32)
-            light = 1.0
-            if label >= FIRST_BODY:
-                for k in ti.static(range(3, len(PALETTE))):
-                    if (label - FIRST_BODY) % (len(PALETTE) - 3) == k - 3:
-                        colour = ti.Vector(PALETTE[k].tolist(), ti.f32)
-            elif label >= FIRST_MANIPULATOR:
-                colour = ti.Vector(PALETTE[2].tolist(), ti.f32)
-            elif label == FLOOR:
-                colour = ti.Vector(PALETTE[1].tolist(), ti.f32)
-            if label >= FIRST_MANIPULATOR:
+            out[q] = 1.0
+            if (keys[q] & 0xFFFF) >= FIRST_MANIPULATOR:
                 along = self.slope(keys, frame, e, row, column, 0, focal)
                 down = self.slope(keys, frame, e, row, column, 1, focal)
                 normal = down.cross(along)
                 lamp = self.axis(frame, 3) + 0.5 * self.axis(frame, 2) - 0.3 * self.axis(frame, 1)
                 cosine = normal.dot(lamp) / ti.max(normal.norm() * lamp.norm(), 1e-20)
-                light = 0.35 + 0.65 * ti.max(cosine, 0.0)
-            for i in ti.static(range(3)):
-                out[3 * q + i] = ti.cast(ti.round(light * colour[i]), ti.u8)
+                out[q] = 0.35 + 0.65 * ti.max(cosine, 0.0)
 
 
-def _empty(shape: tuple[int, ...], name: str, like: "torch.Tensor | None") -> "np.ndarray | torch.Tensor":
-    """Allocate a picture."""
-    if not on_device(like):
-        kinds = {"depth": np.float32, "segmentation": np.int32, "rgb": np.uint8}
-        return np.empty(shape, kinds[name])
-    import torch
-
-    kinds = {"depth": torch.float32, "segmentation": torch.int32, "rgb": torch.uint8}
-    return torch.empty(shape, dtype=kinds[name], device=like.device)
+def _colours(labels: Any, light: Any) -> Any:
+    """Return colours of labels times light, shape [..., 3], uint8; arrays or CUDA tensors."""
+    bodies = len(PALETTE) - 3
+    chosen = (labels >= FIRST_BODY) * (1 + (labels - FIRST_BODY) % bodies) + labels.clip(0, FIRST_MANIPULATOR)
+    if not on_device(labels):
+        return np.rint(np.array(PALETTE)[chosen] * light[..., None]).astype(np.uint8)
+    return (light.new_tensor(PALETTE)[chosen] * light[..., None]).round().byte()

@@ -64,7 +64,7 @@ def page(recording: RecordedRollout, every: int | None = None) -> str:
         antialias=2,
         background_color=_number(PAPER),
         camera_auto_fit=False,
-        camera_fov=camera.angle,
+        camera_fov=camera.field_of_view,
         camera_mode="orbit",
         camera_up_axis="y",
         grid_visible=False,
@@ -78,7 +78,7 @@ def page(recording: RecordedRollout, every: int | None = None) -> str:
         plot += thing
     snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
     # The page sets the camera itself, when it knows how wide its window is.
-    seen = [*camera.position, *camera.look_at, 0.0, 1.0, 0.0]
+    seen = [*camera.position, *camera.target, 0.0, 1.0, 0.0]
     return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
 
 

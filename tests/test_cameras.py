@@ -1,0 +1,79 @@
+"""Pictures of all environments: depth and labels against closed forms, alone and in a batch."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from plab.scenes import Body, Camera, Manipulator, Scene
+from plab.sim import Simulator
+from plab.sim.cameras import FIRST_BODY, FIRST_MANIPULATOR, FLOOR, CameraSensor
+
+DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
+SIZE = 48, 40
+CAMERAS = (
+    Camera((0.5, 0.8, 1.7), (0.5, 0.2, 0.5), 40.0, SIZE),
+    Camera((0.5, 2.0, 0.5), (0.5, 0.0, 0.5), 40.0, SIZE),
+)
+
+pytestmark = [pytest.mark.gpu] if DEVICE == "cuda" else []
+
+
+def scene(center: tuple[float, float, float], particles: int = 4000) -> Scene:
+    """A ball of plasticine and a sphere beside it."""
+    return Scene(
+        "Camera",
+        (Body("sphere", center, (0.12,), particles),),
+        (Manipulator("Sphere", (0.1,), (0.2, 0.3, 0.5), scale=(0.01,) * 3),),
+        grid_size=16,
+    )
+
+
+def ball_depth(camera: Camera, center: tuple[float, float, float], radius: float) -> np.ndarray:
+    """Depth of a ball in each pixel, NaN beside it."""
+    rays = camera.points(np.ones(SIZE[::-1])) - np.array(camera.position)
+    offset = np.array(center) - camera.position
+    along, square = rays @ offset, (rays**2).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        return (along - np.sqrt(along**2 - square * (offset @ offset - radius**2))) / square
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_depth_and_labels_are_those_of_closed_forms(camera):
+    where = (0.6, 0.3, 0.6)
+    simulator = Simulator([scene(where)], device=DEVICE)
+    pictures = CameraSensor(simulator, camera).capture()
+    depth, labels = pictures["depth"][0], pictures["segmentation"][0]
+    floor = camera.position[1] / (camera.position[1] - camera.points(np.ones(SIZE[::-1]))[..., 1])
+    np.testing.assert_allclose(depth[labels == FLOOR], floor[labels == FLOOR], rtol=1e-5)
+    exact = ball_depth(camera, (0.2, 0.3, 0.5), 0.1)
+    np.testing.assert_array_equal(labels == FIRST_MANIPULATOR, np.isfinite(exact))
+    np.testing.assert_allclose(depth[labels == FIRST_MANIPULATOR], exact[np.isfinite(exact)], atol=1e-3)
+    # The surface of plasticine is rough by its particles, its outline right to a pixel.
+    body, shape = labels == FIRST_BODY, np.isfinite(ball_depth(camera, where, 0.12))
+    pixel = 1.5 * camera.pixel_size(SIZE[1])
+    assert not (body & np.isnan(ball_depth(camera, where, 0.12 + pixel))).any()
+    assert body[np.isfinite(ball_depth(camera, where, 0.12 - pixel))].all()
+    assert abs(body.sum() / shape.sum() - 1.0) < 0.1
+    assert np.abs(depth - ball_depth(camera, where, 0.12))[body & shape].mean() < 0.01
+    assert pictures["rgb"].shape == (1, *SIZE[::-1], 3) and len(np.unique(pictures["rgb"][0][body])) > 10
+
+
+def test_pictures_are_the_same_in_a_batch_and_follow_steps():
+    places = [(0.5, 0.3, 0.5), (0.6, 0.3, 0.4)]
+    simulator = Simulator([scene(place) for place in places], device=DEVICE)
+    sensor = CameraSensor(simulator, CAMERAS[0])
+    first = sensor.capture()
+    actions = np.ones((2, 3))
+    simulator.step(actions)
+    later = sensor.capture()
+    assert (first["depth"] != later["depth"]).any(axis=(1, 2)).all()
+    alone = Simulator([scene(places[1])], device=DEVICE)
+    one = CameraSensor(alone, CAMERAS[0])
+    for name, picture in one.capture().items():
+        np.testing.assert_array_equal(picture[0], first[name][1])
+    if DEVICE == "cpu":
+        alone.step(actions[1:])
+        np.testing.assert_array_equal(one.capture("depth")["depth"][0], later["depth"][1])
