@@ -1,7 +1,7 @@
-"""Pages of the documentation that are made when it is built; run by mkdocs-gen-files.
+"""Generated pages of the site; run by mkdocs-gen-files at build time.
 
-The reference of the configuration comes from the dataclasses and the YAML files, the reference of Python from
-docstrings, two pages from files of the repository's root, and a page from each notebook of the examples.
+The reference of the configuration is made from the dataclasses and the YAML files, the reference of Python from
+docstrings. Files of the repository's root, the suite's task files and the notebooks of the examples get a page each.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ PYTHON = {
     ),
     "simulator": (
         "Simulator",
-        "Usable alone.",
+        "The simulator, usable without configurations.",
         ("plab.sim.simulator", "plab.sim.callbacks.Recording", "plab.sim.state"),
     ),
     "methods": (
         "Methods",
-        "What a method outside plab fills in.",
+        "The interface of a method outside plab.",
         ("plab.families", "plab.runners.runner"),
     ),
     "environments": (
@@ -113,6 +113,9 @@ def main() -> None:
         _write(name.lower(), re.sub(r"\]\(docs/", "](", text))
     for path in (ROOT / "examples" / "notebooks").glob("*.ipynb"):
         _write(f"notebooks/{path.stem}.md", "\n\n".join(_notebook(path)) + "\n")
+    for path in (ROOT / "conf" / "task").glob("*.yaml"):
+        text = path.read_text(encoding="utf-8")
+        _write(f"tasks/{path.stem}.md", f"# {path.stem}\n\n`conf/task/{path.name}`\n\n```yaml\n{text}```\n")
 
 
 def _notebook(path: Path) -> Iterator[str]:
@@ -124,7 +127,7 @@ def _notebook(path: Path) -> Iterator[str]:
         else:
             text = re.sub(r"\]\((\w+)\.ipynb", r"](\1.md", text)
             yield re.sub(r"\]\(\.\./\.\./docs/", "](../", text)
-    yield f"To run it, and to see the rollouts in 3-D: `examples/notebooks/{path.name}`, in Jupyter."
+    yield f"Open `examples/notebooks/{path.name}` in Jupyter to run it and to see the rollouts in 3-D."
 
 
 def _write(path: str, text: str) -> None:
@@ -135,9 +138,9 @@ def _write(path: str, text: str) -> None:
 def _configuration() -> Iterator[str]:
     yield "# Configuration\n"
     yield (
-        "Every key, from the dataclasses that check them. Defaults are those of `conf/`, of a task those of "
-        "Rope, of what a profile sets those of `release`. "
-        "`python -m plab.run --help-all` prints the same with the comments of the files.\n"
+        "All keys, with their types and defaults. Defaults are those of `conf/`: for tasks those of Rope, for "
+        "values set by a profile those of `release`. "
+        "`plab run --help-all` prints the same with the comments of the files.\n"
     )
     for title, prefix, kind, source in SECTIONS:
         yield f"## {title}\n"
