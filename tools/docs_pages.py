@@ -1,7 +1,7 @@
 """Generated pages of the site; run by mkdocs-gen-files at build time.
 
-The reference of the configuration is made from the dataclasses and the YAML files, the reference of Python from
-docstrings. Files of the repository's root, the suite's task files and the notebooks of the examples get a page each.
+The reference of the configuration is made from the dataclasses and the YAML files, the reference of Python
+from docstrings. Files of the repository's root, the suite's tasks and the example notebooks get a page each.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ def _write(path: str, text: str) -> None:
 def _configuration() -> Iterator[str]:
     yield "# Configuration\n"
     yield (
-        "All keys, with their types and defaults. Defaults are those of `conf/`: for tasks those of Rope, for "
-        "values set by a profile those of `release`. "
+        "All keys, with their types and defaults. Defaults are those of `conf/`: for tasks those of Rope, "
+        "for values set by a profile those of `release`. "
         "`plab run --help-all` prints the same with the comments of the files.\n"
     )
     for title, prefix, kind, source in SECTIONS:
