@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
         found = look()
         print(json.dumps(asdict(found) | {"workers": found.workers, "eta": found.eta}, indent=1))
     elif options.form == "csv":
-        columns = ("task", "method", "expected", *STATES, "mean_seconds", "rate", "left")
+        columns = ("task", "method", "expected", *STATES, "score", "mean_seconds", "rate", "left")
         groups = [asdict(group) | group.counts for group in look().groups]
         print_table(columns, ([group[name] for name in columns] for group in groups), "csv")
     else:

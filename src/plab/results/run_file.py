@@ -56,6 +56,11 @@ _SUMMARY: dict[str, type] = {
 _COMPACT = ("v110", "v110")
 """HDF5 file format of 2016, whose groups and small data sets take a third of the room of the oldest one's."""
 
+_PROGRESS_SUFFIX = ".progress"
+
+_PROGRESS_EVERY = 1.0
+"""Interval at which a run leaves its progress beside its file [s]."""
+
 _PROBE_BYTES = 4 << 20
 """Room demanded in the results folder before a run starts: a partial, its successor and the final file."""
 
@@ -225,6 +230,15 @@ def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
         return config_of(file), pd.DataFrame(curves_of(file))
 
 
+def read_progress(path: Path) -> dict[str, float]:
+    """Return ``rows``, ``episodes`` and ``score`` of a run under way, newer than its partial file ``path``;
+    empty where there is nothing newer."""
+    stem = path.name.removesuffix(PARTIAL_SUFFIX)
+    with suppress(OSError, ValueError):
+        return dict(json.loads(path.with_name(stem + _PROGRESS_SUFFIX).read_text()))
+    return {}
+
+
 def split_archive(path: Path) -> tuple[Path, str] | None:
     """Return archive and member of a path into an archive, None for any other path."""
     for folder in path.parents:
@@ -335,7 +349,9 @@ def summary_of(file: h5py.File) -> dict[str, Any]:
 def columns_of(file: h5py.File) -> dict[str, np.ndarray]:
     """Return the columns of the iterations of an open run, shape [iteration] each; ValueError if one holds no
     numbers or is of another length than the others."""
-    found = {name: _numbers(file, f"iterations/{name}") for name in summary_of(file)["columns"]}
+    names = summary_of(file)["columns"]
+    group = _member(file, "iterations") if names else file
+    found = {name: _numbers(group, name) for name in names}
     if len({values.shape for values in found.values()}) > 1 or any(v.ndim != 1 for v in found.values()):
         raise ValueError("the columns of iterations differ in length")
     return found
@@ -374,7 +390,9 @@ def _member(file: h5py.Group, path: str) -> h5py.Group | h5py.Dataset:
 
 def _numbers(file: h5py.Group, path: str) -> np.ndarray:
     found = _member(file, path)
-    if found.dtype.kind not in "biufc" or found.is_virtual or found.external:
+    layout = found.id.get_create_plist()
+    elsewhere = layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count()
+    if found.dtype.kind not in "biufc" or elsewhere:
         raise ValueError(f"{path} holds no numbers, or has them in another file")
     if found.nbytes > min(LARGEST, _SMALL + _RATIO * found.id.get_storage_size()):
         raise ValueError(f"{path} claims {found.nbytes} bytes, which the file does not hold")
@@ -436,6 +454,7 @@ class RunFile:
         known = RunResult(config, config_hash(config), provenance=provenance(config))
         self._state: tuple[RunResult, tuple[Any, ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
+        self._progress, self._reported = self.path.with_suffix(_PROGRESS_SUFFIX), time.monotonic()
         self._lock: Lock | None = None
         # What is there before the run begins: folders made for it, files, iterations.
         self._made: list[Path] = []
@@ -502,7 +521,7 @@ class RunFile:
 
     def _remove_temporary(self) -> None:
         for path in self._files():
-            if path.suffix == ".tmp":
+            if path.suffix in (".tmp", _PROGRESS_SUFFIX):
                 path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
@@ -549,6 +568,8 @@ class RunFile:
     def release(self) -> None:
         """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
         if self._lock is not None:
+            with suppress(OSError):
+                self._progress.unlink(missing_ok=True)
             self._lock.release()
 
     def spend(self, name: str, seconds: float) -> None:
@@ -570,8 +591,21 @@ class RunFile:
         """
         known, pending = self._state
         self._state = dataclasses.replace(known, resume=dict(resume), **changes), (dict(row), pending)
-        if keep or time.monotonic() - self._written >= self._every:
+        now = time.monotonic()
+        if keep or now - self._written >= self._every:
             self._write()
+        if now - self._reported >= _PROGRESS_EVERY:
+            self._reported = now
+            self._report(row)
+
+    def _report(self, row: Mapping[str, float]) -> None:
+        """Write the progress for ``plab status``: rows, episodes, and the score of the best row."""
+        known = self.result
+        score = known.columns.get("score", np.full(known.rows, math.nan))[known.best_iteration]
+        content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
+        # A full disk ends a run at its next checkpoint, not here.
+        with suppress(ResultsError):
+            replace_file(self._progress, json.dumps(content, default=float).encode(), sync=False)
 
     def close(self, status: str, message: str) -> None:
         """Mark an unfinished run ``failed`` or ``stopped``, keeping what it computed in the partial file."""

@@ -96,6 +96,9 @@ class Row:
         return Path(self.values["path"])
 
 
+Index = dict[str, tuple[str, list[tuple[str, str, str]]]]
+"""Identity of each file, and member, row and configuration of each of its runs."""
+
 Entries = list[Row | ResultsError]
 """Rows of a file or an archive, and what is wrong where there is none."""
 
@@ -354,20 +357,27 @@ def _indexed(root: Path, files: Sequence[File]) -> list[Entries | None]:
     """Return the rows of each file below a folder, from the index where the file has not changed."""
     place = _index_place(root)
     known = _stored(place)
-    identities = [_identity(status) for _, status in files]
-    names = [os.path.relpath(path, root) for path, _ in files]
-    found: list[Entries | None] = []
-    changed = len(known) != len(files)
-    for (path, _), name, identity in zip(files, names, identities, strict=True):
+    now, found, kept, changed = time.time(), [], {}, False
+    for path, status in files:
+        name, identity = os.path.relpath(path, root), _identity(status)
         entry = known.get(name)
         if entry is not None and entry[0] == identity:
+            kept[name] = entry
             found.append([_restored(path, *parts) for parts in entry[1]])
-        else:
-            found.append(_read(path))
+            continue
+        found.append(own := _read(path))
+        # Damaged files are read again: the message is part of the result.
+        if own and now - status.st_mtime >= _SETTLED and all(isinstance(row, Row) for row in own):
+            kept[name] = identity, [_stored_parts(path, row) for row in own if isinstance(row, Row)]
             changed = True
-    if changed:
-        _write(place, zip(files, names, identities, found, strict=True))
+    if changed or len(kept) < len(known):
+        _write(place, kept)
     return found
+
+
+def _stored_parts(path: Path, row: Row) -> tuple[str, str, str]:
+    member = row.path.relative_to(path).as_posix() if row.path != path else ""
+    return member, json.dumps(row.values | {"path": ""}), json.dumps(row.config)
 
 
 def _identity(status: os.stat_result) -> str:
@@ -383,13 +393,13 @@ def _index_place(root: Path) -> Path:
     return cache_dir() / "results" / f"{digest}{_INDEX}"
 
 
-def _stored(place: Path) -> dict[str, tuple[str, list[tuple[str, str, str]]]]:
+def _stored(place: Path) -> Index:
     """Return identity and runs of each file in the index; nothing if it is missing or damaged."""
     if not place.exists():
         return {}
     import duckdb
 
-    known: dict[str, tuple[str, list[tuple[str, str, str]]]] = {}
+    known: Index = {}
     with suppress(duckdb.Error), duckdb.connect() as connection:
         query = f"SELECT {', '.join(_FIELDS)} FROM read_parquet(?)"
         for file, identity, *parts in connection.execute(query, [str(place)]).fetchall():
@@ -404,22 +414,11 @@ def _restored(path: Path, member: str, row: str, config: str) -> Row:
     return Row(values, json.loads(config))
 
 
-def _write(place: Path, entries: Iterator[tuple[File, str, str, Entries | None]]) -> None:
+def _write(place: Path, entries: Index) -> None:
     """Replace the index; a folder that cannot be written has none."""
     import duckdb
 
-    now, table = time.time(), []
-    for (path, status), name, identity, found in entries:
-        sound = [row for row in found or () if isinstance(row, Row)]
-        # Damaged files are read again: the message is part of the result.
-        if not sound or len(sound) < len(found or ()) or now - status.st_mtime < _SETTLED:
-            continue
-        for row in sound:
-            member = row.path.relative_to(path).as_posix() if row.path != path else ""
-            values = json.dumps(row.values | {"path": ""})
-            table.append((name, identity, member, values, json.dumps(row.config)))
-    if not table and not place.exists():
-        return
+    table = [(name, identity, *parts) for name, (identity, own) in entries.items() for parts in own]
     temporary = place.with_name(f"{place.name}.{os.getpid()}.tmp")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

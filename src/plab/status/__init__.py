@@ -1,4 +1,4 @@
-"""What is done, running, failed and missing in folders and archives of results."""
+"""States of runs in folders and archives of results: done, running, interrupted, failed, missing."""
 
 from plab.status.survey import NAMES, STATES, Group, Run, Survey, survey
 

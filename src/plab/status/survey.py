@@ -1,4 +1,4 @@
-"""Which runs there are and should be, what has become of each, and how long the rest takes."""
+"""Survey of runs: what is done, running, failed and missing, with scores and the time that is left."""
 
 from __future__ import annotations
 
@@ -17,23 +17,21 @@ from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_
 from plab.outcomes import MOST_RUNS
 from plab.results import ResultsError, Row, row_count
 from plab.results.locks import held
-from plab.results.run_file import columns_of, opened, split_archive, summary_of
+from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
 from plab.results.schema import parse_member
 from plab.results.table import readable_rows, sources_of
 
-__all__ = ["NAMES", "STATES", "Group", "Run", "Survey", "survey"]
-
 STATES = ("done", "running", "interrupted", "failed", "missing")
-"""What a run can be, best first; ``interrupted`` goes on when its command is given again."""
+"""States of a run, best first; ``interrupted`` resumes when its command is given again."""
 
 NAMES = ("task", "variant", "method", "seed")
-"""What tells runs apart."""
+"""Identity of a run."""
 
 Key: TypeAlias = tuple[str, str, str, str]
 """Task, variant, method and seed of a run."""
 
 _RECENT_ROWS = 20
-"""Rows of a run under way that its speed is taken from."""
+"""Number of latest rows of a run under way from which its speed is estimated."""
 
 
 @dataclass
@@ -46,7 +44,8 @@ class Run:
         method: Name of the method.
         seed: Seed of the method.
         state: One of :data:`STATES`.
-        message: Why it failed; empty otherwise.
+        message: Reason of a failure; empty otherwise.
+        score: Score of a finished run, or that of the best row so far; None if there is none.
         done: Iterations, or episodes, done.
         total: Iterations, or episodes, in all; 0 where it is not known.
         rate: Iterations, or episodes, per second of wall time [1/s], of a run under way; None if it is not
@@ -63,6 +62,7 @@ class Run:
     seed: str
     state: str = "missing"
     message: str = ""
+    score: float | None = None
     done: int = 0
     total: int = 0
     rate: float | None = None
@@ -71,16 +71,22 @@ class Run:
     together: float = 1.0
     path: str = ""
 
+    @property
+    def name(self) -> str:
+        """Name for readers."""
+        return f"{self.task}-v{self.variant} {self.method} seed {self.seed}"
+
 
 @dataclass
 class Group:
     """The runs of a task and a method.
 
     Attributes:
-        task: Name of the task, or of all.
+        task: Name of the task.
         method: Name of the method.
         expected: Number of runs that are asked for.
-        counts: How many of them are in each of :data:`STATES`.
+        counts: Number of them in each of :data:`STATES`.
+        score: Mean score of those that are done; None if none is.
         mean_seconds: Mean wall time of those that are done [s]; None if none is.
         rate: Mean rate of those that are running [1/s]; None if none is.
         left: Time that one worker needs for what is not done [s]; None if it is not known.
@@ -90,6 +96,7 @@ class Group:
     method: str
     expected: int
     counts: dict[str, int]
+    score: float | None
     mean_seconds: float | None
     rate: float | None
     left: float | None
@@ -103,7 +110,7 @@ class Survey:
         runs: Every one of them.
         groups: The same by task and method.
         others: Number of further runs in the results: not asked for, or of other settings.
-        unreadable: What could not be read.
+        unreadable: Messages about files that could not be read.
         protocol: Name of the runs' protocol.
     """
 
@@ -120,22 +127,23 @@ class Survey:
 
     @property
     def workers(self) -> int:
-        """About how many processes are at work: runs of a batch share one."""
+        """Approximate number of processes at work: runs of a batch share one."""
         return max(round(sum(1.0 / run.together for run in self.running)), 1) if self.running else 0
 
     @property
     def eta(self) -> float | None:
         """Time until all is done [s], if as many processes stay at work; None if it is not known."""
-        left = _sum(group.left for group in self.groups)
-        if not self.workers or left is None:
+        lefts = [group.left for group in self.groups]
+        if not self.workers or None in lefts:
             return None
+        left = sum(cast(list[float], lefts))
         # No process can help another one.
         longest = max((run.left or 0.0) * run.together for run in self.running)
         return max(left / self.workers, longest)
 
 
 def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, missing: bool = False) -> Survey:
-    """Find out what has become of the runs that are asked for.
+    """Find the state of the runs that are asked for.
 
     Args:
         source: Folder of results, archive, or several.
@@ -153,11 +161,10 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
     begun = [key for root in sources_of(source) for key in _begun(root)]
-    keys = _expected(fitting, begun, chosen, missing)
-    runs = {key: Run(*key) for key in keys}
+    runs = {key: Run(*key) for key in _expected(fitting, begun, chosen, missing)}
     others = 0
     for row in fitting:
-        run = runs.get(_names(row.values))
+        run = runs.get(_key(row.values))
         # Of several settings of the same run the best one counts.
         others += run is None or run.state != "missing"
         if run is not None:
@@ -165,28 +172,20 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     for key in begun:
         if key in runs and runs[key].state not in ("done", "running"):
             runs[key].state = "running"
-    times: dict[tuple[str, str], list[float]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs.values():
-        if run.state == "done":
-            times[run.task, run.method].append(run.seconds)
-    means = {pair: sum(seconds) / len(seconds) for pair, seconds in times.items()}
-    for run in runs.values():
-        mean = means.get((run.task, run.method))
-        if run.state == "done":
-            run.left = 0.0
-        elif run.left is None and mean is not None:
-            # Its own speed has not said so.
-            run.left = mean * max(1.0 - (run.done / run.total if run.total else 0.0), 0.0)
-    pairs = dict.fromkeys((run.task, run.method) for run in runs.values())
-    groups = [_group(task, method, runs.values(), means) for task, method in pairs]
-    return Survey(list(runs.values()), groups, others, [str(error) for error in unreadable], protocol)
+        groups[run.task, run.method].append(run)
+    return Survey(
+        list(runs.values()),
+        [_group(task, method, own) for (task, method), own in groups.items()],
+        others,
+        [str(error) for error in unreadable],
+        protocol,
+    )
 
 
-# --------------------------------------------------------------------------------------------------- counting
-
-
-def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> Iterable[Key]:
-    present = list(dict.fromkeys(_names(row.values) for row in found))
+def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> list[Key]:
+    present = list(dict.fromkeys(_key(row.values) for row in found))
     if not chosen.keys:
         # Of a run without a file only its name is known.
         present += [
@@ -195,35 +194,25 @@ def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, mis
             if key not in present and chosen(dict(zip(NAMES, key, strict=True)), {})
         ]
     if missing or (not present and chosen.choices):
-        return _suite(present, chosen)
-    # What the words name takes the place of what a run has.
-    asked = {
-        tuple(tuple(chosen.choices.get(name, [own])) for name, own in zip(NAMES, key, strict=True))
-        for key in present
-    }
-    _require_few(sum(math.prod(map(len, names)) for names in asked))
-    keys = {key for names in asked for key in cast(Iterable[Key], itertools.product(*names))}
-    return sorted(keys, key=_rank)
-
-
-def _suite(present: Sequence[Key], chosen: Selection) -> Iterable[Key]:
-    """Return all combinations of what is chosen, of the suite's tasks and variants, and of the methods and
-    seeds that there are."""
-    methods, seeds = ({key[number] for key in present} for number in (2, 3))
-    open_choices = {
-        "task": suite_tasks(),
-        "variant": list(SUITE_VARIANTS),
-        "method": sorted(methods, key=lambda name: _place(name, PAPER_METHODS)) or list(PAPER_METHODS),
-        "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
-    }
-    asked = [chosen.choices.get(name, open_choices[name]) for name in NAMES]
-    _require_few(math.prod(map(len, asked)))
-    return cast(Iterable[Key], itertools.product(*asked))
-
-
-def _require_few(count: int) -> None:
+        methods, seeds = ({key[number] for key in present} for number in (2, 3))
+        free = {
+            "task": suite_tasks(),
+            "variant": list(SUITE_VARIANTS),
+            "method": sorted(methods, key=lambda name: _place(name, PAPER_METHODS)) or list(PAPER_METHODS),
+            "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
+        }
+        asked = {tuple(tuple(chosen.choices.get(name, free[name])) for name in NAMES)}
+    else:
+        # Values on the command line take the place of those that a run has.
+        asked = {
+            tuple(tuple(chosen.choices.get(name, [own])) for name, own in zip(NAMES, key, strict=True))
+            for key in present
+        }
+    count = sum(math.prod(map(len, names)) for names in asked)
     if count > MOST_RUNS:
         raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
+    keys = dict.fromkeys(cast(Key, key) for names in asked for key in itertools.product(*names))
+    return list(keys) if len(asked) == 1 else sorted(keys, key=_rank)
 
 
 def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
@@ -231,14 +220,14 @@ def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
 
 
 def _rank(key: Key) -> tuple[Any, ...]:
-    """Return where a run is in tables: by task, method, variant and seed."""
+    """Return the position of a run in tables: by task, method, variant and seed."""
     task, variant, method, seed = key
     number = int(seed) if seed.isdecimal() else -1
     orders = (task, suite_tasks()), (method, PAPER_METHODS), (variant, SUITE_VARIANTS)
     return *(_place(name, list(known)) for name, known in orders), number, seed
 
 
-def _names(values: Mapping[str, Any]) -> Key:
+def _key(values: Mapping[str, Any]) -> Key:
     task, variant, method, seed = (str(values[name]) for name in NAMES)
     return task, variant, method, seed
 
@@ -254,6 +243,7 @@ def _take(run: Run, row: Row) -> None:
         return
     run.state, run.path, run.seconds = state, str(row.path), row.values["seconds"]
     run.rate = run.left = None
+    run.score = None if math.isnan(row.values["score"]) else row.values["score"]
     message = row.values["message"] if state == "failed" else ""
     run.message = "".join(letter if letter.isprintable() else " " for letter in message)
     run.total = row_count(row.config["method"]) or row.config["method"].get("episodes") or 0
@@ -264,70 +254,78 @@ def _take(run: Run, row: Row) -> None:
 
 def _begun(source: Path) -> Iterable[Key]:
     """Yield runs that somebody computes, also those that have no file yet."""
-    if not source.is_dir():
-        return
-    for lock in source.rglob("*.lock"):
+    for lock in source.rglob("*.lock") if source.is_dir() else ():
         names = parse_member(lock)
         if names is not None and held(lock.with_suffix(".h5")):
-            yield _names(names)
+            yield _key(names)
 
 
 # -------------------------------------------------------------------------------------------------- estimates
 
 
 def _measure(run: Run) -> None:
-    """Take speed and rest of a run under way from its latest rows."""
+    """Estimate speed and time left of a run under way from its latest rows."""
     try:
         with opened(Path(run.path)) as file:
             table, summary = columns_of(file), summary_of(file)
-            seconds = table["seconds"]
-            done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
-            if not math.isfinite(sum(seconds) + sum(done)):
-                raise ValueError("seconds or episodes are not finite")
-            written = Path(run.path).stat().st_mtime
-            run.seconds = float(sum(summary["wall_time"].values()))
-            run.together = _together(summary["provenance"], written, run.seconds)
-    except (ResultsError, OSError):
+        seconds = table["seconds"]
+        done = table["episodes"] if "train_reward" in table else range(1, len(seconds) + 1)
+        written = Path(run.path).stat().st_mtime
+    except (ResultsError, OSError, KeyError):
         # It may just have ended, and its partial file be gone.
         return
+    run.seconds = float(sum(summary["wall_time"].values()))
+    run.together = _together(summary["provenance"], written, run.seconds)
     if len(seconds) == 0:
         return
     run.done = int(done[-1])
+    run.score = float(table["score"][min(summary["best_iteration"], len(seconds) - 1)])
     # The first row of a process compiles the kernels.
     count = min(_RECENT_ROWS, len(seconds) - 1)
-    if count == 0 or run.done <= int(done[-1 - count]):
-        return
-    rate = (run.done - int(done[-1 - count])) / max(float(seconds[-count:].sum()), 1e-9)
-    since = max(time.time() - written, 0.0)
-    run.left = max((run.total - run.done) / rate - since / run.together, 0.0)
-    run.rate = rate / run.together
+    if count and run.done > int(done[-1 - count]):
+        rate = (run.done - int(done[-1 - count])) / max(float(seconds[-count:].sum()), 1e-9)
+        since = max(time.time() - written, 0.0)
+        run.left = max((run.total - run.done) / rate - since / run.together, 0.0)
+        run.rate = rate / run.together
+    # Newer than the checkpoint.
+    latest = read_progress(Path(run.path))
+    if latest.get("rows", 0) > len(seconds):
+        run.done = int(latest["episodes" if "train_reward" in table else "rows"])
+        run.score = latest["score"]
 
 
 def _together(origin: dict[str, Any], written: float, spent: float) -> float:
     """Return how many runs share a process: wall time since the start over the run's own time, at least 1."""
     if origin.get("resumed") or spent <= 0.0:
-        # What went by between two processes is not known.
+        # The time between two processes is not known.
         return 1.0
     started = datetime.fromisoformat(origin["start_time"]).timestamp()
     return max((written - started) / spent, 1.0)
 
 
-def _group(task: str, method: str, runs: Iterable[Run], means: dict[tuple[str, str], float]) -> Group:
-    own = [run for run in runs if (run.task, run.method) == (task, method)]
+def _group(task: str, method: str, own: Sequence[Run]) -> Group:
+    """Sum up the runs of a task and a method, and estimate the time left of those without a speed."""
+    done = [run for run in own if run.state == "done"]
+    seconds, score = _mean(run.seconds for run in done), _mean(run.score for run in done)
+    for run in own:
+        if run.state == "done":
+            run.left = 0.0
+        elif run.left is None and seconds is not None:
+            run.left = seconds * max(1.0 - (run.done / run.total if run.total else 0.0), 0.0)
     counts = Counter(run.state for run in own)
-    rates = [run.rate for run in own if run.rate is not None]
+    lefts = [run.left for run in own]
     return Group(
         task,
         method,
         len(own),
         {state: counts[state] for state in STATES},
-        means.get((task, method)),
-        sum(rates) / len(rates) if rates else None,
-        _sum(run.left for run in own),
+        score,
+        seconds,
+        _mean(run.rate for run in own),
+        None if None in lefts else float(sum(cast(list[float], lefts))),
     )
 
 
-def _sum(values: Iterable[float | None]) -> float | None:
-    """Add numbers; None if one of them is not known."""
-    known = list(values)
-    return None if None in known else float(sum(value for value in known if value is not None))
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None

@@ -1,4 +1,4 @@
-"""What ``python -m plab.status`` shows: a table, and with ``--watch`` all runs, live."""
+"""Views of a survey: a table of groups, and all runs live."""
 
 from __future__ import annotations
 
@@ -10,22 +10,17 @@ from collections.abc import Callable
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from plab.errors import ArgumentError, tell
 from plab.status.survey import STATES, Survey
 
-__all__ = ["duration", "show", "watch"]
-
-EVERY = 2.0
-"""Time between two looks [s]."""
-
-_ORDER = ("running", "failed", "interrupted", "missing", "done")
-"""States in the order in which runs are shown where there is no room for all."""
+EVERY = 1.0
+"""Interval between two looks [s]."""
 
 _COLOURS = {"running": "cyan", "failed": "red", "interrupted": "yellow", "missing": "dim", "done": "green"}
+"""Colours of states, in the order in which runs are shown where there is no room for all."""
 
 _AROUND = 6
 """Lines of the screen that are not for runs."""
@@ -46,36 +41,43 @@ def duration(seconds: float | None) -> str:
 
 def show(found: Survey) -> None:
     """Print a table by task and method, the runs under way and those that failed, and the sums."""
-    # Not narrower than the table where the output is no terminal.
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    table = Table("task", "method")
-    for title in ("done", *STATES[1:], "mean time", "rate", "time left"):
-        table.add_column(title, justify="right")
+    console = Console() if sys.stdout.isatty() else Console(width=80)
+    table = _table("task", "method", "done", "not done", "score", "mean time", "time left")
     for group in found.groups:
-        counts = [str(group.counts[state] or "") for state in STATES[1:]]
-        rate = "" if group.rate is None else f"{group.rate:.3g}/s"
         mean = "" if group.mean_seconds is None else duration(group.mean_seconds)
         left = "" if group.left == 0 else duration(group.left)
+        open_runs = [f"{group.counts[state]} {state}" for state in STATES[1:] if group.counts[state]]
         done = f"{group.counts['done']}/{group.expected}"
-        table.add_row(escape(group.task), escape(group.method), done, *counts, mean, rate, left)
+        table.add_row(group.task, group.method, done, ", ".join(open_runs), _score(group.score), mean, left)
     console.print(table)
-    if found.protocol != "plab":
-        console.print(f"protocol: {found.protocol}", highlight=False)
+    lines = [] if found.protocol == "plab" else [f"protocol: {found.protocol}"]
     for run in found.runs:
-        name = f"{run.task}-v{run.variant} {run.method} seed {run.seed}"
         if run.state == "running":
-            left = None if run.left is None else run.left * run.together
-            progress = f"{run.done}/{run.total}, {duration(left)} left" if run.total else "starting"
-            console.print(f"running: {name}: {progress}", highlight=False, markup=False)
-        if run.state == "failed":
-            console.print(f"[red]failed[/]: {escape(f'{name}: {run.message}')}", highlight=False)
-    for line in _sums(found):
-        console.print(line, highlight=False)
+            left = duration(None if run.left is None else run.left * run.together)
+            lines.append(
+                f"running: {run.name}: {f'{run.done}/{run.total}, {left} left' if run.total else 'starting'}"
+            )
+        elif run.state == "failed":
+            lines.append(f"failed: {run.name}: {run.message}")
+    lines += _sums(found)
     if found.others:
-        text = "further run(s) in the results, of other names or other settings"
-        console.print(f"{found.others} {text}", highlight=False)
+        lines.append(f"{found.others} further run(s) in the results, of other names or other settings")
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     for error in found.unreadable:
         tell(f"left out: {error}")
+
+
+def _table(*titles: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for title in titles:
+        text = title in ("task", "method", "run", "state", "not done")
+        table.add_column(title, justify="left" if text else "right")
+    return table
+
+
+def _score(score: float | None) -> str:
+    return "" if score is None else f"{score:.2f}"
 
 
 def _sums(found: Survey) -> list[str]:
@@ -109,21 +111,19 @@ def watch(look: Callable[[], Survey], pause: Callable[[float], None] = time.slee
 
 def _screen(found: Survey, room: int) -> Group:
     """Return a table with a line per run, as many as there is room for, and the sums."""
-    table = Table("run", "state", box=None, pad_edge=False)
-    for title in ("done", "rate", "time left"):
-        table.add_column(title, justify="right")
+    table = _table("run", "state", "done", "score", "rate", "time left")
     runs = found.runs
     if len(runs) > room:
-        runs = sorted(runs, key=lambda run: _ORDER.index(run.state))[: max(room, 1)]
+        runs = sorted(runs, key=lambda run: list(_COLOURS).index(run.state))[: max(room, 1)]
     for run in runs:
         state = Text(run.state, _COLOURS[run.state])
         if run.message:
             state.append(f": {run.message}", "default")
         done = f"{run.done}/{run.total}" if run.total else ""
         rate = "" if run.rate is None else f"{run.rate:.3g}/s"
-        name = Text(f"{run.task}-v{run.variant} {run.method} seed {run.seed}")
-        left = None if run.left is None else run.left * run.together
         # Where runs share a process, each has to wait for the others.
-        table.add_row(name, state, done, rate, duration(left) if run.state == "running" else "")
+        left = duration(None if run.left is None else run.left * run.together)
+        left = left if run.state == "running" else ""
+        table.add_row(Text(run.name), state, done, _score(run.score), rate, left)
     rest = len(found.runs) - len(runs)
     return Group(table, *([f"... and {rest} more"] if rest else []), *_sums(found))
