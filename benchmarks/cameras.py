@@ -1,6 +1,6 @@
 """Time of pictures of a camera in every environment.
 
-    python benchmarks/cameras.py                                             one environment, 64 x 64, two threads
+    python benchmarks/cameras.py                                         one environment, 64 x 64
     python benchmarks/cameras.py sim.device=cuda batch=64 size=128
     python benchmarks/cameras.py sim.device=cuda batch=64 size=128 picture=rgb
 
