@@ -29,11 +29,12 @@ import taichi as ti
 import torch
 
 from plab.cli.tables import measure_table
-from plab.config import Config, OffPolicyConfig, PpoConfig, RlConfig, load_config
+from plab.config import Config, load_config
+from plab.config.families import FAMILIES
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
-from plab.families import FAMILIES
-from plab.runners.agents import OffPolicyAgents
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, RlConfig
+from plab.runners.ppo import PpoConfig
 from plab.runners.rl import Population, population_settings
 
 __all__ = ["COLUMNS", "PARTS", "measure", "rows"]

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from plab.config import load_config
+from plab.config.families import family
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
-from plab.families import family
 from plab.objective import scores_from_iou
 from plab.results import RunResult, config_dict, config_hash, result_path, write
 from plab.results.provenance import now, provenance

@@ -24,7 +24,7 @@ from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
 from plab.runners.policy import Policy, load_policy, shared_batches
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
 

@@ -14,7 +14,7 @@ from browsing import browser  # noqa: F401
 from plab.config import Config
 from plab.config.compose import cuda_devices
 from plab.outcomes import Outcome
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 from refusals import ending, refusal, snapshot
 from suite import DEVICE
 

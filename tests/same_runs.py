@@ -14,7 +14,7 @@ import pytest
 from plab.config import Config
 from plab.results import RunResult, read, result_path
 from plab.results.run_file import RunFile
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 
 TIMES = ["seconds"]
 """Columns in which two runs of the same numbers differ."""

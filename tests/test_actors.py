@@ -17,11 +17,12 @@ from plab.envs.core import EpisodeBatch
 from plab.problem import Trials
 from plab.results import RunResult, read, result_path
 from plab.runners import actors, run_config
-from plab.runners.actors import DEVIATION_MIN, ActorPolicy, training_scenes
+from plab.runners.actor_networks import ActorPolicy, ShacPolicy
+from plab.runners.actors import DEVIATION_MIN, training_scenes
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import evaluation, load_policy, policy_path, shared_batches
-from plab.runners.shac import ShacPolicy, ShacTraining, td_lambda
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
+from plab.runners.shac import ShacTraining, td_lambda
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
@@ -119,7 +120,7 @@ def test_on_cuda_it_begins_as_on_the_cpu_and_learns(finished: RunResult, tmp_pat
 def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, name_of(finished))
     # Simulators are kept from run to run, that of the drawn scenes included.
-    monkeypatch.setattr("plab.runners.policy.EpisodeBatch", None)
+    monkeypatch.setattr("plab.envs.core.EpisodeBatch", None)
     for written in (1, 2):
         with stopped_at(1):
             run_config(cfg, CACHE)
@@ -220,7 +221,7 @@ def test_the_scenes_of_a_training_are_drawn(tmp_path: Path, monkeypatch) -> None
     with pytest.raises(ConfigError, match="task"):
         drawn_configs(make_config("results", "shac", "task.yield_stress=77"), (0,))
     # Those that do not fit are left out; if none does, a run says why.
-    monkeypatch.setattr("plab.runners.actors.fits", lambda one: one.seed_scene % 2)
+    monkeypatch.setattr("plab.problem.fits", lambda one: one.seed_scene % 2)
     cfg = make_config("results", "pods", "method.scenes=4")
     assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003]
     monkeypatch.undo()

@@ -20,10 +20,17 @@ from plab.results import BUDGETS, RunResult, checking, read, result_path
 from plab.results.checking import faults
 from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
-from plab.runners.planners.planner import Answer, CandidateStart, Preview, Request, make_planner
-from plab.runners.planners.sampling import actions_of, knots_of
+from plab.runners.planners.planner import (
+    Answer,
+    CandidateStart,
+    Preview,
+    Request,
+    actions_of,
+    knots_of,
+    make_planner,
+)
 from plab.runners.planners.starts import ContactStarts, support
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
@@ -341,7 +348,7 @@ def test_a_candidate_that_breaks_off_counts_for_nothing(tmp_path: Path, monkeypa
 @pytest.fixture
 def halved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory with room for half of two runs' candidates, which are tried in two parts."""
-    monkeypatch.setattr(planner, "batch_limit", lambda *_: 4)
+    monkeypatch.setattr("plab.sim.memory.batch_limit", lambda *_: 4)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 import torch
 
+from plab import autograd
 from plab.autograd import policy_gradient
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import RunError, apg, run_config, trajectory
-from plab.runners.common import measures, shared_problem, simulator_key
 from plab.runners.loggers import RunLog
 from plab.runners.policy import shared_batches
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache, measures, shared_problem, simulator_key
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
 from same_runs import assert_same_numbers, finished_as, stopped_at
@@ -393,7 +393,7 @@ def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_pa
 
 def test_apg_resumes_to_the_same_numbers(tmp_path: Path, trained: RunResult, monkeypatch) -> None:
     cfg = make_config(tmp_path, *APG)
-    with stopped_at(2, apg, "policy_gradient"):
+    with stopped_at(2, autograd, "policy_gradient"):
         run_config(cfg, CACHE)
     assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
     again = run(cfg)

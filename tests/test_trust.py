@@ -22,7 +22,7 @@ from gymnasium.spaces import Box
 import synthetic
 from plab.cli import results, status
 from plab.config import build_scene, load_config
-from plab.families import FAMILIES
+from plab.config.families import FAMILIES
 from plab.results import ResultsError, check, read, unpack
 from plab.results.table import read_rows
 from plab.runners.policy import Spaces, first_policy, load_policy, policy_path, save_policy

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from plab.config import Config, load_config
-from plab.families import FAMILIES
+from plab.config.families import FAMILIES
 from plab.results import config_hash, read, result_path
 from plab.runners import Runner
 from plab.runners.jobs import Job, RunError

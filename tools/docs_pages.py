@@ -19,6 +19,17 @@ import yaml
 
 from plab import config
 from plab.config.suite import conf_folder
+from plab.runners.agents import OffPolicyConfig, RlConfig
+from plab.runners.apg import ApgConfig
+from plab.runners.planners.cem import CemConfig
+from plab.runners.planners.mppi import MppiConfig
+from plab.runners.planners.multistart import MultistartConfig
+from plab.runners.planners.planner import PlannerConfig, SamplerConfig
+from plab.runners.planners.stages import StagesConfig
+from plab.runners.ppo import PpoConfig
+from plab.runners.shac import ShacConfig
+from plab.runners.td3 import Td3Config
+from plab.runners.trajectory import TrajectoryConfig
 from plab.targets import RECIPES
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +57,7 @@ PYTHON = {
     "methods": (
         "Methods",
         "The interface of a method outside plab.",
-        ("plab.families", "plab.runners.runner"),
+        ("plab.config.families", "plab.runners.runner"),
     ),
     "environments": (
         "Environments",
@@ -74,19 +85,19 @@ SECTIONS = (
     ("sim", "sim.", config.SimConfig, "sim/fast.yaml"),
     ("targets", "targets.", config.TargetsConfig, "config.yaml:targets"),
     ("method, all", "method.", config.MethodConfig, "method/adam.yaml"),
-    ("method=adam, gd, adam_h", "method.", config.TrajectoryConfig, "method/adam.yaml"),
-    ("method=cem, mppi, cmaes, multistart", "method.", config.PlannerConfig, "method/cem.yaml"),
-    ("method=cem, mppi, cmaes", "method.", config.SamplerConfig, "method/cem.yaml"),
-    ("method=cem", "method.", config.CemConfig, "method/cem.yaml"),
-    ("method=mppi", "method.", config.MppiConfig, "method/mppi.yaml"),
-    ("method=multistart", "method.", config.MultistartConfig, "method/multistart.yaml"),
-    ("method=hybrid, solve", "method.", config.StagesConfig, "method/solve.yaml"),
-    ("method=apg", "method.", config.ApgConfig, "method/apg.yaml"),
-    ("method=shac", "method.", config.ShacConfig, "method/shac.yaml"),
-    ("method=sac, td3, ppo", "method.", config.RlConfig, "method/sac.yaml"),
-    ("method=sac, td3", "method.", config.OffPolicyConfig, "method/sac.yaml"),
-    ("method=td3", "method.", config.Td3Config, "method/td3.yaml"),
-    ("method=ppo", "method.", config.PpoConfig, "method/ppo.yaml"),
+    ("method=adam, gd, adam_h", "method.", TrajectoryConfig, "method/adam.yaml"),
+    ("method=cem, mppi, cmaes, multistart", "method.", PlannerConfig, "method/cem.yaml"),
+    ("method=cem, mppi, cmaes", "method.", SamplerConfig, "method/cem.yaml"),
+    ("method=cem", "method.", CemConfig, "method/cem.yaml"),
+    ("method=mppi", "method.", MppiConfig, "method/mppi.yaml"),
+    ("method=multistart", "method.", MultistartConfig, "method/multistart.yaml"),
+    ("method=hybrid, solve", "method.", StagesConfig, "method/solve.yaml"),
+    ("method=apg", "method.", ApgConfig, "method/apg.yaml"),
+    ("method=shac", "method.", ShacConfig, "method/shac.yaml"),
+    ("method=sac, td3, ppo", "method.", RlConfig, "method/sac.yaml"),
+    ("method=sac, td3", "method.", OffPolicyConfig, "method/sac.yaml"),
+    ("method=td3", "method.", Td3Config, "method/td3.yaml"),
+    ("method=ppo", "method.", PpoConfig, "method/ppo.yaml"),
     ("task", "task.", config.TaskConfig, "task/Rope.yaml"),
     ("task.bodies.NAME", "task.bodies.NAME.", config.BodyConfig, None),
     ("task.manipulators.NAME", "task.manipulators.NAME.", config.ManipulatorConfig, None),

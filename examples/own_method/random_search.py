@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plab.config import ConfigError, MethodConfig
-from plab.families import Family
-from plab.runners import Runner, Step, Track
-from plab.runners.common import measures, shared_problem
+from plab.runners import Family, Runner, Step, Track, measures, shared_problem
 
 __all__ = ["FAMILY", "RandomSearch", "RandomSearchConfig"]
 

@@ -11,8 +11,9 @@ from typing import Any
 from sb3_contrib import TQC
 from stable_baselines3.common.vec_env import VecEnv
 
-from plab.config import ConfigError, OffPolicyConfig
-from plab.families import FAMILIES, Rule
+from plab.config import ConfigError
+from plab.runners import FAMILIES, Rule
+from plab.runners.agents import OffPolicyConfig
 from plab.runners.sb3 import ModelKind, off_policy
 
 __all__ = ["FAMILY", "TqcConfig"]

@@ -15,13 +15,23 @@ from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from plab.errors import ConfigError
 
-__all__ = ["load_object", "passed_on", "search_in"]
+__all__ = ["LazyModule", "load_object", "passed_on", "search_in"]
 
 Kind = TypeVar("Kind")
+
+
+class LazyModule(ModuleType):
+    """A module that is imported when one of its names is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Import the module, and keep what the name stands for."""
+        value = getattr(import_module(self.__name__), name)
+        setattr(self, name, value)
+        return value
 
 
 def search_in(config_dir: str | Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
-from plab.families import schemas
+from plab.config.families import schemas
 
 __all__ = ["full_help_text", "help_text"]
 

@@ -12,7 +12,6 @@ from plab.errors import ConfigError
 if TYPE_CHECKING:
     from plab.config.compose import *
     from plab.config.method import *
-    from plab.config.planners import *
     from plab.config.run import *
     from plab.config.suite import conf_folder
     from plab.config.task import *
@@ -20,36 +19,18 @@ if TYPE_CHECKING:
 __all__ = [
     "EXPERIMENT",
     "GROUPS",
-    "ActorConfig",
-    "ApgConfig",
     "BodyConfig",
-    "CemConfig",
-    "CmaesConfig",
     "Config",
     "ConfigError",
     "DrawConfig",
     "ManipulatorConfig",
     "MethodConfig",
-    "MppiConfig",
-    "MultistartConfig",
-    "OffPolicyConfig",
-    "PlannerConfig",
-    "PodsConfig",
-    "PolicyConfig",
-    "PpoConfig",
     "ProtocolConfig",
     "RandomConfig",
     "RangeConfig",
-    "RlConfig",
-    "SacConfig",
-    "SamplerConfig",
-    "ShacConfig",
     "SimConfig",
-    "StagesConfig",
     "TargetsConfig",
     "TaskConfig",
-    "Td3Config",
-    "TrajectoryConfig",
     "build_scene",
     "check_overrides",
     "choices",
@@ -63,7 +44,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a part of the configuration when it is asked for."""
     # The types first: composing needs them while it is imported.
-    for part in ("method", "planners", "task", "run", "suite", "compose") if name in __all__ else ():
+    for part in ("method", "task", "run", "suite", "compose") if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")
         if name in module.__all__:
             return getattr(module, name)

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_hex
 from matplotlib.figure import Figure
 
+from plab.config.families import RL
 from plab.config.selection import lookup
-from plab.families import RL
 from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis, single

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from plab.config.families import FAMILIES
 from plab.config.suite import PAPER_METHODS
-from plab.families import FAMILIES
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,8 @@ class Method:
     Attributes:
         name: Name in results and configuration.
         label: Name for readers.
-        kind: :data:`plab.families.RL` or :data:`plab.families.GRADIENT`; empty for a method that is not
-            plab's.
+        kind: :data:`~plab.config.families.RL` or :data:`~plab.config.families.GRADIENT`; empty for a method
+            that is not plab's.
         colour: Colour of its curves.
         dashes: Line style, for those who do not see the colour.
         of: Method that these are some of the runs of, empty if they are all: see :func:`part`.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from plab.families import SOLVED, known_family
+from plab.config.families import SOLVED, known_family
 from plab.report.collect import Runs
 from plab.report.statistics import Interval, stratified_mean, summarise
 from plab.results import BUDGETS as SIMULATED

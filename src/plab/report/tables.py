@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from plab.config.families import GRADIENT, RL
 from plab.config.suite import SUITE_VARIANTS
-from plab.families import GRADIENT, RL
 from plab.report.collect import Runs
 from plab.report.formats import NOTHING, Table, mean_and_std, number
 from plab.report.methods import method

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from plab.families import SOLVED, known_family
+from plab.config.families import SOLVED, known_family
 from plab.objective import scores_from_iou
 from plab.results.run_file import opened_archive, read
 from plab.results.schema import (

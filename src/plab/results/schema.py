@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plab.config.families import FAMILIES
 from plab.config.selection import lookup
 from plab.errors import PlabError
-from plab.families import FAMILIES
 from plab.scenes.bodies import MATERIAL_KEYS
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ with one."""
 
 COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 """Columns that the iterations of every method have, beside those of :func:`loss_columns`;
-:mod:`plab.families` has those of a family."""
+:mod:`plab.config.families` has those of a family."""
 
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation, beside those of :func:`loss_columns`."""

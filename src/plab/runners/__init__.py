@@ -1,8 +1,7 @@
 """Runners: one per family of methods; each turns configurations into result files.
 
-:mod:`plab.families` says which runner a family has. Its module is imported when it is needed, so that an
-open-loop method does not import a reinforcement-learning library. Runs are carried out in batches; a single
-run is a batch of one.
+A method's file has the dataclass of its keys, its runner and its record, which the registry
+:data:`plab.config.families.FAMILIES` finds. Runs are carried out in batches; a single run is a batch of one.
 """
 
 from __future__ import annotations
@@ -12,15 +11,29 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from plab.config import Config
+from plab.config.families import FAMILIES, Appearance, Family, Rule, family
 from plab.errors import TRACEBACK, ConfigError, traceback_wanted
-from plab.families import family
 from plab.outcomes import Outcome
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, describe, outcome
-from plab.runners.runner import Runner, Step, Track
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import Runner, SimulatorCache, Step, Track, measures, shared_problem
 
-__all__ = ["Job", "RunError", "Runner", "SimulatorCache", "Step", "Track", "run_batch", "run_config"]
+__all__ = [
+    "FAMILIES",
+    "Appearance",
+    "Family",
+    "Job",
+    "Rule",
+    "RunError",
+    "Runner",
+    "SimulatorCache",
+    "Step",
+    "Track",
+    "measures",
+    "run_batch",
+    "run_config",
+    "shared_problem",
+]
 
 
 def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:

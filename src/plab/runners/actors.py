@@ -6,20 +6,18 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-from plab.config import ActorConfig, Config, ConfigError, drawn_configs
-from plab.envs.core import EpisodeBatch
-from plab.problem import fits
+from plab.config import Config, ConfigError, ranges
 from plab.runners.jobs import RunError
+from plab.runners.libraries import torch
 from plab.runners.policy import (
     CLIP,
     Policy,
+    PolicyConfig,
     PolicyRunner,
     Spaces,
     evaluation,
@@ -33,12 +31,16 @@ from plab.runners.policy import (
 )
 from plab.runners.runner import Step, Track
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+
+    from plab.envs.core import EpisodeBatch
+
 __all__ = [
     "DEVIATION_MIN",
-    "ActorPolicy",
+    "ActorConfig",
     "ActorRunner",
     "ActorTraining",
-    "actor_network",
     "set_rate",
     "training_scenes",
 ]
@@ -51,33 +53,15 @@ FIRST_SCENE = 1000
 """``seed_scene`` of the first of the scenes that ``method.scenes`` asks for."""
 
 
-def actor_network(spaces: Spaces, outputs: int, hidden: Sequence[int]) -> torch.nn.Sequential:
-    """Return a network, each hidden layer followed by ELU and LayerNorm: without that, actions come to the
-    ends of the hyperbolic tangent, where nothing is learned any more."""
-    (entries,) = spaces.observation_space.shape
-    layers: list[torch.nn.Module] = []
-    for width in hidden:
-        layers += [torch.nn.Linear(entries, width), torch.nn.ELU(), torch.nn.LayerNorm(width)]
-        entries = width
-    return torch.nn.Sequential(*layers, torch.nn.Linear(entries, outputs))
+@dataclass
+class ActorConfig(PolicyConfig):
+    """What the methods have in common that train a policy by the simulator's gradient, in one scene or many.
 
+    Attributes:
+        scenes: Scenes that the environments of the training are drawn from; 0: that of the run.
+    """
 
-class ActorPolicy(BasePolicy):
-    """Actions in (-1, 1), the hyperbolic tangent of a network's output."""
-
-    def __init__(self, spaces: Spaces, method: ActorConfig) -> None:
-        """Make the network, with torch's own initial weights."""
-        super().__init__(*spaces, squash_output=True)
-        self.mean = actor_network(spaces, spaces.action_space.shape[0], method.hidden)
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Return actions, shape [env, A], for scaled observations, shape [env, entry]."""
-        return torch.tanh(self.mean(observations))
-
-    def _predict(
-        self, observation: torch.Tensor | dict[str, torch.Tensor], deterministic: bool = False
-    ) -> torch.Tensor:
-        return self(observation)
+    scenes: int = field(metadata=ranges.NOT_NEGATIVE)
 
 
 def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
@@ -102,6 +86,8 @@ class ActorTraining(ABC):
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the configuration's seed is that of the initial weights and of what is drawn later."""
+        from stable_baselines3.common.running_mean_std import RunningMeanStd
+
         method: Any = cfg.method
         seed = cfg.seed
         self._cfg, self._method, self._batch = cfg, method, batch
@@ -120,6 +106,8 @@ class ActorTraining(ABC):
     @staticmethod
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
         """Return the policy that training begins with, on the CPU."""
+        from plab.runners.actor_networks import ActorPolicy
+
         return ActorPolicy(spaces, method)
 
     @abstractmethod
@@ -274,6 +262,9 @@ class ActorRunner(PolicyRunner):
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> Sequence[Config]:
     """Return what a training's environments, so many, are made of in a turn, one after the other: the drawn
     scenes that follow those of the turn before and fit into the grid, or the run's own."""
+    from plab.config import drawn_configs
+    from plab.problem import fits
+
     if not method.scenes:
         return [cfg]
     some = min(method.scenes, count)

@@ -10,26 +10,72 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
-from stable_baselines3.common.policies import BasePolicy
-from torch import Tensor
-from torch.optim import Adam
 
-from plab.config import Config, OffPolicyConfig, RlConfig
+from plab.config import Config, ranges
+from plab.runners.libraries import torch
 from plab.runners.networks import CapturedUpdate, Networks, fill, flat
-from plab.runners.policy import Spaces, first_policy
+from plab.runners.policy import PolicyConfig, Spaces, first_policy
 from plab.runners.replay import ReplayBuffer, Sizes
 
-__all__ = ["Agents", "Block", "Draws", "OffPolicyAgents"]
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+    from torch import Tensor
+    from torch.optim import Adam
+
+__all__ = ["Agents", "Block", "Draws", "OffPolicyAgents", "OffPolicyConfig", "RlConfig"]
 
 BLOCK = 50
 """Entries that are drawn at once."""
 
 LARGEST = 2**62
 """Integers are drawn below it, and taken modulo what is asked for: then they are uniform to 1e-12."""
+
+
+@dataclass
+class RlConfig(PolicyConfig):
+    """What the reinforcement-learning methods have in common.
+
+    Attributes:
+        profile: Which of the profiles gives the values that are not overridden; None: there are none.
+        num_envs: Environments simulated together.
+        gamma: Discount factor.
+        profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
+    """
+
+    profile: str | None
+    num_envs: int = field(metadata=ranges.COUNT)
+    gamma: float = field(metadata=ranges.SHARE)
+    profiles: dict[str, Any]
+
+
+@dataclass
+class OffPolicyConfig(RlConfig):
+    """What the methods that learn from a replay buffer have in common.
+
+    Attributes:
+        buffer_size: Transitions kept for replay.
+        batch_size: Transitions per update.
+        learning_starts: Steps of uniformly random actions before the first update.
+        tau: How far the target networks follow at each update.
+        gradient_steps: Updates per step of all environments; -1 makes one per transition.
+    """
+
+    buffer_size: int
+    batch_size: int = field(metadata=ranges.COUNT)
+    learning_starts: int = field(metadata=ranges.NOT_NEGATIVE)
+    tau: float = field(metadata=ranges.SHARE)
+    gradient_steps: int
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        ranges.at_least(f"{path}.buffer_size", self.buffer_size, self.num_envs)
+        if self.gradient_steps != -1:
+            ranges.at_least(f"{path}.gradient_steps", self.gradient_steps, 1)
 
 
 class Draws:

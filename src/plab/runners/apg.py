@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-import torch
-
-from plab.autograd import policy_gradient
-from plab.config import ApgConfig
+from plab.config import MethodConfig, ranges
+from plab.config.families import GRADIENT, Appearance, Family
+from plab.runners.libraries import torch
 from plab.runners.policy import (
     PolicyRunner,
     module_arrays,
@@ -26,7 +26,24 @@ from plab.runners.policy import (
 )
 from plab.runners.runner import Step, Track
 
-__all__ = ["ApgRunner", "PolicyTraining"]
+__all__ = ["FAMILY", "ApgConfig", "ApgRunner", "PolicyTraining"]
+
+
+@dataclass
+class ApgConfig(MethodConfig):
+    """A policy network trained through the differentiable simulator.
+
+    Attributes:
+        lr: Learning rate of Adam.
+        iterations: Rollouts with gradient, hence updates.
+        hidden: Widths of the hidden layers.
+        torch_threads: CPU threads of torch.
+    """
+
+    lr: float = field(metadata=ranges.POSITIVE)
+    iterations: int = field(metadata=ranges.COUNT)
+    hidden: list[int] = field(metadata=ranges.WIDTHS)
+    torch_threads: int = field(metadata=ranges.THREADS)
 
 
 class ApgRunner(PolicyRunner):
@@ -49,6 +66,8 @@ class ApgRunner(PolicyRunner):
 
     def step(self, track: Track) -> Step:
         """Run an episode of the policy, and improve the policy by the gradient of its loss."""
+        from plab.autograd import policy_gradient
+
         episode, training = self._episode, self._training
         _, before = episode.reset()
         done = policy_gradient(episode, training.policy, episode.horizon)
@@ -107,3 +126,13 @@ def _network(widths: Sequence[int]) -> torch.nn.Sequential:
     for inputs, outputs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(inputs, outputs), torch.nn.ReLU()]
     return torch.nn.Sequential(*layers[:-1], torch.nn.Tanh())
+
+
+FAMILY = Family(
+    label="a policy, trained through the simulator's gradient",
+    config=ApgConfig,
+    runner=ApgRunner,
+    columns=("gradient_norm",),
+    kind=GRADIENT,
+    methods={"apg": Appearance("APG", "#000000", ":")},
+)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from plab.config import Config
+from plab.config.families import family
 from plab.errors import ConfigError, PlabError
-from plab.families import family
 from plab.outcomes import Outcome
 from plab.results import ResultsError, RunBusyError, RunFile, result_path
 from plab.results.schema import counts_last

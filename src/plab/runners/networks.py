@@ -7,11 +7,14 @@ launching them one by one from Python. On CUDA it is recorded once as a graph an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-import torch
-from torch import Tensor, nn
-from torch.optim import Adam, Optimizer
+from plab.runners.libraries import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+    from torch.optim import Adam, Optimizer
+
 
 __all__ = [
     "CapturedUpdate",
@@ -28,7 +31,7 @@ __all__ = [
     "twin_values",
 ]
 
-Part = dict[str, Tensor]
+Part: TypeAlias = "dict[str, Tensor]"
 """Parameters by their names in the module that they come from, each of shape [stack, ...]; weights are
 transposed, [stack, in, out], so that neither products nor gradients have to be."""
 
@@ -98,7 +101,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return torch.baddbmm(bias.unsqueeze(1), x, weight)
 
 
-def mlp(x: Tensor, part: Part, name: str, activation: nn.Module, *, last: bool) -> Tensor:
+def mlp(x: Tensor, part: Part, name: str, activation: Callable[[Tensor], Tensor], *, last: bool) -> Tensor:
     """Evaluate stacked ``nn.Sequential`` of linear layers, named ``name`` in the part or the part itself,
     for x of shape [stack, row, in]; an activation is after each, but the last if ``last``."""
     prefix = f"{name}." if name else ""
@@ -112,12 +115,12 @@ def mlp(x: Tensor, part: Part, name: str, activation: nn.Module, *, last: bool) 
 def twin_values(part: Part, observations: Tensor, actions: Tensor) -> Tensor:
     """Return the values that two stacked critics give, shape [agent, 2, row]."""
     pairs = torch.cat([observations, actions], dim=2).repeat_interleave(2, dim=0)
-    return mlp(pairs, part, "", nn.ReLU(), last=True).view(len(observations), 2, -1)
+    return mlp(pairs, part, "", torch.relu, last=True).view(len(observations), 2, -1)
 
 
 def adam(parameters: Sequence[Tensor], lr: float, **options: Any) -> Adam:
     """Return Adam for stacked parameters, whose state is there from the start: one step serves all agents."""
-    optimizer = Adam(parameters, lr=lr, fused=True, **options)
+    optimizer = torch.optim.Adam(parameters, lr=lr, fused=True, **options)
     for parameter in parameters:
         optimizer.state[parameter] = {
             "step": torch.zeros((), device=parameter.device),
@@ -216,7 +219,7 @@ def require_capturable(optimizer: Optimizer, lr: float) -> None:
     to record."""
     for group in optimizer.param_groups:
         group["capturable"] = True
-        if isinstance(group["lr"], Tensor):
+        if isinstance(group["lr"], torch.Tensor):
             group["lr"].fill_(lr)
         else:
             group["lr"] = torch.tensor(lr, device=group["params"][0].device)

@@ -17,17 +17,44 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from plab.config import Config, PodsConfig
-from plab.envs.core import EpisodeBatch
-from plab.envs.observations import level_entries
-from plab.runners.actors import ActorRunner, ActorTraining, set_rate, training_scenes
+from plab.config import Config, ranges
+from plab.config.families import GRADIENT, Appearance, Family, Rule
+from plab.runners.actors import ActorConfig, ActorRunner, ActorTraining, set_rate, training_scenes
+from plab.runners.libraries import torch
 
-__all__ = ["PodsRunner", "PodsTraining"]
+if TYPE_CHECKING:
+    from plab.envs.core import EpisodeBatch
+
+__all__ = ["FAMILY", "PodsConfig", "PodsRunner", "PodsTraining"]
+
+
+@dataclass
+class PodsConfig(ActorConfig):
+    """Policy optimization via differentiable simulation.
+
+    Attributes:
+        num_envs: Scenes of a round, at most; more are taken in turn, round by round.
+        updates: Updates of the actions by their gradient in a round.
+        action_lr: Learning rate of these, in units of an action.
+        epochs: How often, after a round, the policy sees as many actions as the round has.
+        batch_size: Actions per update of the policy.
+        observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
+        shift: Where all that is observed of them stands is moved along x and along z by so much at most
+            [domain units].
+    """
+
+    num_envs: int = field(metadata=ranges.COUNT)
+    updates: int = field(metadata=ranges.COUNT)
+    action_lr: float = field(metadata=ranges.POSITIVE)
+    epochs: int = field(metadata=ranges.COUNT)
+    batch_size: int = field(metadata=ranges.COUNT)
+    observation_noise: float = field(metadata=ranges.FINITE)
+    shift: float = field(metadata=ranges.FINITE)
 
 
 class PodsTraining(ActorTraining):
@@ -35,6 +62,8 @@ class PodsTraining(ActorTraining):
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
+        from plab.envs.observations import level_entries
+
         updates = cfg.method_as(PodsConfig).updates
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
@@ -152,3 +181,16 @@ class PodsRunner(ActorRunner):
     def environments(self, method: PodsConfig) -> int:
         """Return how many environments are trained in together, one for each scene."""
         return min(max(1, method.scenes), method.num_envs)
+
+
+FAMILY = Family(
+    label="a policy that imitates its own episodes, improved by the simulator's gradient",
+    config=PodsConfig,
+    runner=PodsRunner,
+    columns=PodsRunner.columns,
+    may_be_nan=PodsRunner.columns,
+    rules={"pods": Rule(PodsTraining, PodsConfig)},
+    contact="hard",
+    kind=GRADIENT,
+    methods={"pods": Appearance("PODS", "#999933", "--")},
+)

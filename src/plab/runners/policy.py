@@ -15,35 +15,36 @@ import math
 import sys
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
-import torch
-from gymnasium.spaces import Box
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from torch.optim import Optimizer
 
-from plab.config import Config, ConfigError, MethodConfig, PolicyConfig, build_scene
+from plab.config import Config, ConfigError, MethodConfig, ranges
+from plab.config.families import FAMILIES, family
 from plab.config.selection import OBSERVED
-from plab.envs.core import EpisodeBatch
-from plab.families import FAMILIES, family
 from plab.files import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.run_file import replace_file
-from plab.runners.common import LAST, episode_columns, simulator_key
-from plab.runners.runner import Runner, Track
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.libraries import torch
+from plab.runners.runner import LAST, Runner, SimulatorCache, Track, episode_columns, simulator_key
+from plab.scenes import DEVICES
 
 if TYPE_CHECKING:
+    from gymnasium.spaces import Box
     from stable_baselines3.common.policies import BasePolicy
+    from torch.optim import Optimizer
+
+    from plab.envs.core import EpisodeBatch
 
 __all__ = [
     "CLIP",
     "Evaluation",
     "Policy",
+    "PolicyConfig",
     "PolicyRunner",
     "Spaces",
     "evaluation",
@@ -71,6 +72,34 @@ _PARAMETER = "policy/"
 """Prefix of the names of the networks' parameters."""
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass
+class PolicyConfig(MethodConfig):
+    """What the methods have in common whose trained policy is kept.
+
+    Attributes:
+        algorithm: Learning algorithm, one of the family's.
+        episodes: Episodes of training.
+        evaluate_every: Episodes between two evaluations of the deterministic policy.
+        torch_device: Where the networks are, ``cpu`` or ``cuda``.
+        torch_threads: CPU threads of torch.
+        lr: Learning rate.
+        hidden: Widths of the hidden layers.
+    """
+
+    algorithm: str
+    episodes: int = field(metadata=ranges.COUNT)
+    evaluate_every: int = field(metadata=ranges.COUNT)
+    torch_device: str = field(metadata=ranges.within(ranges.one_of, DEVICES))
+    torch_threads: int = field(metadata=ranges.THREADS)
+    lr: float = field(metadata=ranges.POSITIVE)
+    hidden: list[int] = field(metadata=ranges.WIDTHS)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
 
 
 class Spaces(NamedTuple):
@@ -135,7 +164,7 @@ class PolicyRunner(Runner):
 @dataclass(frozen=True)
 class Evaluation:
     """What an episode of a deterministic policy gave: values of
-    :func:`plab.runners.common.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
+    :func:`plab.runners.runner.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
     not; from then on it rests as :meth:`plab.envs.core.EpisodeBatch.step` has it."""
 
     measures: dict[str, float]
@@ -164,6 +193,10 @@ def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, s
     """Return batches of environments, in their initial states, those kept from the last run if they can be
     of these scenes; each is of some configurations, which the environments have in turn, a number of
     environments and a contact model."""
+
+    # Imported here, as all that brings the simulator along.
+    from plab.config import build_scene
+    from plab.envs.core import EpisodeBatch
 
     def build() -> list[EpisodeBatch]:
         return [
@@ -236,15 +269,12 @@ def restore_optimizer(optimizer: Optimizer, arrays: Mapping[str, Mapping[str, np
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
     """Return the policy with which a training begins, on the CPU; random numbers stay as they are.
 
-    The algorithm's rule in its family says how: it is an object with ``make_policy(method, spaces)``.
-
-    Raises:
-        plab.config.ConfigError: If the rule cannot be imported.
+    The algorithm's rule in its family says how: it has ``make_policy(method, spaces)``.
     """
-    rule = family(method.family).rule(method.algorithm, object)
+    rule = family(method.family).rules[method.algorithm].what
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return cast(Any, rule).make_policy(method, spaces)
+        return rule.make_policy(method, spaces)
 
 
 class Policy:
@@ -297,7 +327,7 @@ def save_policy(
     header = json.dumps({"format": _FORMAT, "method": asdict(method)})
     arrays: dict[str, Any] = {"header": np.array(header)}
     for name in ("observation", "action"):
-        space = cast(Box, getattr(policy, f"{name}_space"))
+        space = cast("Box", getattr(policy, f"{name}_space"))
         arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
     if moments is not None:
         arrays |= {"mean": np.asarray(moments[0]), "variance": np.asarray(moments[1])}
@@ -342,6 +372,8 @@ def _policy(path: Path) -> Policy:
     if header["format"] != _FORMAT:
         raise ValueError(f"it is of the format {header['format']!r:.80}, not {_FORMAT!r}")
     method = _method(header["method"], path)
+    from gymnasium.spaces import Box
+
     spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
     own = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}

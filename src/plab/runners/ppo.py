@@ -4,23 +4,76 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, cast
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, cast
 
-import torch
-from stable_baselines3.common.policies import ActorCriticPolicy
-from torch import Tensor, nn
-
-from plab.config import Config, PpoConfig
-from plab.runners.agents import Agents
+from plab.config import Config, ConfigError, ranges
+from plab.runners.agents import Agents, RlConfig
+from plab.runners.libraries import torch
 from plab.runners.networks import adam, descend, linear, mlp, require_capturable
 from plab.runners.policy import CLIP, EPSILON, Spaces
 
-__all__ = ["PpoAgents", "Statistics"]
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from torch import Tensor
+
+__all__ = ["PpoAgents", "PpoConfig", "Statistics"]
 
 ACTION_GAIN = 0.01
 """Stable-Baselines3's gain of the last layer of PPO's policy; that of the value function is 1."""
 
-TANH = nn.Tanh()
+
+@dataclass
+class PpoConfig(RlConfig):
+    """Proximal policy optimisation.
+
+    Attributes:
+        lr_decay: Let the learning rate fall linearly to 0 over the run.
+        steps_per_update: Transitions per update.
+        minibatches: Minibatches of each epoch.
+        epochs: Passes over the transitions of an update.
+        gae_lambda: Lambda of the generalised advantage estimate.
+        clip_range: Largest change of the probability ratio.
+        value_clip_range: Largest change of the value; None sets no limit.
+        value_coefficient: Weight of the value function's mean squared error.
+        entropy_coefficient: Weight of the policy's entropy.
+        entropy_mean: Take the mean of the entropies of an action's components; else their sum.
+        max_gradient_norm: Longer gradients are scaled down to this norm.
+        adam_eps: Added to adam's denominator.
+        normalise: Scale observations and rewards by running statistics.
+        statistics_episodes: Episodes after which the statistics of observations stay as they are; None:
+            never.
+        bootstrap: Add the value of an episode's last observation to its rewards; else the episode is taken to
+            end there.
+        policy_gain: Gain of the first weights, which are orthogonal, of the policy's last layer.
+        value_gain: The same of the value function's.
+    """
+
+    lr_decay: bool
+    steps_per_update: int = field(metadata=ranges.within(ranges.at_least, 2))
+    minibatches: int = field(metadata=ranges.COUNT)
+    epochs: int = field(metadata=ranges.COUNT)
+    gae_lambda: float = field(metadata=ranges.UNIT)
+    clip_range: float = field(metadata=ranges.POSITIVE)
+    value_clip_range: float | None = field(metadata=ranges.POSITIVE)
+    value_coefficient: float = field(metadata=ranges.FINITE)
+    entropy_coefficient: float = field(metadata=ranges.FINITE)
+    entropy_mean: bool
+    max_gradient_norm: float = field(metadata=ranges.POSITIVE)
+    adam_eps: float = field(metadata=ranges.POSITIVE)
+    normalise: bool
+    statistics_episodes: int | None = field(metadata=ranges.COUNT)
+    bootstrap: bool
+    policy_gain: float = field(metadata=ranges.POSITIVE)
+    value_gain: float = field(metadata=ranges.POSITIVE)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        # Advantages are standardised: a minibatch needs two of them.
+        if self.minibatches > self.steps_per_update // 2:
+            most = self.steps_per_update // 2
+            raise ConfigError(f"{path}.minibatches must be at most steps_per_update / 2 = {most}")
 
 
 class Statistics:
@@ -93,12 +146,14 @@ class PpoAgents(Agents):
     @staticmethod
     def make_policy(method: PpoConfig, spaces: Spaces) -> ActorCriticPolicy:
         """Return Stable-Baselines3's policy, whose first weights are orthogonal, with the method's gains."""
+        from stable_baselines3.common.policies import ActorCriticPolicy
+
         policy = ActorCriticPolicy(
-            *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.Tanh
+            *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=torch.nn.Tanh
         )
         last = (policy.action_net, method.policy_gain / ACTION_GAIN), (policy.value_net, method.value_gain)
         for layer, gain in last:
-            cast(nn.Linear, layer).weight.data.mul_(gain)
+            cast("torch.nn.Linear", layer).weight.data.mul_(gain)
         return policy
 
     @classmethod
@@ -232,7 +287,7 @@ class PpoAgents(Agents):
     def _evaluate(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return means of actions, shape [agent, row, action], and values, shape [agent, row]."""
         pairs = observations.repeat_interleave(2, dim=0)
-        latent = mlp(pairs, self.networks["hidden"], "", TANH, last=False)
+        latent = mlp(pairs, self.networks["hidden"], "", torch.tanh, last=False)
         latent = latent.view(self.count, 2, *latent.shape[1:])
         mean, value = self.networks["mean"], self.networks["value"]
         values = linear(latent[:, 1], value["weight"], value["bias"])

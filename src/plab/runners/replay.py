@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from plab.config import OffPolicyConfig
 from plab.results import ResultsError
 from plab.results.run_file import cause
+from plab.runners.libraries import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from plab.runners.agents import OffPolicyConfig
 
 __all__ = ["ReplayBuffer", "Samples", "Sizes", "require_file"]
 

@@ -13,23 +13,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from plab.config import Config, OffPolicyConfig, RlConfig
-from plab.envs.core import Transition
-from plab.envs.observations import spaces
-from plab.envs.tensors import TensorEnv
-from plab.families import family
-from plab.problem import build_scenes
+from plab.config import Config
+from plab.config.families import RL, Appearance, Family, Rule, family
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.agents import Agents, OffPolicyAgents
-from plab.runners.common import LAST, episode_columns
+from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, RlConfig
 from plab.runners.jobs import RunError
+from plab.runners.libraries import torch
 from plab.runners.policy import (
     Evaluation,
     PolicyRunner,
@@ -38,17 +32,26 @@ from plab.runners.policy import (
     shared_batches,
     torch_settings,
 )
+from plab.runners.ppo import PpoAgents, PpoConfig
 from plab.runners.replay import Sizes, require_file
-from plab.runners.runner import Step, Track
+from plab.runners.runner import LAST, Step, Track, episode_columns
+from plab.runners.sac import SacAgents, SacConfig
+from plab.runners.td3 import Td3Agents, Td3Config
 
-__all__ = ["Population", "RlRunner", "agents_of", "population_settings"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from plab.envs.core import Transition
+    from plab.envs.tensors import TensorEnv
+
+__all__ = ["FAMILY", "SB3", "Population", "RlRunner", "agents_of", "population_settings"]
 
 NOT_FINITE = "the policy's actions are not finite"
 
 
 def agents_of(method: RlConfig) -> type[Agents]:
-    """Return the agents that learn by a method's algorithm; ConfigError if they cannot be imported."""
-    return family(method.family).rule(method.algorithm, type)
+    """Return the agents that learn by a method's algorithm."""
+    return family(method.family).rules[method.algorithm].what
 
 
 def population_settings(method: RlConfig) -> AbstractContextManager[None]:
@@ -266,6 +269,10 @@ class RlRunner(PolicyRunner):
 
     def build(self) -> None:
         """Make the environments of the training, and those in the hard contact model that judge."""
+        from plab.envs.observations import spaces
+        from plab.envs.tensors import TensorEnv
+        from plab.problem import build_scenes
+
         self.require_torch_device()
         cfgs, method = [track.cfg for track in self.tracks], self.method
         self._spaces = Spaces(*spaces(cfgs[0], build_scenes(cfgs)))
@@ -420,3 +427,38 @@ class RlRunner(PolicyRunner):
 
 def _replay_path(track: Track) -> Path:
     return track.job.run.path.with_suffix(REPLAY_SUFFIX)
+
+
+FAMILY = Family(
+    label="a policy that learns from rewards",
+    config=RlConfig,
+    runner=RlRunner,
+    columns=("train_reward", "train_score"),
+    # No episode of training may have ended.
+    may_be_nan=("train_reward", "train_score"),
+    batching=True,
+    in_step=True,
+    rules={
+        "sac": Rule(SacAgents, SacConfig),
+        "td3": Rule(Td3Agents, Td3Config),
+        "ppo": Rule(PpoAgents, PpoConfig),
+    },
+    contact="hard",
+    kind=RL,
+    methods={
+        "sac": Appearance("SAC", "#0072B2"),
+        "td3": Appearance("TD3", "#56B4E9", "--"),
+        "ppo": Appearance("PPO", "#009E73", "-."),
+    },
+)
+
+SB3 = Family(
+    label="a learning algorithm with the interface of Stable-Baselines3",
+    config=RlConfig,
+    runner="plab.runners.sb3:Sb3Runner",
+    columns=FAMILY.columns,
+    may_be_nan=FAMILY.may_be_nan,
+    contact="hard",
+    kind=RL,
+)
+"""Template of the records of algorithms from outside, which add their ``config`` and ``rules``."""

@@ -7,28 +7,49 @@ break off and the final evaluation in the hard contact model are here.
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from plab.config import Config, ConfigError
-from plab.config.compose import require_runnable
-from plab.families import SOLVED, family
-from plab.problem import Episodes, Problem
+from plab.config.families import SOLVED, family
+from plab.errors import out_of_memory
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
 from plab.results import BUDGETS, ResultsError, row_count
-from plab.runners.common import episode_columns, measures, simulation_errors
 from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
 from plab.runners.loggers import RunLog
-from plab.runners.simulator_cache import SimulatorCache
-from plab.sim import DeviceError, SimulationError
-from plab.sim.taichi_internals import watch_compiling
 
-__all__ = ["Runner", "Step", "Track"]
+if TYPE_CHECKING:
+    from plab.problem import Episodes, Problem
+    from plab.scenes import Scene
+
+Kept = TypeVar("Kept")
+
+__all__ = [
+    "COLUMNS",
+    "LAST",
+    "Runner",
+    "SimulatorCache",
+    "Step",
+    "Track",
+    "episode_columns",
+    "measures",
+    "shared_problem",
+    "simulation_errors",
+    "simulator_key",
+]
+
+COLUMNS = ("loss", "reward", "iou", "score")
+"""Columns of the results that every method has: what an episode is measured by, beside the terms of its
+loss."""
+
+LAST = ("iou", "score")
+"""Columns that judge the last state; the others are sums over the steps."""
 
 _MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
 """What NumPy and torch answer to a state that has other arrays than it should."""
@@ -39,7 +60,7 @@ class Step:
     """What an iteration of a run gave.
 
     Attributes:
-        measures: What the actions are measured by: :func:`plab.runners.common.episode_columns`, and the
+        measures: What the actions are measured by: :func:`plab.runners.runner.episode_columns`, and the
             columns of the family. Others are left out.
         actions: Actions that it ran, in [-1, 1], shape [T, A].
         state: What the next iteration starts from: nested dictionaries of arrays, numbers and strings.
@@ -295,10 +316,15 @@ class Runner:
         return self._note + batch_title([track.cfg for track in self.tracks])
 
     def _waiting(self, what: str) -> AbstractContextManager[None]:
+        from plab.sim.taichi_internals import watch_compiling
+
         enabled = self.tracks[0].cfg.progress
         return show_waiting(f"{self._heading()} {what}", watch_compiling, enabled=enabled)
 
     def _build(self) -> None:
+        # Imported here, as the simulator is: composing needs the records of runners.
+        from plab.config.compose import require_runnable
+
         self.enter("build")
         try:
             for track in self.tracks:
@@ -306,6 +332,8 @@ class Runner:
             with simulation_errors():
                 self.build()
         except Exception as error:
+            from plab.sim import DeviceError
+
             if len(self.tracks) > 1 and not isinstance(error.__cause__, DeviceError):
                 raise TogetherError(str(error)) from error
             raise
@@ -318,6 +346,8 @@ class Runner:
 
     def _start(self, track: Track) -> None:
         """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
+        from plab.sim import DeviceError, SimulationError
+
         state, scene = track.job.run.result.resume, self.problem.scenes[0]
         best, shape = track.best_actions, (scene.horizon, scene.action_dim)
         if state is None:
@@ -337,6 +367,8 @@ class Runner:
 
     def _optimise(self) -> None:
         """Do the iterations that the files do not hold yet."""
+        from plab.sim.taichi_internals import watch_compiling
+
         done, total, every = self.extent()
         # The first rollout of a process compiles the kernels.
         phase = "compile"
@@ -429,3 +461,93 @@ class _Clock:
             for track in self._tracks:
                 track.job.run.spend(self._phase, seconds)
         self._phase = ""
+
+
+# ----------------------------------------------------------------------------------- simulators and measures
+
+
+class SimulatorCache:
+    """The last simulator, in whatever it is part of, and what it is for: a sweep over seeds compiles once.
+
+    Whoever carries out several runs makes one and passes it on to each.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, Any] = {}
+
+    def get(self, key: Any, build: Callable[[], Kept], *, check: Callable[[Kept], object]) -> Kept:
+        """Return something that holds a simulator: what is kept from the last run, if its key is the same and
+        ``check`` raises no RuntimeError, as its memory is gone; else what ``build`` makes."""
+        # Somebody else may have restarted Taichi with another precision or device.
+        with suppress(RuntimeError):
+            if key in self._kept:
+                check(self._kept[key])
+                return self._kept[key]
+        # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels
+        # again.
+        self.clear()
+        self._kept[key] = build()
+        return self._kept[key]
+
+    def clear(self) -> None:
+        """Let go of what is kept."""
+        if self._kept:
+            self._kept.clear()
+            gc.collect()
+
+
+def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
+    """Return the scalars of the final evaluation of one environment: those of :func:`episode_columns`, and
+    what else scores are made of."""
+    sums = zip(result.term_names, result.terms[environment].sum(axis=0), strict=True)
+    judged = result.scores[environment]
+    return {
+        "loss": float(result.loss[environment].sum()),
+        **{f"loss_{name}": float(total) for name, total in sums},
+        "reward": float(result.reward[environment].sum()),
+        "iou": judged.iou_final,
+        "score": judged.score,
+        "score_printed": judged.score_printed,
+        "iou_initial": judged.iou_initial,
+        "iou_target_self": judged.iou_target_self,
+    }
+
+
+def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of what an episode is measured by, for a loss of these terms."""
+    first, *rest = COLUMNS
+    return (first, *(f"loss_{name}" for name in term_names), *rest)
+
+
+def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
+    """Return the problem of some configurations, with the simulator kept from the last runs if it can be of
+    these scenes."""
+    from plab.problem import Problem, build_scenes, make_simulator
+
+    scenes = build_scenes(cfgs)
+    key = len(cfgs), simulator_key(cfgs[0], scenes[0])
+    kept = cache.get(key, lambda: make_simulator(cfgs, scenes), check=lambda it: it.set_scenes(scenes))
+    return Problem(cfgs, kept)
+
+
+def simulator_key(cfg: Config, scene: Scene) -> Hashable:
+    """Return what is the same for configurations whose simulators differ in their scenes alone."""
+    from plab.sim.batch import scene_kind
+
+    sim, method = cfg.sim, cfg.method
+    loss = tuple(method.loss_weights.items()), tuple(method.loss_terms.items())
+    return scene_kind(scene), loss, sim.precision, sim.device, sim.memory_mb, sim.deterministic
+
+
+@contextmanager
+def simulation_errors(when: str = "") -> Iterator[None]:
+    """Turn what the simulator raises into a RunError, what it says of too little memory into a ConfigError;
+    ``when`` goes before the message."""
+    from plab.sim import DeviceError, SimulationError
+
+    try:
+        yield
+    except (DeviceError, SimulationError) as error:
+        raise RunError(f"{when}{error}") from error
+    except MemoryError as error:
+        raise ConfigError(f"{when}{out_of_memory(error)}") from error

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
-import torch
-from stable_baselines3.sac.policies import SACPolicy
-from torch import Tensor, nn
-
-from plab.config import Config, SacConfig
-from plab.runners.agents import OffPolicyAgents
+from plab.config import Config
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig
+from plab.runners.libraries import torch
 from plab.runners.networks import adam, descend, follow, linear, mlp, twin_values
 from plab.runners.policy import Spaces
 
-__all__ = ["SacAgents"]
+if TYPE_CHECKING:
+    from stable_baselines3.sac.policies import SACPolicy
+    from torch import Tensor
+
+__all__ = ["SacAgents", "SacConfig"]
 
 LOG_STD = -20.0, 2.0
 """Smallest and largest logarithm of a standard deviation."""
@@ -23,7 +25,10 @@ LOG_STD = -20.0, 2.0
 EPSILON = 1e-6
 """Added to 1 - a^2 in the density of actions a, as in Stable-Baselines3."""
 
-RELU = nn.ReLU()
+
+@dataclass
+class SacConfig(OffPolicyConfig):
+    """Soft actor-critic."""
 
 
 class SacAgents(OffPolicyAgents):
@@ -55,12 +60,16 @@ class SacAgents(OffPolicyAgents):
     def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
         """Return Stable-Baselines3's policy with the authors' first weights: Glorot's uniform ones, and no
         biases."""
-        policy = SACPolicy(*spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.ReLU)
+        from stable_baselines3.sac.policies import SACPolicy
+
+        policy = SACPolicy(
+            *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=torch.nn.ReLU
+        )
         for part in (policy.actor, policy.critic):
             for layer in part.modules():
-                if isinstance(layer, nn.Linear):
-                    nn.init.xavier_uniform_(layer.weight)
-                    nn.init.zeros_(layer.bias)
+                if isinstance(layer, torch.nn.Linear):
+                    torch.nn.init.xavier_uniform_(layer.weight)
+                    torch.nn.init.zeros_(layer.bias)
         policy.critic_target.load_state_dict(policy.critic.state_dict())
         return policy
 
@@ -108,7 +117,7 @@ class SacAgents(OffPolicyAgents):
     def _gaussian(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and logarithm of the standard deviation of actions before tanh."""
         actor = self.networks["actor"]
-        latent = mlp(observations, actor, "latent_pi", RELU, last=False)
+        latent = mlp(observations, actor, "latent_pi", torch.relu, last=False)
         mean, log_std = (
             linear(latent, actor[f"{name}.weight"], actor[f"{name}.bias"]) for name in ("mu", "log_std")
         )

@@ -27,11 +27,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from plab.config import OffPolicyConfig, RlConfig
+from plab.config.families import family
 from plab.envs.sb3 import PlabVecEnv
-from plab.families import family
 from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.agents import LARGEST
+from plab.runners.agents import LARGEST, OffPolicyConfig, RlConfig
 from plab.runners.jobs import RunError
 from plab.runners.loggers import RunLog
 from plab.runners.policy import PolicyRunner, Spaces, evaluation, save_policy, shared_batches
@@ -95,7 +94,7 @@ class Sb3Runner(PolicyRunner):
         kinds = ([cfg], method.num_envs, method.contact), ([cfg], 1, "hard")
         self._training, self._evaluation = shared_batches(self.cache, *kinds)
         self.problem = self._evaluation.problem
-        self._kind = family(method.family).rule(method.algorithm, ModelKind)
+        self._kind = family(method.family).rules[method.algorithm].what
         horizon, rollout = cfg.sim.horizon, self._kind.rollout_steps
         self._horizon = horizon
         self._cycle = method.num_envs * (horizon if rollout is None else rollout(method))

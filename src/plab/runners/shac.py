@@ -12,36 +12,52 @@ policy. Then the value function learns from the window, by TD(lambda). To reprod
 from __future__ import annotations
 
 import copy
-import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-import torch
-
-from plab.autograd import Stretch, policy_gradient
-from plab.config import Config, ShacConfig
-from plab.envs.core import EpisodeBatch
-from plab.runners.actors import ActorPolicy, ActorRunner, ActorTraining, actor_network, set_rate
+from plab.config import Config, ranges
+from plab.config.families import GRADIENT, Appearance, Family, Rule
+from plab.runners.actors import ActorConfig, ActorRunner, ActorTraining, set_rate
+from plab.runners.libraries import torch
 from plab.runners.policy import Spaces
 
-__all__ = ["ShacPolicy", "ShacRunner", "ShacTraining", "td_lambda"]
+if TYPE_CHECKING:
+    from plab.autograd import Stretch
+    from plab.envs.core import EpisodeBatch
+    from plab.runners.actor_networks import ShacPolicy
+
+__all__ = ["FAMILY", "ShacConfig", "ShacRunner", "ShacTraining", "td_lambda"]
 
 
-class ShacPolicy(ActorPolicy):
-    """Actions in (-1, 1): the hyperbolic tangent of a normal variable whose mean is a network's output and
-    whose standard deviation is learned, the same for all observations."""
+@dataclass
+class ShacConfig(ActorConfig):
+    """Short-horizon actor-critic.
 
-    def __init__(self, spaces: Spaces, method: ShacConfig) -> None:
-        """Make the network, with torch's own initial weights."""
-        super().__init__(spaces, method)
-        self.log_std = torch.nn.Parameter(torch.full(spaces.action_space.shape, math.log(method.noise)))
+    Attributes:
+        num_envs: Environments simulated together.
+        gamma: Discount factor.
+        window: Steps through which the gradient goes.
+        value_lr: Learning rate of the value function.
+        lr_decay: Let the learning rates fall linearly to 0 over the run.
+        td_lambda: Lambda of the value function's targets.
+        tau: How far the value function in use follows at each window.
+        value_epochs: Passes of the value function over a window.
+        minibatches: Minibatches of each pass.
+        noise: Standard deviation of the actions at first, before the hyperbolic tangent.
+        max_gradient_norm: Longer gradients are scaled down to this norm.
+    """
 
-    def forward(self, observations: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
-        """Draw actions, shape [env, A], for scaled observations, shape [env, entry]; without a generator, the
-        most likely ones."""
-        if generator is None:
-            return super().forward(observations)
-        mean = self.mean(observations)
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        return torch.tanh(mean + self.log_std.exp() * noise)
+    num_envs: int = field(metadata=ranges.COUNT)
+    gamma: float = field(metadata=ranges.SHARE)
+    window: int = field(metadata=ranges.COUNT)
+    value_lr: float = field(metadata=ranges.POSITIVE)
+    lr_decay: bool
+    td_lambda: float = field(metadata=ranges.UNIT)
+    tau: float = field(metadata=ranges.SHARE)
+    value_epochs: int = field(metadata=ranges.COUNT)
+    minibatches: int = field(metadata=ranges.COUNT)
+    noise: float = field(metadata=ranges.POSITIVE)
+    max_gradient_norm: float = field(metadata=ranges.POSITIVE)
 
 
 class ShacTraining(ActorTraining):
@@ -49,6 +65,8 @@ class ShacTraining(ActorTraining):
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
+        from plab.runners.actor_networks import actor_network
+
         super().__init__(cfg, batch)
         method = cfg.method_as(ShacConfig)
         with torch.random.fork_rng(devices=[]):
@@ -60,11 +78,17 @@ class ShacTraining(ActorTraining):
     @staticmethod
     def make_policy(method: ShacConfig, spaces: Spaces) -> ShacPolicy:
         """Return the policy that training begins with, on the CPU."""
+        from plab.runners.actor_networks import ShacPolicy
+
         return ShacPolicy(spaces, method)
 
     def train(self) -> None:
         """Run one episode of all environments, window by window."""
+        from plab.autograd import policy_gradient
+        from plab.runners.actor_networks import Drawing
+
         batch, method = self._batch, self._method
+        drawing = Drawing(self.policy, self._scaled, self._generator)
         initial = torch.as_tensor(batch.reset()[1]["loss"], dtype=torch.float32, device=self._device)
         # Rewards in units of the loss at the start.
         scale = initial.mean().clamp(min=1e-12)
@@ -78,7 +102,7 @@ class ShacTraining(ActorTraining):
             self._optimizer.zero_grad()
             stretch = policy_gradient(
                 batch,
-                _Drawing(self),
+                drawing,
                 steps,
                 discount=method.gamma,
                 value=lambda seen: scale * self._target(self._scaled(seen))[:, 0],
@@ -128,19 +152,6 @@ class ShacRunner(ActorRunner):
     training = ShacTraining
 
 
-class _Drawing(torch.nn.Module):
-    """The policy as :func:`plab.autograd.policy_gradient` runs it: of raw observations, with noise."""
-
-    def __init__(self, training: ShacTraining) -> None:
-        super().__init__()
-        self.policy = training.policy
-        self._of = (training,)
-
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        (training,) = self._of
-        return self.policy(training._scaled(observations), training._generator)
-
-
 def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: float) -> torch.Tensor:
     """Return the TD(lambda) targets, shape [T, env], of a stretch of an episode that goes on behind it, by
     rewards, shape [T, env], and values before each step and after the last, shape [T + 1, env]. A
@@ -150,3 +161,16 @@ def td_lambda(rewards: torch.Tensor, values: torch.Tensor, gamma: float, decay: 
         ahead = reward + gamma * ((1.0 - decay) * value + decay * ahead)
         targets.append(ahead)
     return torch.stack(targets[::-1])
+
+
+FAMILY = Family(
+    label="a policy, trained through the simulator's gradient and by a value function",
+    config=ShacConfig,
+    runner=ShacRunner,
+    columns=("train_reward", "train_score"),
+    may_be_nan=("train_reward", "train_score"),
+    rules={"shac": Rule(ShacTraining, ShacConfig)},
+    contact="hard",
+    kind=GRADIENT,
+    methods={"shac": Appearance("SHAC", "#DDAA33", ":")},
+)

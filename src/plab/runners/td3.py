@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
 
-import torch
-from stable_baselines3.td3.policies import TD3Policy
-from torch import Tensor, nn
-
-from plab.config import Config, Td3Config
-from plab.runners.agents import OffPolicyAgents
+from plab.config import Config, ranges
+from plab.runners.agents import OffPolicyAgents, OffPolicyConfig
+from plab.runners.libraries import torch
 from plab.runners.networks import adam, descend, follow, mlp, twin_values
 from plab.runners.policy import Spaces
 from plab.runners.replay import Samples
 
-__all__ = ["Td3Agents"]
+if TYPE_CHECKING:
+    from stable_baselines3.td3.policies import TD3Policy
+    from torch import Tensor
 
-RELU = nn.ReLU()
+__all__ = ["Td3Agents", "Td3Config"]
+
+
+@dataclass
+class Td3Config(OffPolicyConfig):
+    """Twin delayed DDPG.
+
+    Attributes:
+        exploration_noise: Standard deviation of the noise on the actions.
+        target_noise: Standard deviation of the noise on the target policy.
+        target_noise_clip: Largest noise on the target policy.
+        policy_delay: Critic updates per update of the actor.
+    """
+
+    exploration_noise: float = field(metadata=ranges.FINITE)
+    target_noise: float = field(metadata=ranges.FINITE)
+    target_noise_clip: float = field(metadata=ranges.FINITE)
+    policy_delay: int = field(metadata=ranges.COUNT)
 
 
 class Td3Agents(OffPolicyAgents):
@@ -45,7 +62,11 @@ class Td3Agents(OffPolicyAgents):
     @staticmethod
     def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
         """Return Stable-Baselines3's policy with its own first weights."""
-        return TD3Policy(*spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=nn.ReLU)
+        from stable_baselines3.td3.policies import TD3Policy
+
+        return TD3Policy(
+            *spaces, lambda _: method.lr, net_arch=list(method.hidden), activation_fn=torch.nn.ReLU
+        )
 
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
         """Add noise to the policy's actions."""
@@ -99,7 +120,7 @@ class Td3Agents(OffPolicyAgents):
         return loss.detach()
 
     def _actor(self, part: str, observations: Tensor) -> Tensor:
-        return torch.tanh(mlp(observations, self.networks[part], "", RELU, last=True))
+        return torch.tanh(mlp(observations, self.networks[part], "", torch.relu, last=True))
 
     def _noisy(self, actions: Tensor, noise: Tensor) -> Tensor:
         return (actions + noise * self.method.exploration_noise).clamp(-1.0, 1.0)

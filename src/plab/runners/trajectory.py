@@ -11,17 +11,63 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
 
-from plab.config import TrajectoryConfig
-from plab.families import family
-from plab.runners.common import checked_array, measures, shared_problem
-from plab.runners.runner import Runner, Step, Track
+from plab.config import MethodConfig, ranges
+from plab.config.families import GRADIENT, Appearance, Family, Rule, family
+from plab.runners.runner import Runner, Step, Track, measures, shared_problem
 
-__all__ = ["ActionSequence", "Adam", "Momentum", "TrajectoryRunner", "UpdateRule"]
+__all__ = [
+    "FAMILY",
+    "ActionSequence",
+    "Adam",
+    "Momentum",
+    "TrajectoryConfig",
+    "TrajectoryRunner",
+    "UpdateRule",
+]
+
+
+@dataclass
+class TrajectoryConfig(MethodConfig):
+    """Open-loop optimisation of the action sequence through the differentiable simulator.
+
+    Attributes:
+        optimizer: Update rule, one of the family's: ``adam`` or ``gd``.
+        lr: Learning rate; actions are in [-1, 1].
+        lr_by_task: Learning rates by whose numbers the task has, and task, or ``other``. Empty in a run's
+            configuration: what was used is in ``lr``.
+        contact_by_task: Weights of the contact term by term and task. Empty likewise: what was used is in
+            ``loss_weights``.
+        betas: Decay rates of adam's two moment estimates.
+        eps: Added to adam's denominator.
+        momentum: gd's momentum, on (1 - momentum)-weighted gradients.
+        max_gradient_norm: Longer gradients are scaled down to this norm; None sets no limit.
+        max_gradient_norm_by_numbers: Limits by whose numbers the task has. Empty likewise.
+        iterations: Rollouts with gradient, hence updates.
+        action_init: Initial actions are uniform in +- this.
+    """
+
+    optimizer: str
+    lr: float = field(metadata=ranges.POSITIVE)
+    lr_by_task: dict[str, Any]
+    contact_by_task: dict[str, Any]
+    betas: list[float] = field(metadata=ranges.DECAYS)
+    eps: float = field(metadata=ranges.POSITIVE)
+    momentum: float = field(metadata=ranges.FRACTION)
+    max_gradient_norm: float | None = field(metadata=ranges.POSITIVE)
+    max_gradient_norm_by_numbers: dict[str, Any]
+    iterations: int = field(metadata=ranges.COUNT)
+    action_init: float = field(metadata=ranges.UNIT)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        ranges.one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
 
 
 class TrajectoryRunner(Runner):
@@ -127,8 +173,7 @@ class ActionSequence:
     def __init__(self, method: TrajectoryConfig, horizon: int, action_dim: int, seed: int) -> None:
         """Draw the first actions, uniform in +-``method.action_init``."""
         self.actions = (2.0 * uniform(seed, (horizon, action_dim)) - 1.0) * method.action_init
-        rule: Any = family(method.family).rule(method.optimizer, Callable)  # type: ignore[arg-type]
-        self._rule = rule(method)
+        self._rule = family(method.family).rules[method.optimizer].what(method)
         self._largest = method.max_gradient_norm
 
     def step(self, gradient: np.ndarray) -> None:
@@ -144,17 +189,9 @@ class ActionSequence:
         return {"actions": self.actions, "optimizer": dict(self._rule.state)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; ValueError if it is that of other actions."""
-        if not isinstance(state["optimizer"], Mapping):
-            raise ValueError("the optimiser's state is none")
-        shape = self.actions.shape
-        self._rule.state = {
-            name: checked_array(
-                np.asarray(value, np.float64), shape if np.ndim(value) else (), "float64", name
-            )
-            for name, value in state["optimizer"].items()
-        }
-        self.actions = checked_array(state["actions"], shape, "float64", "actions")
+        """Return to a :meth:`state`."""
+        self._rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
+        self.actions = np.array(state["actions"])
 
 
 def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
@@ -166,3 +203,19 @@ def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
     words = twister.randint(0, 2**32, (*shape, 2), dtype=np.uint32).astype(np.uint64)
     bits = (words[..., 0] << np.uint64(32) | words[..., 1]) & np.uint64(2**53 - 1)
     return bits * 2.0**-53
+
+
+FAMILY = Family(
+    label="a sequence of actions, improved by its gradient",
+    config=TrajectoryConfig,
+    runner=TrajectoryRunner,
+    columns=("gradient_norm",),
+    batching=True,
+    rules={"adam": Rule(Adam), "gd": Rule(Momentum)},
+    kind=GRADIENT,
+    methods={
+        "adam": Appearance("Adam", "#D55E00"),
+        "gd": Appearance("GD", "#E69F00", "--"),
+        "adam_h": Appearance("Adam-H", "#CC79A7", "-."),
+    },
+)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
+from plab.config.families import GRADIENT
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.families import GRADIENT
 from plab.report.methods import method
 from plab.report.reference import PAPER_SEED_COUNT, paper_table
 from plab.report.series import BUDGETS

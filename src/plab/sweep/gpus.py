@@ -18,7 +18,7 @@ from plab.config import Config, ConfigError
 from plab.config.compose import cuda_devices
 from plab.outcomes import Outcome
 from plab.progress import forward_to, show_several
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 
 __all__ = ["choose", "gpu_workers"]
 

@@ -8,9 +8,9 @@ from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
-from plab.config import Config, RlConfig, build_scene
+from plab.config import Config, build_scene
+from plab.config.families import family
 from plab.config.selection import OBSERVED
-from plab.families import family
 from plab.problem import build_scenes
 from plab.results import row_count
 from plab.scenes import Scene
@@ -74,7 +74,7 @@ def _limit(cfg: Config, size: int | None, sharing: int) -> int:
         return batch_limit(scene, cfg.sim.precision, cfg.sim.device, cfg.sim.memory_mb)
     # Agents need no gradient, so sim.memory_mb, the budget of one, is none of theirs.
     room = most_environments(scene, cfg.sim.precision, cfg.sim.device) // sharing
-    return max(1, room // cfg.method_as(RlConfig).num_envs)
+    return max(1, room // asdict(cfg.method)["num_envs"])
 
 
 def _split(group: Sequence[Config], count: int) -> list[list[Config]]:

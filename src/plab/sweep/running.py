@@ -27,7 +27,7 @@ from plab.results import ResultsError, RunFile, read, result_path
 from plab.results.locks import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
 from plab.runners.jobs import outcome
-from plab.runners.simulator_cache import SimulatorCache
+from plab.runners.runner import SimulatorCache
 from plab.scenes import SceneError
 from plab.sweep.gpus import gpu_workers
 from plab.sweep.plan import plan

@@ -7,13 +7,40 @@ To reproduce a result:
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from plab.config import CemConfig
-from plab.runners.planners.sampling import Sampler
+from plab.config import ConfigError, ranges
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import Sampler, SamplerConfig
 
-__all__ = ["Cem"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Cem", "CemConfig"]
+
+
+@dataclass
+class CemConfig(SamplerConfig):
+    """Cross-entropy method.
+
+    Attributes:
+        elites: Candidates that mean and spread are taken from.
+        smoothing: Share of the old mean and spread that is kept.
+        least_spread: The spread falls no lower.
+    """
+
+    elites: int = field(metadata=ranges.within(ranges.at_least, 2))
+    smoothing: float = field(metadata=ranges.FRACTION)
+    least_spread: float = field(metadata=ranges.FINITE)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if self.elites > self.population:
+            raise ConfigError(
+                f"{path}.elites must be at most population = {self.population}, not {self.elites}"
+            )
 
 
 class Cem(Sampler):

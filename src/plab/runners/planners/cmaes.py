@@ -8,17 +8,24 @@ To reproduce a result:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from cmaes import CMA
-from torch import Tensor
 
-from plab.config import CmaesConfig
-from plab.runners.planners.sampling import Sampler
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import Sampler, SamplerConfig
 
-__all__ = ["Cmaes"]
+if TYPE_CHECKING:
+    from cmaes import CMA
+    from torch import Tensor
+
+__all__ = ["Cmaes", "CmaesConfig"]
+
+
+@dataclass
+class CmaesConfig(SamplerConfig):
+    """Covariance matrix adaptation."""
 
 
 class Cmaes(Sampler):
@@ -29,6 +36,8 @@ class Cmaes(Sampler):
 
     def settle(self, point: Tensor) -> None:
         """Begin to draw around a curve."""
+        from cmaes import CMA
+
         flat = point.flatten().cpu().numpy()
         bounds = np.stack([-np.ones_like(flat), np.ones_like(flat)], axis=1)
         # Not drawn again where it leaves the bounds, but clipped: in many dimensions nearly all would.

@@ -8,13 +8,31 @@ To reproduce a result:
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from plab.config import MppiConfig
-from plab.runners.planners.sampling import Sampler
+from plab.config import ranges
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import Sampler, SamplerConfig
 
-__all__ = ["Mppi"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Mppi", "MppiConfig"]
+
+
+@dataclass
+class MppiConfig(SamplerConfig):
+    """Model-predictive path integral: the mean of all candidates, weighted by how good they are.
+
+    Attributes:
+        temperature: Candidates that are worse than the best by this many standard deviations of the costs
+            weigh 1 / e of it.
+        decay: The spread is multiplied by this after each iteration.
+    """
+
+    temperature: float = field(metadata=ranges.POSITIVE)
+    decay: float = field(metadata=ranges.UNIT)
 
 
 class Mppi(Sampler):

@@ -8,16 +8,54 @@ To reproduce a result:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from plab.config import MultistartConfig
-from plab.runners.planners.planner import Asking, CandidateStart, Planner, Request
+from plab.config import ConfigError, ranges
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import Asking, CandidateStart, Planner, PlannerConfig, Request
 
-__all__ = ["Multistart"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Multistart", "MultistartConfig"]
+
+
+@dataclass
+class MultistartConfig(PlannerConfig):
+    """Gradient descent from many starts.
+
+    Attributes:
+        lrs: Learning rates, which candidates have in turn.
+        betas: Decay rates of Adam's two moment estimates.
+        eps: Added to Adam's denominator.
+        updates: Updates of each candidate per iteration.
+        softness_end: The softness goes from ``softness`` to this over the iterations, by the same factor in
+            each; None: it stays.
+        replace_every: Iterations after which the worse half is replaced.
+        fresh: Share of the replaced candidates that start anew; the others start beside a better one, no
+            farther off than ``action_init``.
+    """
+
+    lrs: list[float]
+    betas: list[float] = field(metadata=ranges.DECAYS)
+    eps: float = field(metadata=ranges.POSITIVE)
+    updates: int = field(metadata=ranges.COUNT)
+    softness_end: float | None = field(metadata=ranges.POSITIVE)
+    replace_every: int = field(metadata=ranges.COUNT)
+    fresh: float = field(metadata=ranges.UNIT)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if not self.lrs:
+            raise ConfigError(f"{path}.lrs is empty: give one learning rate at least")
+        for lr in self.lrs:
+            ranges.positive(f"{path}.lrs", lr)
+        if self.softness_end is not None and self.contact == "hard":
+            raise ConfigError(f"{path}.softness_end has no effect with contact=hard: leave it out")
 
 
 class Multistart(Planner):

@@ -11,33 +11,86 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from plab.config import MethodConfig, PlannerConfig, StagesConfig
-from plab.families import family
-from plab.problem import Episodes, build_scenes
-from plab.runners.common import shared_problem
-from plab.runners.planners.starts import ContactStarts
+from plab.config import MethodConfig, ranges
+from plab.config.families import family
+from plab.runners.libraries import torch
 from plab.runners.policy import torch_settings
-from plab.runners.runner import Runner, Step, Track
-from plab.scenes import Scene
-from plab.sim.memory import batch_limit
+from plab.runners.runner import Runner, Step, Track, shared_problem
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from plab.problem import Episodes
+    from plab.scenes import Scene
 
 __all__ = [
     "Answer",
     "Asking",
     "CandidateStart",
     "Planner",
+    "PlannerConfig",
     "PlannerRunner",
     "Preview",
     "Request",
+    "Sampler",
+    "SamplerConfig",
+    "actions_of",
+    "knots_of",
     "make_planner",
 ]
+
+
+OBJECTIVES = ("loss", "final", "score")
+CURVES = ("constant", "linear")
+
+
+@dataclass
+class PlannerConfig(MethodConfig):
+    """What the planners have in common.
+
+    Attributes:
+        algorithm: How it searches, one of the family's rules.
+        iterations: Rows of the result; what one costs is up to the planner.
+        population: Candidates, each a sequence of actions.
+        objective: What candidates are ranked by: ``loss``, that of the whole episode; ``final``, that of its
+            last step; or ``score``, and the loss where the score is 0.
+        action_init: Random candidates are uniform in +- this.
+        contact_starts: Share of the candidates to start from that drive manipulators to the body and push or
+            carry it towards the target; the others are random.
+    """
+
+    algorithm: str
+    iterations: int = field(metadata=ranges.COUNT)
+    population: int = field(metadata=ranges.within(ranges.at_least, 4))
+    objective: str = field(metadata=ranges.within(ranges.one_of, OBJECTIVES))
+    action_init: float = field(metadata=ranges.UNIT)
+    contact_starts: float = field(metadata=ranges.UNIT)
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
+
+
+@dataclass
+class SamplerConfig(PlannerConfig):
+    """What planners have in common that draw candidates and learn from what they cost, without a gradient.
+
+    Attributes:
+        knots: Actions are a curve through so many points in time, at most one per environment step.
+        curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
+            the next.
+        spread: Standard deviation of the first draws around the best start, of each point.
+    """
+
+    knots: int = field(metadata=ranges.COUNT)
+    curve: str = field(metadata=ranges.within(ranges.one_of, CURVES))
+    spread: float = field(metadata=ranges.POSITIVE)
 
 
 @dataclass(frozen=True)
@@ -101,6 +154,8 @@ class CandidateStart:
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
         """Take note of scene and target, a mass tensor of shape [n, n, n]."""
+        from plab.runners.planners.starts import ContactStarts
+
         self.shape, self.device = (scene.horizon, scene.action_dim), device
         self._contact = ContactStarts(scene, target)
 
@@ -181,9 +236,102 @@ class Planner(ABC):
         self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
 
 
+def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
+    """Return the actions of curves.
+
+    Args:
+        knots: Points, evenly spaced in time, shape [P, K, A].
+        steps: Environment steps T.
+        curve: ``constant`` or ``linear``.
+
+    Returns:
+        Actions in [-1, 1], shape [P, T, A].
+    """
+    by_component = knots.transpose(1, 2)
+    if curve == "constant":
+        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="nearest")
+    else:
+        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="linear", align_corners=True)
+    return drawn.transpose(1, 2).clamp(-1.0, 1.0)
+
+
+def knots_of(actions: Tensor, knots: int) -> Tensor:
+    """Return points, shape [P, knots, A], that are means of actions, shape [P, T, A], over their share of the
+    time."""
+    return torch.nn.functional.adaptive_avg_pool1d(actions.transpose(1, 2), knots).transpose(1, 2)
+
+
+class Sampler(Planner):
+    """Draws curves, has them tried, and learns from what they cost; first the starts, then around the best.
+
+    Attributes:
+        method: Its numbers.
+        knots: Points K of a curve.
+    """
+
+    method: SamplerConfig
+
+    @property
+    def knots(self) -> int:
+        """Points of a curve, at most one per step."""
+        return min(self.method.knots, self.start.shape[0])
+
+    def begin(self, random: torch.Generator, found: Tensor) -> None:
+        """Take over the better half of what has been found, and draw starts for the others."""
+        kept = found[: self.method.population // 2]
+        drawn = self.start.draw(self.method, self.method.population - len(kept), random)
+        self.memory["candidates"] = torch.cat([kept, drawn])
+
+    def candidates(self) -> Tensor:
+        """Return the curves drawn last, the best first."""
+        return self.memory["candidates"]
+
+    def iterate(self, random: torch.Generator) -> Asking:
+        """Try the starts, later what is drawn, and learn from it."""
+        method, first = self.method, self.iteration == 0
+        if first:
+            points = knots_of(self.memory["candidates"], self.knots)
+        else:
+            points = self.sample(random).clamp(-1.0, 1.0)
+            points[0] = self.memory["best"]
+        actions = actions_of(points, self.start.shape[0], method.curve)
+        softness = method.softness if method.contact == "soft" else None
+        answer = yield Request(actions, softness)
+        cost = answer.cost(method.objective)
+        order = cost.argsort(stable=True)
+        self.memory |= {"candidates": actions[order], "best": points[order[0]].clone()}
+        if first:
+            self.settle(points[order[0]])
+        else:
+            self.learn(points, cost)
+        if softness is not None:
+            # Rows are of the hard model: that of the best half, so that it is no gamble.
+            actions = actions[order[: len(order) // 2]]
+            answer = yield Request(actions)
+        return self.show(actions, answer)
+
+    @abstractmethod
+    def settle(self, point: Tensor) -> None:
+        """Begin to draw around a curve, shape [K, A]."""
+
+    @abstractmethod
+    def sample(self, random: torch.Generator) -> Tensor:
+        """Draw curves, shape [P, K, A]; whatever leaves [-1, 1] will be clipped."""
+
+    @abstractmethod
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        """Learn from curves, shape [P, K, A], and what they cost, shape [P], infinite for what broke off."""
+
+    def noise(self, random: torch.Generator) -> Tensor:
+        """Draw standard normal numbers, shape [P, K, A]."""
+        size = (self.method.population, self.knots, self.start.shape[1])
+        return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
+
+
 def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
     """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
-    return family(method.family).rule(getattr(method, "algorithm"), type)(method, start)  # noqa: B009
+    rule = family(method.family).rules[getattr(method, "algorithm")]  # noqa: B009
+    return rule.what(method, start)
 
 
 class PlannerRunner(Runner):
@@ -200,6 +348,9 @@ class PlannerRunner(Runner):
 
     def build(self) -> None:
         """Make the problem: environment e is for a candidate of run e modulo the number of runs."""
+        from plab.problem import build_scenes
+        from plab.sim.memory import batch_limit
+
         cfgs = [track.cfg for track in self.tracks]
         scene, sim = build_scenes(cfgs[:1])[0], cfgs[0].sim
         fewest = min(_smallest_population(cfg.method) for cfg in cfgs)
@@ -311,6 +462,6 @@ def _alike(a: Request, b: Request) -> bool:
 
 def _smallest_population(method: Any) -> int:
     """Return how many candidates are tried at once at least: more environments would stand still then."""
-    if isinstance(method, StagesConfig):
+    if hasattr(method, "stages"):
         return min(map(_smallest_population, method.stages.values()))
     return method.population

@@ -10,14 +10,46 @@ reproduce a result:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-import torch
+from plab.config import ConfigError, MethodConfig
+from plab.runners.planners.planner import Asking, CandidateStart, Planner, PlannerConfig, make_planner
 
-from plab.config import StagesConfig
-from plab.runners.planners.planner import Asking, CandidateStart, Planner, make_planner
+if TYPE_CHECKING:
+    import torch
 
-__all__ = ["Stages"]
+__all__ = ["Stages", "StagesConfig"]
+
+
+@dataclass
+class StagesConfig(MethodConfig):
+    """Planners one after the other, each from what the one before has found.
+
+    Attributes:
+        algorithm: ``stages``.
+        stages: Planners by names of your choice, in order; each has the keys of a method of its own.
+    """
+
+    algorithm: str
+    stages: dict[str, Any]
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if not self.stages:
+            raise ConfigError(f"{path}.stages is empty: give one planner at least")
+        for name, stage in self.stages.items():
+            if not isinstance(stage, PlannerConfig):
+                raise ConfigError(
+                    f"{path}.stages.{name} is no planner: start from one, as conf/method/solve.yaml"
+                )
+            for part in ("loss_weights", "loss_terms"):
+                if getattr(stage, part) != getattr(self, part):
+                    raise ConfigError(
+                        f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
+                    )
+            stage.check(f"{path}.stages.{name}")
 
 
 class Stages:

@@ -1,0 +1,176 @@
+"""Families of methods: the types of their records, and the registry that finds them.
+
+A record is at the end of a runner's file, beside the dataclass of the section ``method``; a method's YAML
+names it as ``family: name`` of :data:`FAMILIES`, or as ``module:NAME`` outside plab: see docs/own_method.md.
+These files import no large library before they need it, so that looking up a record stays cheap.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from plab.errors import ConfigError, pick
+from plab.plugins import load_object
+
+__all__ = [
+    "FAMILIES",
+    "GRADIENT",
+    "RL",
+    "SOLVED",
+    "Appearance",
+    "Family",
+    "Rule",
+    "family",
+    "known_family",
+    "schemas",
+]
+
+RL, GRADIENT = "RL", "gradient"
+"""Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
+
+SOLVED = 1.0
+"""The highest score there is."""
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How a method appears in tables and figures.
+
+    Attributes:
+        label: Name for readers.
+        colour: Colour of its curves.
+        dashes: Line style, for those who do not see the colour.
+    """
+
+    label: str
+    colour: str
+    dashes: str = "-"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A learning algorithm or an update rule, of which a family may offer several.
+
+    Attributes:
+        what: It; of which kind it is, is up to the family's runner.
+        config: Type of the section ``method``; None: the family's.
+    """
+
+    what: Any
+    config: type | None = None
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of methods: what they have in common, and who carries them out.
+
+    Attributes:
+        label: What the methods of the family do, in a few words.
+        config: Type of the section ``method``, a subclass of :class:`plab.config.MethodConfig`.
+        runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
+            large library.
+        columns: Columns of the results beside those that all methods have.
+        may_be_nan: Those of them with entries for which there is no number.
+        ranking: What the best actions of a run are chosen by: ``loss``, the lowest, or ``score``, the highest
+            (and of several the one of lowest loss).
+        batching: Whether runs can share a simulator; else each runs alone.
+        in_step: Whether those that share one must have the same section ``method``, as agents that learn in
+            step with each other.
+        rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
+        contact: Contact model in which rows are measured, ``soft`` or ``hard``; None: ``method.contact``.
+        kind: :data:`RL`, :data:`GRADIENT`, or empty.
+        methods: Appearance of methods by name; others appear in grey, by their names.
+    """
+
+    label: str
+    config: type
+    runner: type | str
+    columns: tuple[str, ...] = ()
+    may_be_nan: tuple[str, ...] = ()
+    ranking: str = "loss"
+    batching: bool = False
+    in_step: bool = False
+    rules: Mapping[str, Rule] = field(default_factory=dict)
+    contact: str | None = None
+    kind: str = ""
+    methods: Mapping[str, Appearance] = field(default_factory=dict)
+
+    def config_type(self, rule: str | None = None) -> type:
+        """Return the type of the section ``method``, of a rule that has one of its own that."""
+        own = self.rules.get(rule or "")
+        return self.config if own is None or own.config is None else own.config
+
+    def runner_type(self) -> type:
+        """Return the runner.
+
+        Raises:
+            plab.config.ConfigError: If it cannot be imported.
+        """
+        return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
+
+
+class _Registry(dict[str, Any]):
+    """Records by name, each imported when it is first asked for."""
+
+    def __getitem__(self, name: str) -> Family:
+        record = super().__getitem__(name)
+        if isinstance(record, str):
+            self[name] = record = load_object(record, Family)
+        return record
+
+    def values(self) -> Iterator[Family]:  # type: ignore[override]
+        return (self[name] for name in self)
+
+    def items(self) -> Iterator[tuple[str, Family]]:  # type: ignore[override]
+        return ((name, self[name]) for name in self)
+
+
+FAMILIES: Mapping[str, Family] = _Registry(
+    trajectory="plab.runners.trajectory:FAMILY",
+    planner="plab.runners.planners:FAMILY",
+    rl="plab.runners.rl:FAMILY",
+    sb3="plab.runners.rl:SB3",
+    apg="plab.runners.apg:FAMILY",
+    pods="plab.runners.pods:FAMILY",
+    shac="plab.runners.shac:FAMILY",
+)
+"""plab's own families by name, the ``family`` of a method's YAML."""
+
+
+def family(name: str) -> Family:
+    """Return the family of a name, as in ``method.family``.
+
+    Args:
+        name: A key of :data:`FAMILIES`, or the ``module:NAME`` of a record elsewhere.
+
+    Raises:
+        plab.config.ConfigError: If there is none.
+    """
+    if name in FAMILIES:
+        return FAMILIES[name]
+    if ":" in name:
+        return load_object(name, Family)
+    raise ConfigError(f"method.family '{name}' does not exist; {pick(name, [*FAMILIES, 'module:NAME'])}")
+
+
+def known_family(name: str) -> Family | None:
+    """Return the family of a name, None if its module has not been imported: readers of results can do
+    without, and no result file chooses what is imported."""
+    if name in FAMILIES or name.partition(":")[0] in sys.modules:
+        try:
+            return family(name)
+        except ConfigError:
+            return None
+    return None
+
+
+def schemas() -> Iterator[tuple[str, type]]:
+    """Yield names and types that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``."""
+    for name, record in FAMILIES.items():
+        own = [rule for rule, it in record.rules.items() if it.config is not None]
+        yield from ((rule, record.config_type(rule)) for rule in own or [name])
