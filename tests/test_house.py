@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -63,6 +64,33 @@ def test_the_version_is_semantic_and_in_one_place():
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
     assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+CLIENT = """
+import numpy as np
+import plab
+
+def mean_height(scene: plab.Scene) -> float:
+    simulator = plab.Simulator([scene], device="cpu")
+    simulator.step(np.zeros((1, scene.action_dim)))
+    return float(simulator.state().x[..., 1].mean())
+
+height: float = mean_height(plab.build_scene(plab.load_config(["task=Move"])))
+observation, info = plab.make(plab.TASKS[0], 1, contact="soft").reset(seed=0)
+actions = plab.make_vec("Rope", num_envs=2).action_space.sample()
+best: float = plab.load_results("example")["score"].max()
+"""
+
+
+@pytest.mark.nightly
+def test_a_typed_client_passes_strict_type_checking(tmp_path) -> None:
+    pytest.importorskip("mypy")
+    (tmp_path / "client.py").write_text(CLIENT)
+    options = ["--strict", "--follow-imports=silent", "--config-file=", "--cache-dir=cache", "client.py"]
+    command = [sys.executable, "-m", "mypy", *options]
+    paths = os.environ | {"MYPYPATH": str(ROOT / "src")}
+    done = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_public_name_of_plab_is_there() -> None:
