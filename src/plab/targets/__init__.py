@@ -7,7 +7,6 @@ the suite.
 
 from plab.targets.build import (
     RECIPES,
-    TARGET_SEED,
     build_target,
     build_targets,
     check_target,
@@ -16,15 +15,13 @@ from plab.targets.build import (
 )
 from plab.targets.recipes import (
     EPISODE_STEPS,
+    TARGET_SEED,
     BodiesTarget,
-    GeometricRecipe,
     MassTarget,
     PointsTarget,
     RingTarget,
-    ScriptedRecipe,
     TargetBody,
     TargetError,
-    TensorRecipe,
 )
 from plab.targets.store import load_release_target
 
@@ -33,14 +30,11 @@ __all__ = [
     "RECIPES",
     "TARGET_SEED",
     "BodiesTarget",
-    "GeometricRecipe",
     "MassTarget",
     "PointsTarget",
     "RingTarget",
-    "ScriptedRecipe",
     "TargetBody",
     "TargetError",
-    "TensorRecipe",
     "build_target",
     "build_targets",
     "check_target",

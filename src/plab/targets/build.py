@@ -6,16 +6,15 @@ import functools
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.objective import spread_mass
 from plab.scenes import Scene, SceneError
 from plab.targets import recipes, scripted
-from plab.targets.recipes import EPISODE_STEPS, GeometricRecipe, ScriptedRecipe, TargetError, TensorRecipe
+from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError, TensorRecipe
 from plab.targets.store import TargetStore
 
 if TYPE_CHECKING:
@@ -23,19 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "RECIPES",
-    "TARGET_SEED",
     "build_target",
     "build_targets",
     "check_target",
     "demonstration",
     "make_recipe",
 ]
-
-TARGET_SEED = 1
-"""Seed of a geometric target's samples; not the scene's, or a target could be a shifted copy of the
-bodies."""
-
-Recipe: TypeAlias = GeometricRecipe | ScriptedRecipe | TensorRecipe
 
 RECIPES: dict[str, type[Recipe]] = {
     "bodies": recipes.BodiesTarget,
@@ -99,7 +91,7 @@ def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
     """
     recipe = make_recipe(target)
-    return recipe.actions(scene) if isinstance(recipe, ScriptedRecipe) else None
+    return recipe.actions(scene) if isinstance(recipe, scripted.Script) else None
 
 
 def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
@@ -125,21 +117,11 @@ def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
             domain, or the target has to be simulated.
     """
     recipe = make_recipe(target)
-    if isinstance(recipe, TensorRecipe):
-        return recipe.mass(scene)
-    if not isinstance(recipe, GeometricRecipe):
+    if not isinstance(recipe, TensorRecipe):
         raise TargetError(
             f"target.recipe {target['recipe']} is simulated: build it with plab.problem.Problem"
         )
-    points = recipe.sample(scene, np.random.default_rng(TARGET_SEED))
-    top = 1.0 - 3.0 * scene.dx
-    if not np.all((points >= -1e-9) & (points <= top + 1e-9)):
-        raise TargetError(
-            f"the target reaches outside the domain 0 .. {top:.4g}: it covers {points.min(0).round(3)} to "
-            f"{points.max(0).round(3)}"
-        )
-    share = scene.particle_count / len(points)
-    return spread_mass(points, scene.grid_size, share * scene.particle_mass, scene.floor_stencil)
+    return recipe.mass(scene)
 
 
 def build_targets(

@@ -1,39 +1,43 @@
-"""Target recipes: dataclasses whose fields are the remaining keys of a task's ``target`` section.
+"""Target recipes that need no simulation, and the classes of all recipes.
 
-Protocols of the three kinds of recipes, and the recipes that need no simulation: solids, whose points are
-drawn uniformly and spread over the grid, and files with a point cloud or a mass tensor. Total masses agree
-with the scene's.
+Solids, whose points are drawn uniformly and spread over the grid, and files with a point cloud or a mass
+tensor. Total masses agree with the scene's.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from plab.errors import PlabError
 from plab.files import ShapeError, one_line, pinned, read_array
+from plab.objective import spread_mass
 from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
 from plab.scenes.mesh import read_mesh
 
 __all__ = [
     "EPISODE_STEPS",
+    "TARGET_SEED",
     "BodiesTarget",
-    "GeometricRecipe",
     "MassTarget",
+    "PointsRecipe",
     "PointsTarget",
+    "Recipe",
     "RingTarget",
-    "ScriptedRecipe",
     "TargetBody",
     "TargetError",
     "TensorRecipe",
     "read_points",
     "read_tensor",
 ]
+
+TARGET_SEED = 1
+"""Seed of a target's samples; not the scene's, or a target could be a shifted copy of the bodies."""
 
 EPISODE_STEPS = 50
 """Environment steps of the suite's episodes, hence of its scripted demonstrations."""
@@ -43,27 +47,14 @@ class TargetError(PlabError, ValueError):
     """A target that cannot be built; the message says why."""
 
 
-@runtime_checkable
-class GeometricRecipe(Protocol):
-    """A target that is a shape."""
-
-    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """Draw points that the mass of the scene's particles is shared out among.
-
-        Args:
-            scene: The scene that the target belongs to.
-            rng: Source of randomness.
-
-        Returns:
-            Positions [domain units], shape [point, 3].
-        """
-        ...
+class Recipe:
+    """A target recipe; its subclasses are dataclasses whose fields are the keys of the section ``target``."""
 
 
-@runtime_checkable
-class TensorRecipe(Protocol):
-    """A target that is given on the grid."""
+class TensorRecipe(Recipe, ABC):
+    """A target that need not be simulated."""
 
+    @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
         """Return the mass tensor.
 
@@ -71,25 +62,31 @@ class TensorRecipe(Protocol):
             scene: The scene that the target belongs to.
 
         Returns:
-            Mass tensor, shape [n, n, n], with the mass of the scene's particles.
+            Mass tensor, shape [n, n, n], float64, with the mass of the scene's particles.
+
+        Raises:
+            TargetError: If a parameter has a wrong value, or the shape leaves the domain.
         """
-        ...
 
 
-@runtime_checkable
-class ScriptedRecipe(Protocol):
-    """A target that is what a demonstration makes of the scene, simulated in the hard contact model."""
+class PointsRecipe(TensorRecipe):
+    """A target made of points that share the mass of the scene's particles."""
 
-    def actions(self, scene: Scene) -> np.ndarray:
-        """Draw the demonstration's actions.
+    @abstractmethod
+    def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
+        """Draw or read the points; positions [domain units], shape [point, 3]."""
 
-        Args:
-            scene: The scene that is handled.
-
-        Returns:
-            Actions in [-1, 1], shape [EPISODE_STEPS, A].
-        """
-        ...
+    def mass(self, scene: Scene) -> np.ndarray:
+        """See :meth:`TensorRecipe.mass`."""
+        points = self.sample(scene, np.random.default_rng(TARGET_SEED))
+        top = 1.0 - 3.0 * scene.dx
+        if not np.all((points >= -1e-9) & (points <= top + 1e-9)):
+            raise TargetError(
+                f"the target reaches outside the domain 0 .. {top:.4g}: it covers "
+                f"{points.min(0).round(3)} to {points.max(0).round(3)}"
+            )
+        share = scene.particle_count / len(points)
+        return spread_mass(points, scene.grid_size, share * scene.particle_mass, scene.floor_stencil)
 
 
 # ----------------------------------------------------------------------------------------------------- solids
@@ -120,7 +117,7 @@ class TargetBody:
 
 
 @dataclass
-class BodiesTarget:
+class BodiesTarget(PointsRecipe):
     """Solid bodies of uniform density.
 
     Attributes:
@@ -130,7 +127,7 @@ class BodiesTarget:
     bodies: dict[str, TargetBody]
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """See :meth:`GeometricRecipe.sample`."""
+        """See :meth:`PointsRecipe.sample`."""
         if not self.bodies:
             raise TargetError("target.bodies is empty: name at least one body")
         for name, body in self.bodies.items():
@@ -158,7 +155,7 @@ class BodiesTarget:
 
 
 @dataclass
-class RingTarget:
+class RingTarget(PointsRecipe):
     """A closed, level ring of square section around a manipulator.
 
     Attributes:
@@ -174,7 +171,7 @@ class RingTarget:
     floor: float
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """See :meth:`GeometricRecipe.sample`."""
+        """See :meth:`PointsRecipe.sample`."""
         if not 0 <= self.around < len(scene.manipulators):
             raise TargetError(
                 f"target.around {self.around} is not the index of a manipulator, 0 .. "
@@ -202,7 +199,7 @@ _MEASURED = 1000
 
 
 @dataclass
-class PointsTarget:
+class PointsTarget(PointsRecipe):
     """A solid that points fill, in domain units; those of a surface alone make a shell.
 
     Attributes:
@@ -215,7 +212,7 @@ class PointsTarget:
     sha256: str | None = None
 
     def sample(self, scene: Scene, _: np.random.Generator) -> np.ndarray:
-        """See :meth:`GeometricRecipe.sample`."""
+        """See :meth:`PointsRecipe.sample`."""
         # Imported here: SciPy's start-up would be paid by every `--help`.
         from scipy.spatial import KDTree
 
@@ -235,7 +232,7 @@ class PointsTarget:
 
 
 @dataclass
-class MassTarget:
+class MassTarget(TensorRecipe):
     """A mass tensor; node (i, j, k) is at (i, j, k) / n.
 
     Attributes:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
-from plab.targets.recipes import EPISODE_STEPS, TargetError
+from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 __all__ = [
     "DECIMALS",
@@ -88,7 +88,7 @@ class ActionTrack:
 
 
 @dataclass
-class Script(ABC):
+class Script(Recipe, ABC):
     """A scripted demonstration.
 
     Attributes:
@@ -112,7 +112,17 @@ class Script(ABC):
         return {key: value for key, value in values.items() if value is not None}
 
     def actions(self, scene: Scene) -> np.ndarray:
-        """See :meth:`plab.targets.recipes.ScriptedRecipe.actions`."""
+        """Draw the demonstration's actions.
+
+        Args:
+            scene: The scene that is handled.
+
+        Returns:
+            Actions in [-1, 1], shape [EPISODE_STEPS, A].
+
+        Raises:
+            TargetError: If a parameter has a wrong value, or no drawn way fits into an episode.
+        """
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
         if not any(m.action_dim for m in scene.manipulators):
