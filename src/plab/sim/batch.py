@@ -14,16 +14,6 @@ from numpy.typing import ArrayLike
 
 from plab.scenes import Material, Scene, SceneError
 
-__all__ = [
-    "YIELD_STRAIN_MAX",
-    "initial_poses",
-    "material_parameters",
-    "parameter_gradient",
-    "require_alike",
-    "scene_kind",
-    "with_material",
-]
-
 SHARED = (
     "particle_count",
     "material_count",

@@ -20,8 +20,6 @@ from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, st
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["ClosedLoop", "Recording", "StateRecorder"]
-
 
 class Recording:
     """States after environment steps; arrays, or CUDA tensors where the actions were one.

@@ -12,20 +12,6 @@ import taichi as ti
 
 from plab.sim.taichi_internals import Bitcode
 
-__all__ = [
-    "copy",
-    "flow",
-    "flow_adjoint",
-    "gather",
-    "gather_adjoint",
-    "scatter",
-    "strain",
-    "strain_adjoint",
-    "stress",
-    "stress_adjoint",
-]
-
-
 _function = Bitcode(f"{sys.platform}-{platform.machine().lower()}")
 
 

@@ -20,8 +20,6 @@ from plab.sim.taichi_internals import address_of
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 
-__all__ = ["BLOCK_NODES", "PROBE", "PROBE_FIRST", "RECENT", "SPLIT", "CpuEngine", "CpuPhases", "TeamChoice"]
-
 BLOCK_NODES = BLOCK**3
 
 SPLIT = 512

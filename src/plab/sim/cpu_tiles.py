@@ -44,8 +44,6 @@ from plab.sim.storage import (
     WEIGHTS,
 )
 
-__all__ = ["KEY", "NODE", "MaterialTiles", "TransferTiles"]
-
 # Entries in ``bases``: node in the environment's grid; block and crossing in one number.
 NODE = 0
 KEY = 1

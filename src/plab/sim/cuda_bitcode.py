@@ -10,8 +10,6 @@ import taichi as ti
 
 from plab.sim.taichi_internals import Bitcode, local_variable
 
-__all__ = ["add", "gather_sums", "look", "particle", "particle_adjoint"]
-
 _function = Bitcode("cuda")
 
 

@@ -20,8 +20,6 @@ from plab.sim.runtime import cuda_driver
 from plab.sim.storage import STATE
 from plab.sim.tensors import Array
 
-__all__ = ["CudaEngine"]
-
 THREADS_MAX = 1 << 17
 """Threads of a loop over nodes: about as many as the largest devices hold at a time."""
 

@@ -30,8 +30,6 @@ from plab.sim.particle_phases import affine_field, spline, spline_slope, widen
 from plab.sim.shapes import signed_distance
 from plab.sim.storage import AT_C, AT_F, AT_V, FRAME_ADJOINT
 
-__all__ = ["DISTANCE_GROUPS", "POSE_SHARE", "RESIDENT_BLOCK", "CudaPhases"]
-
 DISTANCE_GROUPS = 256
 """Threads per environment and manipulator that tally distances, warps of them together."""
 

@@ -13,8 +13,6 @@ import taichi as ti
 from plab.sim.cuda_bitcode import add
 from plab.sim.storage import Storage
 
-__all__ = ["SumPhases"]
-
 MOMENTUM_BITS, MASS_BITS = 36, 42
 """Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""
 

@@ -19,20 +19,6 @@ from plab.sim.storage import BLOCK_BITS, STATE
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 
-__all__ = [
-    "ALL_LANES",
-    "BLOCK_WARPS",
-    "NODE_BITS",
-    "NODE_MASK",
-    "NODE_STRIDE",
-    "RUN_BITS",
-    "WARP",
-    "WARP_BLOCK",
-    "WARP_NUMBERS",
-    "OrderPhases",
-    "WarpPhases",
-]
-
 ALL_LANES = 0xFFFFFFFF
 """Mask of a warp: 32 threads, which are the 32 lanes of one tile of particles."""
 

@@ -15,8 +15,6 @@ from plab.sim.storage import (
     Storage,
 )
 
-__all__ = ["MASS_MIN", "STRENGTH_MIN", "GridPhases", "slid", "slid_adjoint"]
-
 MASS_MIN = 1e-12
 """Nodes with less mass are skipped."""
 

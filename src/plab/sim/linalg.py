@@ -18,22 +18,6 @@ import operator
 from dataclasses import dataclass
 from functools import reduce
 
-__all__ = [
-    "Series",
-    "cofactor_sym",
-    "det",
-    "det_sym",
-    "exp_coefficients",
-    "inverse_cbrt",
-    "inverse_sym",
-    "log_coefficients",
-    "mat_from_sym",
-    "mul",
-    "mul_sym_mat",
-    "outer_sym",
-    "square_sym",
-]
-
 SYM = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of a symmetric matrix's components."""
 

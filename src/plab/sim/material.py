@@ -32,16 +32,6 @@ from plab.sim.linalg import (
     square_sym,
 )
 
-__all__ = [
-    "NORM_SHIFT",
-    "flow",
-    "hencky_strain",
-    "scattered_matrix",
-    "stress",
-    "trial_gradient",
-    "yield_factor",
-]
-
 NORM_SHIFT = 1e-8
 """Added to |d|^2 under the square root, as in the PlasticineLab release."""
 

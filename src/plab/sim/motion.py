@@ -11,18 +11,6 @@ from plab.scenes import MANIPULATOR_SHAPES, ROLL_RADIUS
 from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 
-__all__ = [
-    "ROLL_RADIUS",
-    "PosePhases",
-    "advance_pose",
-    "advance_pose_adjoint",
-    "rotation_matrix",
-    "rotation_matrix_adjoint",
-    "vec4",
-    "vec7",
-    "vec8",
-]
-
 vec3 = ti.types.vector(3, ti.f64)
 vec4 = ti.types.vector(4, ti.f64)
 vec7 = ti.types.vector(7, ti.f64)

@@ -18,17 +18,6 @@ from plab.sim.spectral import (
 from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
 
-__all__ = [
-    "SIZES",
-    "ParticlePhases",
-    "affine_field",
-    "at_base",
-    "column",
-    "spline",
-    "spline_slope",
-    "widen",
-]
-
 SIZES = {ti.f32: 4, ti.f64: 8}
 """Bytes of a number."""
 

@@ -21,8 +21,6 @@ from plab.sim.tensors import copy_numbers
 if TYPE_CHECKING:
     from plab.sim.cpu_engine import CpuEngine
 
-__all__ = ["ParticleOrder", "Particles", "curve_order", "hilbert_index"]
-
 STAMP_MAX = 2**31 - 2**20
 
 PARTS = 4

@@ -25,9 +25,6 @@ from plab.sim.taichi_internals import (
     hasten_tracing,
 )
 
-__all__ = ["DeviceError", "Runtime", "SimulationError", "start_runtime"]
-
-
 CACHE_BYTES = 1 << 30
 """Size up to which Taichi keeps compiled kernels, those used last, in the user's cache folder."""
 

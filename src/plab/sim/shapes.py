@@ -11,8 +11,6 @@ import taichi as ti
 
 from plab.scenes import MANIPULATOR_SHAPES, SceneError
 
-__all__ = ["SURFACES", "Surface", "gap_slope", "hessian_product", "require_surfaces", "signed_distance"]
-
 
 def missing(*_arguments: object) -> object:
     """Stands for a function that a shape does not have."""

@@ -37,8 +37,6 @@ from plab.sim.term_phases import LossTerm
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["Simulator"]
-
 
 class Simulator:
     """Differentiable elastoplastic MLS-MPM for a batch of environments.

@@ -11,17 +11,6 @@ import taichi as ti
 
 from plab.sim.material import NORM_SHIFT
 
-__all__ = [
-    "SINGULAR_VALUE_MIN",
-    "product",
-    "product_nt",
-    "product_tn",
-    "spectral_parameter_adjoint",
-    "spectral_return_map",
-    "spectral_return_map_adjoint",
-    "svd_signed",
-]
-
 SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
 

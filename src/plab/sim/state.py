@@ -14,17 +14,6 @@ from plab.sim.tensors import on_device
 if TYPE_CHECKING:
     import torch
 
-__all__ = [
-    "Measures",
-    "Rollout",
-    "State",
-    "broken_gradients",
-    "broken_states",
-    "broken_terms",
-    "require_none",
-    "rest_state",
-]
-
 
 @dataclass(frozen=True)
 class State:

@@ -29,41 +29,6 @@ from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.taichi_internals import free_with
 from plab.sim.tensors import Array
 
-__all__ = [
-    "ADJOINT_FIELD",
-    "AT_C",
-    "AT_F",
-    "AT_FRAME_GAP",
-    "AT_FRAME_ROTATION",
-    "AT_FRAME_SPIN",
-    "AT_FRAME_VELOCITY",
-    "AT_V",
-    "BASES",
-    "BLOCK",
-    "BLOCK_BITS",
-    "CHUNKS",
-    "FRAME_ADJOINT",
-    "INDEX_MASK",
-    "MOMENTUM_FIELD",
-    "OFFSETS",
-    "SLOPES",
-    "STATE",
-    "STATE_MASK",
-    "STENCILS",
-    "STRAINS",
-    "STRAIN_BARS",
-    "STRAIN_D",
-    "STRAIN_D_BAR",
-    "STRAIN_G_BAR",
-    "STRAIN_PARAMETERS",
-    "STRAIN_PARAMETER_BARS",
-    "STRAIN_SCALARS",
-    "STRAIN_W",
-    "STRAIN_Z",
-    "WEIGHTS",
-    "Storage",
-]
-
 STATE = 24
 """Entries per particle: x (3), v (3), C (9), F (9); the same of a state's adjoint."""
 

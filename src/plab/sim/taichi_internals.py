@@ -49,21 +49,6 @@ from taichi.lang.source_builder import SourceBuilder
 
 from plab.files import cache_dir
 
-__all__ = [
-    "BITCODE",
-    "Bitcode",
-    "address_of",
-    "cache_folder",
-    "cuda_available",
-    "forget_arguments",
-    "free_own_arrays_only",
-    "free_with",
-    "hasten_tracing",
-    "local_variable",
-    "tell_classes_quickly",
-    "watch_compiling",
-]
-
 BITCODE = Path(__file__).with_name("bitcode")
 """Folder of the files that ``make bitcode`` writes."""
 

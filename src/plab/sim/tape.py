@@ -10,8 +10,6 @@ import taichi as ti
 from plab.sim.memory import ENTRIES_MAX, held_bytes, segment_length
 from plab.sim.particles import Particles
 
-__all__ = ["Tape"]
-
 
 class Tape:
     """Runs environment steps forward and back.

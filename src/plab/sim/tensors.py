@@ -23,17 +23,6 @@ if TYPE_CHECKING:
 else:
     Array = ti.types.ndarray(ndim=1)
 
-__all__ = [
-    "Array",
-    "Constants",
-    "action_array",
-    "copy_numbers",
-    "numbers_of",
-    "on_device",
-    "output_for",
-    "step_actions",
-]
-
 
 def on_device(array: object) -> "TypeIs[torch.Tensor]":
     """Whether something is a CUDA tensor; PyTorch is not imported for that."""

@@ -23,8 +23,6 @@ from plab.sim.shapes import gap_slope, signed_distance
 from plab.sim.storage import AT_V, Storage
 from plab.sim.tensors import Array
 
-__all__ = ["EXTRA_MEASURES", "LossTerm", "TermPhases"]
-
 EXTRA_MEASURES = 2
 """Measures of a state after its terms: the largest mass of a node, and the fault: the number of the substep
 in which the state broke, from 1 on, or 0."""
