@@ -2,28 +2,21 @@
 
 LLVM vectorises what ends in stores to a field, and what begins with loads from one. A transfer therefore
 leaves what a tile's particles need of their stencils in ``stencils`` (lane vectors, one particle per lane),
-and sums over the nodes of one particle after the other take it from there. The parts of the material are
-:mod:`plab.sim.material`'s as bitcode; each takes its input from ``strains`` and leaves its results there.
+and sums over the nodes of one particle after the other take it from there. These sums
+(``tools/stencils.py``) and the parts of the material (``tools/material.py``) are LLVM's bitcode, of which
+Taichi would make slow code. Each part of the material takes its input from ``strains`` and leaves its results
+there.
 
 ``at`` and ``bases_at`` are the first entries of a thread's shares of ``stencils`` and ``bases``; ``source``,
 ``target`` and ``entry9`` those of a tile in states and in ``affine``; ``state_at`` and ``bar_at`` are the
 addresses of arrays of states.
 """
 
+import platform
+import sys
+
 import taichi as ti
 
-from plab.sim.cpu_bitcode import (
-    copy,
-    flow,
-    flow_adjoint,
-    gather,
-    gather_adjoint,
-    scatter,
-    strain,
-    strain_adjoint,
-    stress,
-    stress_adjoint,
-)
 from plab.sim.particle_phases import ParticlePhases, at_base, spline, spline_slope
 from plab.sim.storage import (
     ADJOINT_FIELD,
@@ -43,6 +36,7 @@ from plab.sim.storage import (
     STRAINS,
     WEIGHTS,
 )
+from plab.sim.taichi_internals import Bitcode, local_variable
 
 # Entries in ``bases``: node in the environment's grid; block and crossing in one number.
 NODE = 0
@@ -52,6 +46,37 @@ REACHING = tuple(
     sum(1 << crossing for crossing in range(8) if crossing & corner == corner) for corner in range(8)
 )
 """For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
+
+
+_function = Bitcode(f"{sys.platform}-{platform.machine().lower()}")
+
+
+@ti.func
+def call(
+    name: ti.template(), real: ti.template(), at: ti.template(), sizes: ti.template(), numbers: ti.template()
+):
+    """Call a function of the bitcode with addresses, integers and numbers.
+
+    Addresses are those of a node in a grid, of one particle's number in the first of some lane vectors, and
+    of a tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
+    """
+    a = [local_variable(ti.cast(address, ti.u64)) for address in at]
+    i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
+    n = [local_variable(ti.cast(number, real)) for number in numbers]
+    ti.static(_function(name, real))(*a, *i, *n)
+
+
+@ti.func
+def ask(
+    name: ti.template(), real: ti.template(), at: ti.template(), sizes: ti.template(), numbers: ti.template()
+):
+    """Call a function of the bitcode as :func:`call` does, and return its result, a number."""
+    a = [local_variable(ti.cast(address, ti.u64)) for address in at]
+    i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
+    n = [local_variable(ti.cast(number, real)) for number in numbers]
+    result = ti.cast(0.0, real)
+    ti.static(_function(name, real))(*a, *i, *n, result)
+    return result
 
 
 class TransferTiles(ParticlePhases):
@@ -137,7 +162,7 @@ class TransferTiles(ParticlePhases):
         grid, stencil = ti.get_addr(self.momentum, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + MOMENTUM_FIELD, lane)
         a = self.lane_in(self.affine, entry9, lane)
-        scatter(self.real, grid, stencil, value, a, self.axis, self.mass, self.dx)
+        call("scatter", self.real, [grid, stencil, value, a], [self.axis], [self.mass, self.dx])
 
     @ti.func
     def scatter_adjoint(self, bar_at, target, lane, grid_node, at):
@@ -146,30 +171,25 @@ class TransferTiles(ParticlePhases):
         grid, stencil = ti.get_addr(self.velocity_bar, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + ADJOINT_FIELD, lane)
         c_bar = self.lane_of(bar_at, target + AT_C, lane)
-        scatter(self.real, grid, stencil, value, c_bar, self.axis, 0.0, 4.0 * self.inv_dx)
+        call("scatter", self.real, [grid, stencil, value, c_bar], [self.axis], [0.0, 4.0 * self.inv_dx])
 
     @ti.func
     def gather_particle(self, state_at, source, target, lane, node, e, time, at):
         """Grid to particle: v, C and x after the substep; ``time`` is noted where the speed is not sane."""
-        speed = gather(
-            self.real,
+        addresses = [
             ti.get_addr(self.velocity, [node]),
             self.lane_in(self.stencils, at, lane),
             self.lane_of(state_at, source, lane),
             self.lane_of(state_at, target, lane),
-            self.axis,
-            self.dt,
-            self.x_max,
-            4.0 * self.inv_dx,
-        )
+        ]
+        speed = ask("gather", self.real, addresses, [self.axis], [self.dt, self.x_max, 4.0 * self.inv_dx])
         self.note_speed(speed, e, time)
 
     @ti.func
     def gather_particle_adjoint(self, state_at, source, after, bar_at, target, entry9, lane, node, at):
         """Adjoint of both transfers for one particle: of x and v in the array at ``bar_at``, and of A in
         ``affine``."""
-        gather_adjoint(
-            self.real,
+        addresses = [
             ti.get_addr(self.velocity, [node]),
             ti.get_addr(self.momentum_bar, [node]),
             self.lane_in(self.stencils, at, lane),
@@ -177,13 +197,9 @@ class TransferTiles(ParticlePhases):
             self.lane_of(state_at, source, lane),
             self.lane_of(state_at, after, lane),
             self.lane_of(bar_at, target, lane),
-            self.axis,
-            self.dt,
-            self.x_max,
-            self.dx,
-            self.inv_dx,
-            self.mass,
-        )
+        ]
+        numbers = [self.dt, self.x_max, self.dx, self.inv_dx, self.mass]
+        call("gather_adjoint", self.real, addresses, [self.axis], numbers)
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 
@@ -234,13 +250,15 @@ class MaterialTiles(ParticlePhases):
         super()._allocate()
 
     @ti.func
-    def strain_tile(self, state_at, source, e, entry9, at, whole: ti.template()):
-        """Strain of a tile, and its parameters, into ``strains``; whether the series serve all its lanes."""
+    def strain_tile(self, state_at, source, e, entry9, at, kind: ti.template()):
+        """Strain of a tile, and its parameters, into ``strains``, in a ``whole_strain`` with what the adjoint
+        needs; whether the series serve all its lanes."""
         p = self.parameters_of_tile(e, entry9)
         for i in ti.static(range(3)):
             self.strains[at + STRAIN_PARAMETERS + i] = p[i]
-        first = self.lane_in(self.strains, at, 0)
-        return strain(self.real, whole, first, self.lane_of(state_at, source, 0), self.dt, self.series)
+        addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
+        numbers = [self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
+        return ask(kind, self.real, addresses, [], numbers) > 0.0
 
     @ti.func
     def material_tile(
@@ -248,15 +266,15 @@ class MaterialTiles(ParticlePhases):
     ):
         """Return mapping and A = stress_scale tau + mass C for a tile, in the thread's share of ``strains``
         from entry ``at``; the new F is stored if ``update``."""
-        if self.strain_tile(state_at, source, e, entry9, at, False):
+        if self.strain_tile(state_at, source, e, entry9, at, "strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine = self.lane_in(self.affine, entry9, 0)
-            yields = stress(self.real, first, x, affine, self.stress_scale, self.mass)
+            rigid = ask("stress", self.real, [first, x, affine], [], [self.stress_scale, self.mass])
             if ti.static(update):
-                if yields:
-                    flow(self.real, first, self.lane_of(state_at, target, 0))
+                if rigid < 1.0:
+                    call("flow", self.real, [first, self.lane_of(state_at, target, 0)], [], [])
                 else:
-                    copy(self.real, first, self.lane_of(state_at, target + AT_F, 0))
+                    call("copy", self.real, [first, self.lane_of(state_at, target + AT_F, 0)], [], [])
         else:
             for lane in range(self.lanes):
                 a = self.spectral_material(state, source, target, lane, e, update)
@@ -268,18 +286,18 @@ class MaterialTiles(ParticlePhases):
         self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
     ):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
-        if self.strain_tile(state_at, source, e, entry9, at, True):
+        if self.strain_tile(state_at, source, e, entry9, at, "whole_strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
-            yields = stress_adjoint(self.real, first, affine, self.stress_scale)
-            if yields:
-                flow_adjoint(self.real, first, bars)
+            rigid = ask("stress_adjoint", self.real, [first, affine], [], [self.stress_scale])
+            if rigid < 1.0:
+                call("flow_adjoint", self.real, [first, bars], [], [])
             else:
-                g_bar = self.lane_in(self.strains, at + STRAIN_G_BAR, 0)
-                copy(self.real, self.lane_of(bar_at, target + AT_F, 0), g_bar)
+                f_bar = self.lane_of(bar_at, target + AT_F, 0)
+                call("copy", self.real, [f_bar, self.lane_in(self.strains, at + STRAIN_G_BAR, 0)], [], [])
             if ti.static(self.full_gradient):
                 self.parameter_tile_adjoint(entry9, at)
-            strain_adjoint(self.real, first, x, affine, bars, self.dt, self.mass)
+            call("strain_adjoint", self.real, [first, x, affine, bars], [], [self.dt, self.mass])
         else:
             for lane in range(self.lanes):
                 a_bar = self.load(self.affine, entry9, lane, 9)
