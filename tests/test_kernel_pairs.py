@@ -47,7 +47,7 @@ class Tiles(CpuPhases):
     def scatter_all(self, state: ARRAY, state_at: ti.u64):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.scatter_chunk(state, state_at, 0, 1, e, c, 1)
+                self.scatter_chunk(state, state_at, 0, 1, state, state_at, e, c, 1, False)
 
     @ti.kernel
     def gather_all(self, state: ARRAY, state_at: ti.u64):
@@ -59,7 +59,7 @@ class Tiles(CpuPhases):
     def scatter_adjoint_all(self, state: ARRAY, state_at: ti.u64, bar: ARRAY, bar_at: ti.u64):
         for e in range(self.batch):
             for c in range(self.chunks):
-                self.scatter_chunk_adjoint(state, state_at, 0, 1, bar, bar_at, e, c, 2)
+                self.scatter_chunk(state, state_at, 0, 1, bar, bar_at, e, c, 2, True)
 
     @ti.kernel
     def gather_adjoint_all(self, state: ARRAY, state_at: ti.u64, bar: ARRAY, bar_at: ti.u64):

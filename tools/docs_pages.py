@@ -52,7 +52,7 @@ PYTHON = {
     "simulator": (
         "Simulator",
         "The simulator, usable without configurations.",
-        ("plab.sim.simulator", "plab.sim.callbacks.Recording", "plab.sim.state"),
+        ("plab.sim.simulator", "plab.sim.tape.Recording", "plab.sim.state"),
     ),
     "methods": (
         "Methods",

@@ -2,10 +2,10 @@
 
 # First: it changes the decorators of the kernels that the others define.
 import plab.sim.taichi_internals  # noqa: F401
-from plab.sim.callbacks import Recording
 from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
 from plab.sim.state import Measures, Rollout, State
+from plab.sim.tape import Recording
 
 __all__ = [
     "DeviceError",

@@ -29,17 +29,14 @@ thread's work."""
 PADDING = 32
 """Distance of the teams' barrier counters, so that no two share a cache line."""
 
-PROBE_FIRST = 10
-"""So many launches after a choice the other team is tried again, then after twice as many."""
-
-PROBE = 100
-"""In the end the other team is tried every so many launches."""
+PROBE_FIRST, PROBE = 16, 100
+"""The slower team is tried again at this launch, after as many more, and in the end every so many."""
 
 RECENT = 3
 """A team is as fast as the fastest of so many of its launches: one that was interrupted says little."""
 
 CLEARLY = 1.5
-"""A team that takes so many times as long as the fastest at the start need not be tried again there."""
+"""A team that takes so many times as long as the first one is not tried ``RECENT`` times at the start."""
 
 
 class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases):
@@ -78,27 +75,36 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
     # -- phases of one chunk ------------------------------------------------------------------------
 
     @ti.func
-    def scatter_chunk(self, state: ti.template(), state_at, before, after, e, c, stamp):
-        """Material update and scatter of momentum and mass."""
+    def scatter_chunk(
+        self,
+        state: ti.template(),
+        state_at,
+        before,
+        after,
+        bar: ti.template(),
+        bar_at,
+        e,
+        c,
+        stamp,
+        adjoint: ti.template(),
+    ):
+        """Material update, and scatter of momentum and mass; on the way back (``adjoint``) without update,
+        and with scatter of the adjoint of the grid velocities."""
         grid_index = e * self.chunks + c
         at = self.bounded(grid_index * STENCILS)
         bases_at = self.bounded(grid_index * BASES)
         known = -1
         for tile in range(self.first_tile(c), self.first_tile(c + 1)):
             source = self.tile_entry(before, e, tile)
+            target = self.tile_entry(after, e, tile)
+            entry = self.tile_entry(0, e, tile)
             entry9 = self.bounded((e * self.tiles + tile) * 9)
-            self.material_tile(
-                state,
-                state_at,
-                source,
-                self.tile_entry(after, e, tile),
-                entry9,
-                e,
-                self.bounded(grid_index * STRAINS),
-                True,
-            )
+            at_strains = self.bounded(grid_index * STRAINS)
+            self.material_tile(state, state_at, source, target, entry9, e, at_strains, not adjoint)
             self.stencil_tile(state, source, at, bases_at, False)
             self.momentum_tile(state, source, entry9, at)
+            if ti.static(adjoint):
+                self.adjoint_tile(state, source, target, bar, entry, at)
             for lane in range(self.lanes_of(tile)):
                 key = self.bases[bases_at + KEY][lane]
                 if key != known:
@@ -106,6 +112,8 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
                     known = key
                 node = self.bounded(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
                 self.scatter_momentum(entry9, lane, node, at)
+                if ti.static(adjoint):
+                    self.scatter_adjoint(bar_at, entry, lane, node, at)
 
     @ti.func
     def grid_chunk(self, e, c, s):
@@ -146,34 +154,6 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
             for lane in range(self.lanes_of(tile)):
                 node = self.bounded(e * self.nodes + self.bases[bases_at + NODE][lane])
                 self.gather_particle(state_at, source, target, lane, node, e, time, at)
-
-    @ti.func
-    def scatter_chunk_adjoint(
-        self, state: ti.template(), state_at, before, after, bar: ti.template(), bar_at, e, c, stamp
-    ):
-        """Scatter momentum and mass again, and with them the adjoint of the grid velocities."""
-        grid_index = e * self.chunks + c
-        at = self.bounded(grid_index * STENCILS)
-        bases_at = self.bounded(grid_index * BASES)
-        known = -1
-        for tile in range(self.first_tile(c), self.first_tile(c + 1)):
-            source = self.tile_entry(before, e, tile)
-            target = self.tile_entry(after, e, tile)
-            entry = self.tile_entry(0, e, tile)
-            entry9 = self.bounded((e * self.tiles + tile) * 9)
-            at_strains = self.bounded(grid_index * STRAINS)
-            self.material_tile(state, state_at, source, target, entry9, e, at_strains, False)
-            self.stencil_tile(state, source, at, bases_at, False)
-            self.momentum_tile(state, source, entry9, at)
-            self.adjoint_tile(state, source, target, bar, entry, at)
-            for lane in range(self.lanes_of(tile)):
-                key = self.bases[bases_at + KEY][lane]
-                if key != known:
-                    self.mark(grid_index, key, stamp)
-                    known = key
-                node = self.bounded(grid_index * self.nodes + self.bases[bases_at + NODE][lane])
-                self.scatter_momentum(entry9, lane, node, at)
-                self.scatter_adjoint(bar_at, entry, lane, node, at)
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
@@ -354,11 +334,8 @@ class TeamChoice:
 
     def __init__(self, sizes: Sequence[int]) -> None:
         """Start with the first team, of so many threads; the others are tried in their order."""
-        self._sizes = tuple(dict.fromkeys(sizes))
-        self._seconds: dict[int, deque[float]] = {}
-        self._launches = 0
-        self._best: int | None = None
-        self._interval = self._probe_at = 0
+        self._seconds: dict[int, deque[float]] = {size: deque(maxlen=RECENT) for size in sizes}
+        self._launches, self._probe_at = 0, PROBE_FIRST
 
     def run(self, kernel: Callable, args: tuple) -> None:
         """Launch a kernel with a team's size before its other arguments."""
@@ -366,32 +343,21 @@ class TeamChoice:
         size = self._next()
         start = time.perf_counter()
         kernel(size, *args)
-        seconds = time.perf_counter() - start
         # The first launch compiles.
         if self._launches > 1:
-            self._seconds.setdefault(size, deque(maxlen=RECENT)).append(seconds)
+            self._seconds[size].append(time.perf_counter() - start)
 
     def _next(self) -> int:
+        fastest = {size: min(seconds, default=0.0) for size, seconds in self._seconds.items()}
+        tried = {size: len(seconds) for size, seconds in self._seconds.items()}
+        limit = CLEARLY * next(iter(fastest.values()))
         # As many launches of each at first: the first ones of a process are often interrupted.
-        tried = {size: len(self._seconds.get(size, ())) for size in self._sizes}
-        wanted = [size for size in self._sizes if tried[size] < RECENT and not self._out_of_question(size)]
-        if wanted:
-            return min(wanted, key=lambda size: tried[size])
-        best = min(self._sizes, key=lambda size: min(self._seconds[size]))
-        if best != self._best:
-            # What led to the choice may have been a moment's disturbance.
-            self._best, self._interval = best, PROBE_FIRST
-            self._probe_at = self._launches + PROBE_FIRST
-        elif self._launches >= self._probe_at:
-            self._interval = min(2 * self._interval, PROBE)
-            self._probe_at = self._launches + self._interval
-            return next((size for size in self._sizes if size != best), best)
-        return best
-
-    def _out_of_question(self, size: int) -> bool:
-        """Return whether a team's fastest launch is clearly slower than the first team's."""
-        first, own = (self._seconds.get(team, ()) for team in (self._sizes[0], size))
-        return size != self._sizes[0] and bool(own) and min(own) > CLEARLY * min(first)
+        if wanted := [size for size in fastest if tried[size] < RECENT and fastest[size] <= limit]:
+            return min(wanted, key=tried.__getitem__)
+        if self._launches >= self._probe_at:
+            self._probe_at += min(self._launches, PROBE)
+            return max(fastest, key=fastest.__getitem__)
+        return min(fastest, key=fastest.__getitem__)
 
 
 @ti.data_oriented
@@ -511,8 +477,20 @@ class CpuEngine(CpuPhases):
                         self.advance_manipulators(e, actions, poses, t, pose_before, pose_after)
                     for s in range(self.substeps):
                         before = slot + s * stride
+                        after = before + stride
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                            self.scatter_chunk(state, state_at, before, before + stride, e, c, stamp + s)
+                            self.scatter_chunk(
+                                state,
+                                state_at,
+                                before,
+                                before + stride,
+                                state,
+                                state_at,
+                                e,
+                                c,
+                                stamp + s,
+                                False,
+                            )
                         self.barrier(team, size)
                         if rank == 0:
                             self.collect_blocks(e, stamp + s)
@@ -522,7 +500,7 @@ class CpuEngine(CpuPhases):
                         self.barrier(team, size)
                         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
                             time = t * self.substeps + s
-                            self.gather_chunk(state, state_at, before, before + stride, e, c, time)
+                            self.gather_chunk(state, state_at, before, after, e, c, time)
 
     @ti.kernel
     def losses_kernel(
@@ -587,8 +565,8 @@ class CpuEngine(CpuPhases):
                         before, now = slot + s, stamp + 1 + back
                         if contact:
                             for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
-                                self.scatter_chunk_adjoint(
-                                    state, state_at, before, before + 1, bar, bar_at, e, c, now
+                                self.scatter_chunk(
+                                    state, state_at, before, before + 1, bar, bar_at, e, c, now, True
                                 )
                             self.barrier(team, size)
                             if rank == 0:

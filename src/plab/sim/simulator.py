@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from plab.errors import ArgumentError
 from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
-from plab.sim.callbacks import ClosedLoop, Recording, StateRecorder
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles
@@ -30,7 +29,7 @@ from plab.sim.state import (
     rest_state,
 )
 from plab.sim.taichi_internals import free_with
-from plab.sim.tape import Tape
+from plab.sim.tape import ClosedLoop, Recording, StateRecorder, Tape
 from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
 

@@ -1,30 +1,8 @@
 """Reaches into Taichi's internals: everything that its documented interface does not promise.
 
-Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. A patch is left out where
-another version lacks what it changes.
-
-Patches, with what they change and why:
-    :func:`tell_classes_quickly`: ``kernel_impl._inside_class``. The import of the simulator would take a
-        quarter longer.
-    :func:`hasten_tracing`: ``kernel_impl.getsourcelines`` and ``textwrap``,
-        ``ASTTransformerContext.get_pos_info``. Half of compiling from a warm cache serves messages only.
-    :func:`forget_arguments`: ``Kernel.mapper.mapping``. It would hold 100 kB of each simulator for good.
-    :func:`free_own_arrays_only`: ``ScalarNdarray.__init__`` and ``__del__``. Arrays from before ``ti.init``
-        would free memory that is in use.
-    :func:`free_with`: ``FieldsBuilder.finalize`` of one builder. Fields would never be freed.
-    :func:`watch_compiling`: ``kernel_impl._get_tree_and_ctx``, ``Kernel.launch_kernel``. Nothing else says
-        when a kernel is compiled.
-
-Other uses, and why:
-    :class:`Bitcode`: ``SourceBuilder.bc`` and ``mode``. The public way to them compiles C++ with clang.
-    :func:`address_of`: ``Program.get_ndarray_data_ptr_as_int``. Bitcode takes addresses.
-    :data:`local_variable`: ``impl.expr_init``. Bitcode takes lists of local variables.
-    :func:`cache_folder`: ``impl.default_cfg().offline_cache_file_path``. Locks of killed processes are
-        removed there.
-    :func:`cuda_available`: ``core.with_cuda``. ``ti.init`` falls back to the CPU instead of raising.
-
-Nothing of the standard library is changed. :mod:`plab.sim` imports this module before any kernel is defined,
-which changes Taichi's decorators; :func:`plab.sim.runtime.start_runtime` applies the other patches.
+Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. Each function says what it
+changes or uses, and why. Nothing of the standard library is changed. :mod:`plab.sim` imports this module
+before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
 """
 
 from __future__ import annotations
@@ -45,6 +23,7 @@ from typing import Any
 
 import taichi as ti
 from taichi.lang import _ndarray, impl, kernel_impl
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 from taichi.lang.source_builder import SourceBuilder
 
 from plab.files import cache_dir
@@ -56,15 +35,14 @@ BITCODE = Path(__file__).with_name("bitcode")
 # -- definitions of kernels ---------------------------------------------------------------------------------
 
 
-def tell_classes_quickly() -> None:
-    """Let Taichi's decorators tell functions from methods without a search for the source.
+def _tell_classes_quickly() -> None:
+    """Let Taichi's decorators tell functions from methods without a search for the source: patches
+    ``kernel_impl._inside_class``.
 
     For each function of a module Taichi asks ``inspect`` for the source of the module's importer, which looks
-    through all modules, each time, for a file that it does not know. Methods are told as before.
+    through all modules, each time, for a file that it does not know: a quarter of the simulator's import.
     """
-    tell = getattr(kernel_impl, "_inside_class", None)
-    if tell is None or hasattr(tell, "__wrapped__"):
-        return
+    tell = kernel_impl._inside_class
 
     @functools.wraps(tell)
     def inside_class(level_of_class_stackframe: int) -> bool:
@@ -76,30 +54,26 @@ def tell_classes_quickly() -> None:
     kernel_impl._inside_class = inside_class
 
 
-tell_classes_quickly()
+_tell_classes_quickly()
 
 
 # -- compiling ----------------------------------------------------------------------------------------------
 
 
 def hasten_tracing() -> None:
-    """Let Taichi find a function's source and tell an AST node's place quickly: both only serve messages.
+    """Let Taichi find a function's source and an AST node's place quickly: patches
+    ``kernel_impl.getsourcelines`` and ``textwrap``, and ``ASTTransformerContext.get_pos_info``.
 
-    Taichi looks the source up, among all modules of the process, and lays it out at each inlining, and wraps
-    an excerpt of it for each node: half of what compiling from a warm cache takes. What a future Taichi no
-    longer has is left as it is.
+    Both only serve messages. Taichi looks the source up, among all modules of the process, and lays it out at
+    each inlining, and wraps an excerpt of it for each node: half of what compiling from a warm cache takes.
     """
-    from taichi.lang.ast import ast_transformer_utils
-
-    find = getattr(kernel_impl, "getsourcelines", None)
-    if find is not None and not hasattr(find, "__wrapped__"):
-        kernel_impl.getsourcelines = _quick_sources(find)
-    if getattr(kernel_impl, "textwrap", None) is textwrap:
-        fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
-        kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
-    context = ast_transformer_utils.ASTTransformerContext
-    if hasattr(context, "get_pos_info"):
-        context.get_pos_info = _position
+    find = kernel_impl.getsourcelines
+    if hasattr(find, "__wrapped__"):
+        return
+    kernel_impl.getsourcelines = _quick_sources(find)
+    fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
+    kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
+    ASTTransformerContext.get_pos_info = _position
 
 
 def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -122,9 +96,11 @@ def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 @functools.cache
 def _last_lines(file: str) -> dict[int, int]:
-    """Where the functions and methods of a file end, by where they, or their first decorators, begin: sooner
-    found by parsing the file than by going through each function's tokens, as ``inspect`` does. Functions
-    within functions are left out."""
+    """Return the last line of each function and method of a file by its first one, decorators included.
+
+    Parsing the file is faster than reading each function's tokens, as ``inspect`` does. Functions within
+    functions are left out.
+    """
     found = {}
     with contextlib.suppress(SyntaxError):
         outer = ast.parse("".join(linecache.getlines(file))).body
@@ -148,24 +124,16 @@ def _position(context: Any, node: Any) -> str:
     return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
 
 
-_ENTRY = "_get_tree_and_ctx"
-"""Function that Taichi calls once per kernel or function that it compiles, and at no launch."""
-
-
 @contextlib.contextmanager
 def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Tell which kernel is being compiled while the ``with`` block lasts.
-
-    Launches of kernels that are compiled already cost nothing more. A future Taichi that compiles in another
-    way is not watched.
+    """Tell which kernel is being compiled while the ``with`` block lasts: patches
+    ``kernel_impl._get_tree_and_ctx``, which Taichi calls once per kernel or function that it compiles, and at
+    no launch.
 
     Args:
         tell: Takes the kernel's name when its compiling begins, and an empty name after its first launch.
     """
-    original = getattr(kernel_impl, _ENTRY, None)
-    if original is None:
-        yield
-        return
+    original = kernel_impl._get_tree_and_ctx
 
     @functools.wraps(original)
     def entry(function: Any, *args: Any, **kwargs: Any) -> Any:
@@ -174,11 +142,11 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
             _tell_after_launch(function, tell)
         return original(function, *args, **kwargs)
 
-    setattr(kernel_impl, _ENTRY, entry)
+    kernel_impl._get_tree_and_ctx = entry
     try:
         yield
     finally:
-        setattr(kernel_impl, _ENTRY, original)
+        kernel_impl._get_tree_and_ctx = original
 
 
 def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
@@ -199,21 +167,23 @@ def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 
 
 def forget_arguments() -> None:
-    """Let kernels forget what they were called with before Taichi started anew, as they forget their code.
+    """Let kernels forget what they were called with before Taichi started anew: clears ``Kernel.mapper``.
 
-    Else Taichi's own kernels hold all fields that they have ever filled or read, some 100 kB of a simulator.
+    Taichi's own kernels would hold all fields that they have ever filled or read, some 100 kB of a simulator.
     """
-    for kernel in getattr(impl.get_runtime(), "kernels", ()):
-        if hasattr(kernel, "mapper"):
-            kernel.mapper.mapping.clear()
+    for kernel in impl.get_runtime().kernels:
+        kernel.mapper.mapping.clear()
 
 
 def free_own_arrays_only() -> None:
-    """Let arrays of before Taichi started anew, which are gone, free nothing when Python forgets them: Taichi
-    would free what is at their addresses by now, an array that is in use, perhaps."""
+    """Let arrays of before Taichi started anew free nothing when Python forgets them: patches
+    ``ScalarNdarray.__init__`` and ``__del__``.
+
+    Taichi would free what is at their addresses by now, an array that is in use, perhaps.
+    """
     kind, current = _ndarray.ScalarNdarray, impl.get_runtime
-    make, free = kind.__init__, getattr(kind, "__del__", None)
-    if free is None or hasattr(free, "__wrapped__"):
+    make, free = kind.__init__, kind.__del__
+    if hasattr(free, "__wrapped__"):
         return
 
     @functools.wraps(make)
@@ -232,7 +202,8 @@ def free_own_arrays_only() -> None:
 
 
 def free_with(owner: object) -> None:
-    """Let the memory of all fields declared since the last kernel be freed together with their owner.
+    """Free the memory of all fields declared since the last kernel together with their owner: watches
+    ``FieldsBuilder.finalize`` of Taichi's current builder.
 
     A field keeps its memory until Taichi starts anew otherwise. Taichi's ``SNodeTree.destroy`` would forget
     all compiled kernels, those of other simulators, too.
@@ -252,7 +223,7 @@ def _free_tree(tree: Any) -> None:
 
 
 def address_of(array: ti.Ndarray) -> int:
-    """Return the address of an array's first number."""
+    """Return the address of an array's first number, which bitcode takes."""
     return int(impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr))
 
 
@@ -260,12 +231,12 @@ def address_of(array: ti.Ndarray) -> int:
 
 
 def cache_folder() -> Path:
-    """Return the folder of Taichi's cache of compiled kernels."""
+    """Return the folder of Taichi's cache of compiled kernels, in which killed processes leave locks."""
     return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
 
 
 def cuda_available() -> bool:
-    """Return whether Taichi can open a CUDA device."""
+    """Return whether Taichi can open a CUDA device; ``ti.init`` would fall back to the CPU without."""
     return bool(ti._lib.core.with_cuda())
 
 
@@ -278,7 +249,8 @@ _ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
 
 
 class Bitcode:
-    """Functions of a file of LLVM bitcode, which Taichi links into its kernels.
+    """Functions of a file of LLVM bitcode, which Taichi links into its kernels: sets ``SourceBuilder.bc`` and
+    ``mode``, as the public way to them compiles C++ with clang.
 
     Attributes:
         path: Where it is: a copy in plab's cache folder, if that can be written to. Taichi knows compiled
