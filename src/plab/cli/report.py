@@ -54,8 +54,7 @@ def main(argv: Sequence[str]) -> None:
         now = (runs.digest, quiet == 0)
         if now != before and not (options.follow and runs.table.empty and not quiet):
             made = _MAKERS[options.what](runs, options, out, command)
-            expected = len(runs.tasks) * len(runs.variants) * len(runs.methods) * len(runs.seeds)
-            print(f"{out}: {made} of {len(runs.table)} out of {expected} runs")
+            print(f"{out}: {made} of {len(runs.table)} out of {runs.expected} runs")
             for line in runs.left_out():
                 tell(line)
             before = now

@@ -121,8 +121,10 @@ def budget_curves(runs: Runs, series: Series) -> Drawing:
     """Return the score of the best actions so far against simulated environment steps, per task."""
     tasks, absent = _tasks_with_runs(runs)
     figure, panels = _panels(len(tasks))
-    for panel, task in zip(panels, tasks, strict=True):
+    for place, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
         panel.set_title(task)
+        if place % 5 == 0:
+            panel.set_ylabel("score of best actions")
         for name, strata in sorted(
             strata_of(series, task).items(), key=lambda one: runs.methods.index(one[0])
         ):

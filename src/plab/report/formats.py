@@ -115,6 +115,7 @@ _DOCUMENT = r"""% pdflatex tables.tex, twice: long tables align their columns th
 \usepackage[utf8]{inputenc}
 \usepackage[a4paper, margin=1.5cm]{geometry}
 \usepackage{booktabs}
+\usepackage{graphicx}
 \usepackage{longtable}
 \begin{document}
 INPUTS
@@ -138,7 +139,10 @@ def _latex_text(text: str) -> str:
 
 
 def _latex(table: Table) -> str:
-    """Return a table environment for ``\\input``; it needs booktabs, and longtable where it is long."""
+    """Return a table environment for ``\\input``; it needs booktabs, graphicx, and longtable where it is long.
+
+    A table wider than the page is scaled down, or set in smaller type where it is long.
+    """
     cells = table.cells.map(_latex_text).rename(columns=_latex_text)
     style = cells.style.hide(axis="index")
     if table.bold is not None:
@@ -159,8 +163,26 @@ def _latex(table: Table) -> str:
     if table.long:
         # The pages after the first need no caption.
         text = re.sub(r"\\caption\[\].*\n", "", text)
+        if _characters(table) > _WIDEST:
+            size = r"\tiny\setlength{\tabcolsep}{3pt}"
         return f"{{{size}\n{text}}}\n"
-    return text.replace("\\centering\n", f"\\centering\n{size}\n", 1)
+    text = text.replace("\\centering\n", f"\\centering\n{size}\n", 1)
+    fitted = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%" + "\n"
+    text = text.replace(r"\begin{tabular}", fitted + r"\begin{tabular}", 1)
+    return text.replace(r"\end{tabular}", r"\end{tabular}}", 1)
+
+
+_WIDEST = 115
+"""Characters of a row, three of them per gap, that fit on a page in footnote size."""
+
+
+def _characters(table: Table) -> int:
+    widths = [
+        0 if name in _COLUMN else max(map(len, [str(name), *table.cells[name].astype(str)]))
+        for name in table.cells
+    ]
+    running = sum(name in _COLUMN for name in table.cells)
+    return sum(widths) + 3 * len(widths) + 65 * running
 
 
 _RULES = {"l": "---", "r": "---:"}

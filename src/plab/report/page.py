@@ -87,8 +87,10 @@ class Page:
             "columns": list(_COLUMNS),
             "every": _LOOK_EVERY,
         }
+        best = {one.name: best_of_tasks([one])[one.task][1] for one in self.shown}
         self._configurations: list[dict[str, Any]] = [
             {"name": f"{task}-v{variant}", "task": task, "variant": variant}
+            | {"best": best.get(f"{task}-v{variant}")}
             | {"cells": _compared(runs, ours, theirs, (task, variant))}
             for task in tasks
             for variant in runs.variants

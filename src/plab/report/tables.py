@@ -200,7 +200,7 @@ def _iou_tables(runs: Runs, unit: str, what: str, keys: list[tuple[str, ...]]) -
         notes = [f"Mean ± standard deviation {what}.", _BOLD, *more]
         heading = f"{title}, {owner}"
         made.append(
-            Table(name, cells.source, heading, shown, pd.DataFrame(data), bold, notes, len(keys) > 40)
+            Table(name, cells.source, heading, shown, pd.DataFrame(data), bold, notes, len(keys) > 60)
         )
     compared, data = [], []
     for key in keys:

@@ -20,14 +20,14 @@ const short = (value) => {
 
 /**
  * Draw curves, each with x, y, low and high, into an SVG, and show their values where the pointer is.
- * look: log (of x), bottom and top (of y, where they are given), label (of x), heading (what the tip says of x).
+ * look: log (of x), bottom and top (of y, where they are given), label (of x), side (label of y), heading (what the tip says of x).
  */
 function drawCurves(svg, tip, curves, look) {
   const { width, height } = svg.getBoundingClientRect(), { log } = look;
   tip.hidden = true;
   if (width < 80) return;
   svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-  const room = { left: 46, right: 12, top: 8, bottom: 40 };
+  const room = { left: 62, right: 12, top: 8, bottom: 40 };
   const xs = curves.flatMap(({ x }) => x).filter((x) => !log || x > 0);
   if (!xs.length) { svg.replaceChildren(make("text", { x: width / 2, y: height / 2, "text-anchor": "middle" }, "nothing to draw")); return; }
   const [x0, x1] = [Math.min(...xs), Math.max(...xs)];
@@ -45,6 +45,8 @@ function drawCurves(svg, tip, curves, look) {
     parts.push(make("text", { x: X(x), y: height - room.bottom + 16, "text-anchor": "middle" }, short(x)));
   }
   parts.push(make("text", { x: (room.left + width - room.right) / 2, y: height - 6, "text-anchor": "middle" }, look.label));
+  const middle = (room.top + height - room.bottom) / 2;
+  parts.push(make("text", { x: 14, y: middle, "text-anchor": "middle", transform: `rotate(-90 14 ${middle})` }, look.side));
   for (const { name, dashes, x, y, low, high } of curves) {
     const at = x.map((value, k) => k).filter((k) => !log || x[k] > 0);
     const path = (values) => at.map((k) => `${X(x[k]).toFixed(1)} ${Y(values[k]).toFixed(1)}`);

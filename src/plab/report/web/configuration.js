@@ -34,7 +34,7 @@ function showConfiguration(one) {
   place.append(pictures(one));
   fetchDetails(one.name, (details) => {
     if (!details) { place.append(make("p", { class: "missing" }, `data/${one.name}.js is not there: make the page again.`)); return; }
-    place.append(...films(one, details), ...chart(details), ...runTable(details));
+    place.append(...films(one, details), ...chart(details), ...runTable(one, details));
   });
   return place;
 }
@@ -64,7 +64,7 @@ function films(one, details) {
   return [head, grid, make("p", { class: "note" }, "Replayed in the hard contact model; pictures show the last state.")];
 }
 
-function runTable(details) {
+function runTable(one, details) {
   const body = methods.filter(({ name }) => details[name]).flatMap(({ name, label }) => details[name].runs.map((run) => {
     const copy = make("button", { type: "button", class: "copy", title: run.command }, "copy command");
     copy.addEventListener("click", async () => {
@@ -80,7 +80,7 @@ function runTable(details) {
   }));
   const heads = ["method", "seed", "score", "soft IoU", "best loss", "best row", "time", "computed on", "SHA-256", ""];
   const head = make("tr", {}, ...heads.map((text, at) => make("th", { class: at > 0 && at < 7 ? "number" : "" }, text)));
-  const runs = Object.values(details).flatMap((own) => own.runs), best = runs.reduce((a, b) => (b.score > a.score ? b : a));
+  const chosen = details[one.best], best = chosen.runs.find((run) => run.hash === chosen.best);
   const commands = [best.command, `python -m plab.render ${best.path} --output rollout.mp4`].map((text) => make("code", {}, text));
   return [make("h2", {}, "Runs"), make("div", { class: "scroll" }, make("table", { class: "plain runs" }, make("thead", {}, head), make("tbody", {}, ...body))),
     make("p", { class: "note" }, "Times of runs that were computed at once are each one's share. The run with the highest score is made again, and drawn, by"), make("div", { class: "commands" }, ...commands)];
@@ -107,7 +107,7 @@ function chart(details) {
     return [{ name, label, dashes, x, y, low: y.map((value, k) => value - std[k]), high: y.map((value, k) => Math.min(value + std[k], ceiling)) }];
   });
   const [box, draw] = chartBox("curves", shown, curveView.hidden, curves, () => ({
-    log: curveView.scale === "log", bottom: curveView.column === "loss" ? null : 0, top: curveView.column === "score" ? 1 : null, label: labels[curveView.axis],
+    log: curveView.scale === "log", bottom: curveView.column === "loss" ? null : 0, top: curveView.column === "score" ? 1 : null, label: labels[curveView.axis], side: labels[curveView.column] ?? curveView.column,
     heading: (x) => `${curveView.axis === "episodes" ? Math.round(x) : short(x)} ${curveView.axis}`,
   }));
   redraws.add(draw);

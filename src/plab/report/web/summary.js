@@ -71,7 +71,7 @@ function showAggregates() {
   });
   const [box] = chartBox("performance profile", shown, new Set(),
     (visible) => visible.map(({ name, label, dashes }) => { const [y, low, high] = profile.methods[name]; return { name, label, dashes, x: profile.x, y, low, high }; }),
-    () => ({ log: false, bottom: 0, top: 1, label: "score", heading: (x) => `share of runs above ${fixed(x)}` }));
+    () => ({ log: false, bottom: 0, top: 1, label: "score", side: "share of runs above", heading: (x) => `share of runs above ${fixed(x)}` }));
   const panels = [
     make("div", { class: "panel", id: "mean" }, make("h3", {}, "Interquartile mean"), make("div", { class: "card" }, ...dots)),
     make("div", { class: "panel", id: "profile" }, make("h3", {}, "Performance profile: share of runs above a score"), box),
