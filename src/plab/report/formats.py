@@ -139,7 +139,7 @@ def _latex_text(text: str) -> str:
 
 
 def _latex(table: Table) -> str:
-    """Return a table environment for ``\\input``; it needs booktabs, graphicx, and longtable where it is long.
+    """Return a table environment for ``\\input``, which needs booktabs, graphicx, longtable.
 
     A table wider than the page is scaled down, or set in smaller type where it is long.
     """
