@@ -1,7 +1,7 @@
-"""The simulator as functions that PyTorch differentiates.
+"""Simulator as functions that PyTorch differentiates.
 
 Trajectory losses, differentiable by the actions; states for losses of your own, differentiable by initial
-state and material, too; and the gradient of a policy that reacts to what it sees. With ``sim.device=cuda``
+state and material, too; and the gradient of a policy that reacts to observations. With ``sim.device=cuda``
 tensors stay on the device.
 """
 
@@ -121,8 +121,8 @@ def simulate(
         mass: Whether to return mass tensors.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] where
             bodies have materials of their own; as they are if None.
-        **initial: What the initial state is to have: any of the fields of :class:`plab.sim.State`. The
-            simulator keeps it, as it does the material.
+        **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. The simulator keeps
+            them, as it does the material.
 
     Returns:
         The states, like ``actions`` in type and device.
@@ -244,7 +244,7 @@ def policy_gradient(
         value: Maps observations to values, shape [batch]; its parameters get no gradient.
 
     Returns:
-        What was observed and done; nothing of it has a gradient.
+        Observations, actions and losses, without gradients.
 
     Raises:
         ValueError: If an action has another shape or is not finite.
@@ -261,10 +261,10 @@ def policy_gradient(
 
 
 class _Walk:
-    """A policy's way through a stretch of episodes, and back.
+    """A policy in a stretch of episodes, forward and backward.
 
     Attributes:
-        like: What tensors are like: the policy's first parameter.
+        like: The policy's first parameter, whose type and device all tensors have.
         seen: Observations before each step and after the last.
         done: Actions.
     """
@@ -285,7 +285,7 @@ class _Walk:
         self.done: list[torch.Tensor] = []
 
     def choose(self, t: int, observation: Any) -> Any:
-        """Look, and act unless the stretch is over; what was done is kept as a function of what was seen."""
+        """Observe, and act unless the stretch is over; keep the action as a function of the observation."""
         self.seen.append(torch.as_tensor(observation).to(self.like).requires_grad_())
         if t == self._steps:
             return None
@@ -294,7 +294,7 @@ class _Walk:
         return self._given(self.done[t])
 
     def react(self, t: int, actions_bar: Any) -> Any:
-        """Add to the parameters' gradients; return the derivative by what was seen."""
+        """Add to the parameters' gradients; return the derivative by the observation."""
         if t == self._steps:
             return self._look_ahead()
         bar = torch.as_tensor(actions_bar).to(self.like)

@@ -1,4 +1,4 @@
-"""Mistakes: what can be put right by whoever uses plab, and how it is told."""
+"""Errors for mistakes that the user can put right, and their messages."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ __all__ = [
 ]
 
 TRACEBACK = "PLAB_TRACEBACK"
-"""Variable of the environment that lets a bug through with its traceback."""
-
+"""Environment variable that shows bugs with their tracebacks."""
 
 LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>(?<![^\s(])'[^']{400})[^']+(?=')")
-"""What a message says too much of: a word, or what stands in quotation marks."""
+"""Overlong parts of a message: a word, or text in quotation marks."""
 
 
 class PlabError(Exception):
@@ -47,7 +46,7 @@ class ArgumentError(PlabError, ValueError):
 
 
 class ConfigError(PlabError, ValueError):
-    """A configuration that cannot run; the message is one line that says what is wrong and what would do."""
+    """A configuration that cannot run; the message is one line with the problem and the remedy."""
 
 
 def pick(name: str, names: Sequence[str]) -> str:
@@ -58,16 +57,16 @@ def pick(name: str, names: Sequence[str]) -> str:
 
 
 def tell(message: str) -> None:
-    """Print a line on standard error, as every mistake and warning is told."""
+    """Print a line on standard error, the form of all mistakes and warnings."""
     with suppress(BrokenPipeError):
         print(f"plab: {' '.join(message.split())}", file=sys.stderr)
 
 
 def out_of_memory(error: MemoryError) -> str:
-    """Return one line about memory that is lacking; Python's own error says nothing."""
+    """Return one line about lacking memory; Python's own error says nothing."""
     return str(error) or "this computer has too little memory for that: close something, or ask for less"
 
 
 def traceback_wanted() -> bool:
-    """Whether bugs are to be shown with their tracebacks."""
+    """Return whether bugs are shown with their tracebacks."""
     return bool(os.environ.get(TRACEBACK))

@@ -33,10 +33,10 @@ __all__ = [
 ]
 
 OBSERVED_PARTICLES = 200
-"""Particles in an observation, at least: every (particle count // this)-th is taken."""
+"""Least number of particles in an observation: every (particle count // this)-th is observed."""
 
 TARGET_ENTRIES = 14
-"""Numbers that :func:`target_observation` gives."""
+"""Length of :func:`target_observation`."""
 
 SMOOTHING = 1 / 32
 """Standard deviation of the Gaussian by which :func:`mass_change` smooths [domain units]."""
@@ -50,14 +50,14 @@ TARGET_MASS = 1e-4
 
 @dataclass(frozen=True)
 class Scores:
-    """How close an episode came to the target.
+    """Scores of an episode.
 
     Attributes:
         iou_initial: Soft IoU of the initial mass tensor and the target.
         iou_final: Soft IoU of the final mass tensor and the target.
         iou_target_self: Soft IoU of the target and itself, well below 1: the most that can be reached.
         score_printed: The paper's printed formula ``(iou_final - iou_initial) / (1 - iou_initial)``.
-        score: What the paper's tables hold: ``(iou_final - iou_initial) / (iou_target_self - iou_initial)``,
+        score: Score of the paper's tables: ``(iou_final - iou_initial) / (iou_target_self - iou_initial)``,
             clamped to [0, 1].
     """
 
@@ -163,7 +163,7 @@ def soft_iou(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
-    """Judge an episode by its first and last mass tensor.
+    """Score an episode by its first and last mass tensor.
 
     Args:
         initial: Mass tensor at the start, shape [n, n, n].
@@ -177,7 +177,7 @@ def scores(initial: ArrayLike, final: ArrayLike, target: ArrayLike) -> Scores:
 
 
 def scores_from_iou(start: float, end: float, best: float) -> Scores:
-    """Judge an episode by soft IoUs with its target.
+    """Score an episode by soft IoUs with its target.
 
     Where the initial shape is as good as the target itself, so that nothing can be gained and the formulas
     divide by zero, a score is 1 if the final shape is still as good, and 0 otherwise.
@@ -195,7 +195,7 @@ def scores_from_iou(start: float, end: float, best: float) -> Scores:
 
 
 def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
-    """Return the numbers by which :func:`batch_scores` judges, shape [4, 2, batch].
+    """Return the constants of :func:`batch_scores`, shape [4, 2, batch].
 
     Args:
         start: Soft IoUs of the initial mass tensors, shape [batch].
@@ -204,13 +204,13 @@ def score_scale(start: ArrayLike, best: ArrayLike) -> np.ndarray:
     start = np.broadcast_to(np.asarray(start, np.float64), (2, np.size(start)))
     best = np.stack([np.asarray(best, np.float64), np.ones_like(start[0])])
     nothing_to_gain = best - start <= 1e-12
-    # Divided by infinity the share is 0, to which what counts then is added.
+    # Division by infinity makes the share 0; batch_scores adds 0 or 1 to it.
     way = np.where(nothing_to_gain, np.inf, best - start)
     return np.stack([start, way, best - 1e-12, nothing_to_gain])
 
 
 def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
-    """Judge many episodes as :func:`scores_from_iou` judges one.
+    """Score many episodes as :func:`scores_from_iou` scores one.
 
     Args:
         scale: From :func:`score_scale`, an array or a tensor like ``end``.
@@ -226,7 +226,7 @@ def batch_scores(scale: Any, end: Any) -> tuple[Any, Any]:
 
 def mass_change(start: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return where mass has to arrive (above 0) and to leave (below), by node, as shares of all mass, shape
-    [n, n, n]; both mass tensors, of whatever mass, are smoothed, being of particles drawn at random."""
+    [n, n, n]. Both mass tensors are normalised and smoothed: they are of particles drawn at random."""
     # Imported here: SciPy's start-up would be paid by every `--help`.
     from scipy.ndimage import gaussian_filter
 

@@ -1,8 +1,8 @@
 """Objects that a configuration names as ``module:NAME``, plab's own and those of files outside it.
 
 A module is looked for where Python looks, then in the config folder of the command line (``--config-dir``)
-and in the folder above it. So a method or anything else of one's own is a Python file there, and what is
-recorded of it is this text alone, which is the same on every computer.
+and in the folder above it: a method of your own is a Python file there. Results record the text alone, which
+is the same on every computer.
 """
 
 from __future__ import annotations

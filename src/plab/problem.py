@@ -1,4 +1,4 @@
-"""A batch of configurations as one problem: scenes, targets, simulator, and what actions are judged by.
+"""Problems: scenes, targets, simulator and objective of a batch of configurations.
 
 Runners and environments start here. All configurations of a batch share the kind of scene (numbers of
 particles and manipulators, grid); variants of one task do.
@@ -50,7 +50,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Episodes:
-    """What a rollout of all environments gave.
+    """Result of a rollout of all environments, step by step.
 
     Attributes:
         term_names: Names of the terms of the loss.
@@ -61,7 +61,7 @@ class Episodes:
         final_mass: Mass tensors of the last states, shape [batch, n, n, n], or None.
         scores: How close each environment came.
         gradient: Gradient of the sum of the step losses, shape [batch, T, A], or None.
-        failures: Environments that broke off, and when and why; their numbers mean nothing.
+        failures: Environments that broke off, with time and reason; their numbers mean nothing.
     """
 
     term_names: tuple[str, ...]
@@ -77,14 +77,14 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Trials:
-    """What many sequences of actions gave; arrays, or CUDA tensors if the actions were one.
+    """Totals of many sequences of actions; arrays, or CUDA tensors if the actions were one.
 
     Attributes:
-        measures: What each episode is measured by, shape [batch] each: ``loss`` and its terms, ``reward``,
-            ``iou`` and ``score``, as in the columns of results.
+        measures: Measures of the episodes, shape [batch] each: ``loss`` and its terms, ``reward``, ``iou``
+            and ``score``, as in the columns of results.
         final_loss: Weighted loss of the last step, shape [batch].
         gradient: Gradient of ``loss``, shape [batch, T, A], or None.
-        failures: Environments that broke off, and when and why; their numbers mean nothing.
+        failures: Environments that broke off, with time and reason; their numbers mean nothing.
     """
 
     measures: dict[str, Any]
@@ -131,7 +131,7 @@ def make_simulator(
     """
     cfgs = [cfgs] if isinstance(cfgs, Config) else cfgs
     sim, method = cfgs[0].sim, cfgs[0].method
-    settings = {
+    settings: dict[str, Any] = {
         "terms": make_terms(method.loss_weights, method.loss_terms),
         "precision": sim.precision,
         "device": sim.device,
@@ -142,8 +142,8 @@ def make_simulator(
 
 
 def kinds_of(cfgs: Sequence[Config]) -> list[str]:
-    """Return texts that are equal where configurations have the same environment: where they differ in seed,
-    files and how the method learns only."""
+    """Return texts that are equal for configurations of the same environment: those that differ only in seed,
+    files and learning."""
 
     def text(cfg: Config) -> str:
         sections = (asdict(part) for part in (cfg.task, cfg.protocol, cfg.sim, cfg.targets))
@@ -183,7 +183,7 @@ class Problem:
             plab.sim.DeviceError: If CUDA was asked for and is not there.
         """
         _require_alike(cfgs)
-        # Vectorised environments and the seeds of a sweep are many of one kind: what is alike is made once.
+        # Vectorised environments and seeds of a sweep are often alike: what they share is made once.
         kinds = kinds_of(cfgs)
         first = {kind: kinds.index(kind) for kind in kinds}
         self.simulator = simulator or make_simulator(cfgs)
@@ -218,8 +218,8 @@ class Problem:
         return batch_scores(self._scale.like(iou), iou)
 
     def try_out(self, actions: np.ndarray | torch.Tensor, *, gradient: bool) -> Trials:
-        """Run actions from the initial states, in the current contact model, and sum up what they give; with
-        CUDA tensors nothing passes through the host but that which has broken off.
+        """Run actions from the initial states, in the current contact model, and total their measures. CUDA
+        tensors stay on the device, failures excepted.
 
         Args:
             actions: Actions, shape [batch, T, A]; clipped to [-1, 1].
@@ -236,7 +236,7 @@ class Problem:
             rewards(result.initial_terms, terms, self._held_weights.like(terms)),
         )
         score, _ = self.scores_of(iou)
-        # One after the other: in which order sum() adds depends on how many episodes there are.
+        # cumsum() adds in order; the order of sum() depends on the number of episodes.
         total, summed, reward = (values.cumsum(1)[:, -1] for values in (loss, terms, reward))
         by_term = {f"loss_{name}": summed[:, k] for k, name in enumerate(self.term_names)}
         measures = {"loss": total, **by_term, "reward": reward, "iou": iou, "score": score}
@@ -275,14 +275,14 @@ class Problem:
         )
 
     def scores(self, mass: np.ndarray) -> list[Scores]:
-        """Judge states by their mass tensors, shape [batch, n, n, n]."""
+        """Score states by their mass tensors, shape [batch, n, n, n]."""
         return [self._score(e, final) for e, final in enumerate(mass)]
 
     def _score(self, e: int, mass: np.ndarray) -> Scores:
         return scores(self.initial_mass[e], mass, self.target_mass[e])
 
     def _final_scores(self, result: Rollout, final_mass: np.ndarray | None) -> list[Scores]:
-        """Judge the last states, by their mass tensors if there are any; what broke off has no score."""
+        """Score the last states, by their mass tensors if there are any; failures have none."""
         judged = []
         for e, (first, iou) in enumerate(zip(self.initial_scores, result.step_iou[:, -1], strict=True)):
             if final_mass is None or e in result.failures:
@@ -322,7 +322,7 @@ def make_targets(cfgs: Sequence[Config], simulator: Simulator, *, rebuild: bool 
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:
-    """Refuse configurations of which one simulator could only follow the first."""
+    """Refuse configurations that cannot share a simulator."""
     if isinstance(cfgs, Config):
         raise ConfigError("give a list of configurations, one per environment: [cfg]")
     if not cfgs:

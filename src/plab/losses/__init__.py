@@ -1,8 +1,7 @@
-"""Losses: what a state is judged by and differentiated for, a file per term.
+"""Losses: functions of a state, and their gradients, one file per term.
 
-:data:`TERMS` is the list of terms. All that depends on which there are (columns of results, entries of
-``info``, labels of reports) follows from the weights that a configuration gives. Terms are imported when they
-are made: to know their names needs no Taichi.
+:data:`TERMS` lists the terms. Columns of results, entries of ``info`` and labels of reports follow from the
+weights of a configuration. A term is imported when it is made: its name needs no Taichi.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ def make_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None =
 
     Args:
         weights: Weight of each term by its name, each at least 0; a term of weight 0 is left out.
-        choices: Which term a name stands for, where it is not one of that name: a name of :data:`TERMS`, or a
-            class of your own as ``module:Class``.
+        choices: Terms by the names of their weights, where these differ: a name of :data:`TERMS`, or a class
+            of your own as ``module:Class``.
 
     Returns:
         New terms, for one simulator.

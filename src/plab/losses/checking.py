@@ -1,4 +1,4 @@
-"""Whether a term's gradient is that of its measure, by central differences."""
+"""Check of a term's gradient by central differences of its measure."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from plab.sim import Simulator, State
 __all__ = ["check_gradient"]
 
 STEP = 1e-6
-"""Half the way of a central difference, along directions of unit variance."""
+"""Half the step of a central difference, along directions of unit variance."""
 
 DISTURBANCE = 0.02
-"""Standard deviation of how far manipulators are moved from where the scene has them [domain units]."""
+"""Standard deviation of the manipulators' displacements from their places in the scene [domain units]."""
 
 
 def check_gradient(

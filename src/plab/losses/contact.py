@@ -1,4 +1,4 @@
-"""How far the moving manipulators are from the body: three terms of the distances d_p of all particles p.
+"""Contact terms: three functions of the distances d_p between a moving manipulator and all particles p.
 
 * ``nearest``: ``D^2``, D the distance of the nearest particle, and its gradient.
 * ``all``: the same measure; as gradient ``2 D sum grad d_p`` over all particles outside. No function has it.

@@ -1,4 +1,4 @@
-"""How much mass is where the target has none, and the reverse: ``sum |S - S*|``."""
+"""Density term, ``sum |S - S*|``: mass where the target has none, and the reverse."""
 
 import numpy as np
 import taichi as ti

@@ -1,4 +1,4 @@
-"""How well mass and target overlap: what scores are made of. Measured, but no part of the loss."""
+"""Overlap of mass and target, from which scores are computed; measured, but not part of the loss."""
 
 from typing import Any
 

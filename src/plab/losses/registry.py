@@ -1,4 +1,4 @@
-"""Which terms of the loss there are, by name. Nothing is imported: to know their names needs no Taichi."""
+"""Names of the terms of the loss, without importing the terms, which need Taichi."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TERMS = {
 """Terms by name, as ``module:Class``."""
 
 CHOICES = {"contact": "nearest"}
-"""Which term a weight's name stands for where it is none of :data:`TERMS` and nothing else is said."""
+"""Default terms of weights whose names are not in :data:`TERMS`."""
 
 
 def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""How far mass is from the target: ``sum sdf* S``."""
+"""Distance term, ``sum sdf* S``: mass times its distance to the target."""
 
 import taichi as ti
 

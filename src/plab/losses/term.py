@@ -1,8 +1,8 @@
-"""What a term of the loss is: three kinds, by what they are a function of.
+"""Base classes of the terms of the loss: functions of grid nodes, of particles, or of distances.
 
 A term is a class with a few functions that Taichi compiles into the simulator's kernels, for the CPU and for
-CUDA alike. It knows a state, not how the simulator works: where the mass tensor's nodes are, where particles
-are and how fast, how far they are from manipulators. The simulator does the sums, forward and back.
+CUDA alike. It depends on the state alone: masses of nodes, positions and velocities of particles, distances
+to manipulators. The simulator sums up, forward and backward.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Bodies of plasticine: spheres, boxes, and what a mesh bounds; and what they are made of."""
+"""Bodies of plasticine: spheres, boxes and solids bounded by meshes; and their materials."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 BODY_SHAPES = ("sphere", "box", "mesh")
-"""What :attr:`Body.shape` may be."""
+"""Values of :attr:`Body.shape`."""
 
 MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
 """Fields of a :class:`Material`, in the order in which gradients have them."""
@@ -48,7 +48,7 @@ class SceneError(PlabError, ValueError):
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of.
+    """Elastoplastic material of a body.
 
     Attributes:
         youngs_modulus: Young's modulus E.
@@ -77,14 +77,7 @@ class Material:
         return 3.0 * self.lame_lambda + 2.0 * self.shear_modulus
 
     def validate(self, label: str = "") -> None:
-        """Check that it can be simulated.
-
-        Args:
-            label: What begins the message.
-
-        Raises:
-            SceneError: If a value is out of range.
-        """
+        """Raise SceneError, with a message that begins with ``label``, if a value is out of range."""
         young, nu = self.youngs_modulus, self.poisson_ratio
         if not 0 < young < math.inf:
             raise SceneError(f"{label}youngs_modulus {young:g} must be positive and finite")
@@ -118,7 +111,7 @@ class Body:
 
     @property
     def own_material(self) -> dict[str, float]:
-        """What it does not share with the scene, by the names of :data:`MATERIAL_KEYS`."""
+        """Parameters that it does not share with the scene, by the names of :data:`MATERIAL_KEYS`."""
         values = {key: getattr(self, key) for key in MATERIAL_KEYS}
         return {key: value for key, value in values.items() if value is not None}
 
@@ -137,8 +130,8 @@ class MeshBody(Body):
     """A body in the shape of a mesh.
 
     Attributes:
-        mesh: The mesh. ``center`` is where the centre of its bounding box is, ``size`` the longest edge of
-            that, in ``(longest,)``.
+        mesh: The mesh; ``center`` is the centre of its bounding box, ``size`` is ``(longest,)``, the longest
+            edge of that box.
     """
 
     mesh: Mesh
@@ -162,7 +155,7 @@ def make_body(
     sha256: str | None = None,
     **material: float | None,
 ) -> Body:
-    """Make a body of what a configuration says, reading the file of a mesh.
+    """Make a body from a configuration's values, reading the file of a mesh.
 
     Args:
         shape: ``sphere``, ``box`` or ``mesh``.
@@ -171,12 +164,12 @@ def make_body(
             units].
         particles: Number of particles.
         file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
-        sha256: What the file has to hold, likewise.
-        **material: What it does not share with the scene, by the names of :data:`MATERIAL_KEYS`.
+        sha256: SHA-256 of the file, likewise.
+        **material: Parameters that it does not share with the scene, by the names of :data:`MATERIAL_KEYS`.
 
     Raises:
         SceneError: If a mesh has no file, or something else has one.
-        plab.files.ShapeError: If the file does not do.
+        plab.files.ShapeError: If the file cannot be used.
     """
     if shape != "mesh":
         if file is not None:

@@ -1,4 +1,4 @@
-"""Target recipes: what shape the plasticine is to take, as a mass tensor.
+"""Target recipes: the shapes that the plasticine is to take, as mass tensors.
 
 A recipe is a dataclass; :data:`RECIPES` lists them by the name that a task's YAML gives as ``target.recipe``.
 The remaining keys of ``target`` are the dataclass's fields. ``python -m plab.targets`` builds the targets of

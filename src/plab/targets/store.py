@@ -1,4 +1,4 @@
-"""Files of mass tensors: the cache of simulated targets, and the original release's."""
+"""Files of mass tensors: cached simulated targets, and targets of the original release."""
 
 from __future__ import annotations
 
