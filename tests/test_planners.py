@@ -205,10 +205,10 @@ def test_a_search_in_soft_contact_shows_the_better_half_in_the_hard_model() -> N
 
 
 def test_costs_and_curves() -> None:
-    measures = {"loss": torch.tensor([3.0, 1.0, 2.0, 0.0]), "score": torch.tensor([0.5, 0.0, 0.0, 0.9])}
+    measures = {"loss": torch.tensor([3.0, 2.0, 1.0, 0.0]), "score": torch.tensor([0.5, 0.0, 0.0, 0.9])}
     broken = torch.tensor([False, False, False, True])
     answer = Answer(measures, torch.tensor([1.0, 4.0, 2.0, 0.0]), None, broken)
-    for objective, order in (("loss", [1, 2, 0, 3]), ("final", [0, 2, 1, 3]), ("score", [0, 1, 2, 3])):
+    for objective, order in (("loss", [2, 1, 0, 3]), ("final", [0, 2, 1, 3]), ("score", [0, 2, 1, 3])):
         assert answer.cost(objective).argsort().tolist() == order
     knots = torch.tensor([[[0.0], [1.0], [-3.0]]], dtype=torch.float64)
     assert actions_of(knots, 6, "constant").flatten().tolist() == [0.0, 0.0, 1.0, 1.0, -1.0, -1.0]
