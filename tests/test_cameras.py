@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 
+import plab
 from plab.scenes import Body, Camera, Manipulator, Scene
 from plab.sim import Simulator
 from plab.sim.cameras import FIRST_BODY, FIRST_MANIPULATOR, FLOOR, CameraSensor
@@ -77,3 +78,63 @@ def test_pictures_are_the_same_in_a_batch_and_follow_steps():
     if DEVICE == "cpu":
         alone.step(actions[1:])
         np.testing.assert_array_equal(one.capture("depth")["depth"][0], later["depth"][1])
+
+
+COARSE = ["sim.grid_size=32", "sim.particles_scale=0.05", f"sim.device={DEVICE}"]
+EVERYTHING = {
+    "observe": ["state", "particles", "depth", "rgb", "segmentation"],
+    "cameras": {"top": {"position": (0.5, 2.0, 0.5), "target": (0.5, 0.0, 0.5), "size": (24, 16)}},
+}
+
+
+def test_environments_observe_by_key():
+    env = plab.make("Move", overrides=COARSE, **EVERYTHING)
+    many = plab.make_vec("Move", num_envs=2, overrides=COARSE, **EVERYTHING)
+    one, _info = env.reset(seed=0)
+    both, _infos = many.reset(seed=0)
+    assert one in env.observation_space and both in many.observation_space
+    assert one["top_depth"].shape == (16, 24, 1) and one["top_rgb"].shape == (16, 24, 3)
+    assert {0, FIRST_MANIPULATOR, FIRST_BODY} >= set(np.unique(one["top_segmentation"])) - {FLOOR}
+    for _ in range(many.unwrapped.batch.horizon):
+        action = env.action_space.sample()
+        one, *_rest = env.step(action)
+        both, *_rest, infos = many.step(np.stack([action, action]))
+    last = infos["final_obs"][1]
+    assert last in env.observation_space and both in many.observation_space
+    if DEVICE == "cpu":
+        for key, values in one.items():
+            np.testing.assert_array_equal(values, last[key])
+    env.close()
+    many.close()
+    alone = plab.make("Move", overrides=COARSE, observe="depth")
+    assert alone.reset()[0].shape == (64, 64, 1)
+    for wrong, named in (({"observe": "sound"}, "sound"), ({"observe": []}, "nothing")):
+        with pytest.raises(ValueError, match=named):
+            plab.make("Move", overrides=COARSE, **wrong)
+
+
+def test_stable_baselines_learns_from_pictures():
+    from stable_baselines3 import PPO
+
+    from plab.envs.sb3 import make_sb3
+
+    overrides = [*COARSE, "sim.horizon=4"]
+    envs = make_sb3("plab/Move-v1", 2, overrides=overrides, observe=["state", "rgb"])
+    model = PPO("MultiInputPolicy", envs, n_steps=4, batch_size=8, n_epochs=1).learn(16)
+    assert model.num_timesteps == 16 and set(envs.observation_space) == {"state", "front_rgb"}
+
+
+def test_tensors_by_key_stay_on_the_device():
+    import torch
+
+    from plab.config import load_config
+    from plab.envs.core import EpisodeBatch
+    from plab.envs.tensors import TensorEnv
+
+    env = TensorEnv(EpisodeBatch([load_config(["task=Move", *COARSE])] * 2, observe=["state", "rgb"]))
+    first = env.reset()
+    later = env.step(torch.ones(2, env.batch.action_space.shape[0], device=env.device)).observation
+    for seen in (first, later):
+        assert {value.device.type for value in seen.values()} == {DEVICE}
+        assert seen["front_rgb"].dtype == torch.uint8 and seen["front_rgb"].shape == (2, 64, 64, 3)
+    assert (first["state"] != later["state"]).any()

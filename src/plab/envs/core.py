@@ -17,10 +17,10 @@ from gymnasium.error import ResetNeeded
 from plab.config import Config, load_config
 from plab.config.selection import OBSERVED
 from plab.config.words import prepared
-from plab.envs.observations import Observer, spaces
+from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
-from plab.scenes import CONTACTS
+from plab.scenes import CONTACTS, Camera
 from plab.sim import SimulationError, Simulator
 from plab.sim.tensors import Constants, on_device
 
@@ -115,7 +115,7 @@ class Transition:
     """Result of one step of all sub-environments. The arrays are the caller's.
 
     Attributes:
-        observation: Observations, shape [batch, entry], float32.
+        observation: Observations, shape [batch, entry], float32, or by key.
         reward: Rewards, shape [batch], float64; a tensor has the type of the actions.
         truncated: Whether the episodes are over.
         info: The entries of ``info``, each of shape [batch], in type like the rewards.
@@ -144,15 +144,25 @@ class EpisodeBatch:
         picture_target: Whether pictures show the target, as a ghost; likewise.
     """
 
-    def __init__(self, cfgs: Sequence[Config], *, contact: str = "hard") -> None:
+    def __init__(
+        self,
+        cfgs: Sequence[Config],
+        *,
+        contact: str = "hard",
+        observe: str | Sequence[str] = "state",
+        cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
+    ) -> None:
         """Build everything; the episodes start at :meth:`reset`.
 
         Args:
             cfgs: One configuration per sub-environment, alike in ``sim`` and the loss.
             contact: Contact model, ``hard`` or ``soft``.
+            observe: One of ``state``, ``particles``, ``depth``, ``rgb`` and ``segmentation``; or several,
+                which makes observations a dictionary with keys such as ``state`` and ``front_depth``.
+            cameras: Cameras of pictures by name, or their attributes; one named ``front`` if None.
 
         Raises:
-            ValueError: If the contact model does not exist.
+            ValueError: If the contact model or an observation does not exist.
             plab.config.ConfigError: If the configurations do not fit together.
             plab.scenes.SceneError: If a scene cannot be simulated or the scenes do not fit together.
             plab.targets.TargetError: If a target cannot be built.
@@ -167,7 +177,9 @@ class EpisodeBatch:
         self.picture_size, self.picture_target = PICTURE_SIZE, False
         self._renderers: list[Renderer] = []
         self._take(cfgs, problem)
-        self.observation_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
+        state_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
+        self._sensors = Sensors(observe, cameras, problem.simulator, state_space)
+        self.observation_space = self._sensors.space
         self._begin()
 
     def renew(self, cfgs: Sequence[Config]) -> None:
@@ -194,6 +206,7 @@ class EpisodeBatch:
             simulator.set_scenes(scenes)
             problem = Problem(cfgs, simulator)
         self._take(cfgs, problem)
+        self._sensors.refresh()
         self._begin()
 
     def _take(self, cfgs: Sequence[Config], problem: Problem) -> None:
@@ -233,7 +246,7 @@ class EpisodeBatch:
             like: Given a CUDA tensor, everything returned is one too.
 
         Returns:
-            Observations, shape [batch, entry], float32; and ``info``, each entry of shape [batch].
+            Observations, shape [batch, entry], float32, or by key; and ``info``, each of shape [batch].
 
         Raises:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
@@ -276,7 +289,7 @@ class EpisodeBatch:
         seen = observation, measures.terms, measures.iou
         if self._failures:
             for table, before in zip(seen, self._last, strict=True):
-                _restore_rows(table, before, list(self._failures))
+                mapped(lambda now, then: _restore_rows(now, then, list(self._failures)), table, before)
         if not strict:
             self._last = _copies(seen)
         self._step = now + 1
@@ -367,9 +380,12 @@ class EpisodeBatch:
         self._renderers = []
 
     def _observe(self, like: Array = None) -> Array:
-        seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
-        joined = self._observer(*seen, np.float32)
-        return joined.float() if on_device(joined) else joined
+        def state() -> Array:
+            seen = self._simulator.observe(self._observer.stride, like), self._simulator.poses(like)
+            joined = self._observer(*seen, np.float32)
+            return joined.float() if on_device(joined) else joined
+
+        return self._sensors(state, like)
 
     def _seen(self, like: Array = None) -> tuple[Array, Array, Array]:
         """Return observations, loss terms and IoU of the current states."""
@@ -403,4 +419,7 @@ def _restore_rows(table: Array, before: Array, rows: Sequence[int]) -> None:
 
 
 def _copies(tables: Sequence[Array]) -> tuple[Array, ...]:
-    return tuple(table.clone() if on_device(table) else table.copy() for table in tables)
+    def copy(table: Array) -> Array:
+        return table.clone() if on_device(table) else table.copy()
+
+    return tuple(mapped(copy, table) for table in tables)

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 
 from plab.config import Config
+from plab.errors import ArgumentError
 from plab.objective import TARGET_ENTRIES, target_observation
 from plab.problem import Problem
-from plab.scenes import Scene
+from plab.scenes import Camera, Scene
+from plab.sim import Simulator
+from plab.sim.cameras import FIRST_BODY, CameraSensor
 from plab.sim.tensors import Constants, on_device
 
-__all__ = ["Observer", "level_entries", "spaces"]
+__all__ = ["OBSERVATIONS", "Observer", "Sensors", "level_entries", "mapped", "spaces"]
+
+PICTURES = ("depth", "rgb", "segmentation")
+
+OBSERVATIONS = ("state", "particles", *PICTURES)
+"""Names of what can be observed."""
+
+DEFAULT_CAMERAS = {"front": Camera((0.5, 0.9, 1.7), (0.5, 0.15, 0.5), 45.0)}
+"""Cameras of environments that are given none."""
 
 Array: TypeAlias = Any
 """A NumPy array, or a CUDA tensor where the caller gave one."""
@@ -52,6 +63,83 @@ class Observer:
         # The entries after the poses are constant.
         whole[:, self._poses] = bar[:, particles : particles + len(self._poses)]
         return bar[:, :particles].reshape(size, self._count, 6), whole.reshape(size, -1, 8)
+
+
+class Sensors:
+    """Observations by key: of the state, of particles, and pictures of cameras.
+
+    Attributes:
+        names: What is observed, of :data:`OBSERVATIONS`.
+        space: Space of one environment's observation: that of the state or of a picture alone, or a Dict.
+    """
+
+    def __init__(
+        self,
+        observe: str | Sequence[str],
+        cameras: Mapping[str, Camera | Mapping[str, Any]] | None,
+        simulator: Simulator,
+        state_space: Box,
+    ) -> None:
+        """Choose what is observed.
+
+        Args:
+            observe: One of :data:`OBSERVATIONS`, or several.
+            cameras: Cameras of pictures by name, or their attributes; :data:`DEFAULT_CAMERAS` if None.
+            simulator: Whose state is observed.
+            state_space: Space of ``state``.
+
+        Raises:
+            ValueError: If there is no such observation, or nothing to observe.
+        """
+        self.names = (observe,) if isinstance(observe, str) else tuple(observe)
+        if unknown := [name for name in self.names if name not in OBSERVATIONS]:
+            raise ArgumentError(f"observe '{unknown[0]}' is not one of {', '.join(OBSERVATIONS)}")
+        self._pictures = [name for name in self.names if name in PICTURES]
+        given = (DEFAULT_CAMERAS if cameras is None else cameras) if self._pictures else {}
+        self.cameras = {
+            name: one if isinstance(one, Camera) else Camera(**one) for name, one in given.items()
+        }
+        if not self.names or (self._pictures and not self.cameras):
+            raise ArgumentError("nothing is observed: name observations, and cameras for pictures")
+        self._simulator = simulator
+        self._cameras = {name: CameraSensor(simulator, camera) for name, camera in self.cameras.items()}
+        spaces: dict[str, Space[Any]] = {"state": state_space} if "state" in self.names else {}
+        if "particles" in self.names:
+            spaces["particles"] = Box(0.0, 1.0, (simulator.particle_count, 3), np.float32)
+        for name, camera in self.cameras.items():
+            width, height = camera.size
+            known: dict[str, Space[Any]] = {
+                "depth": Box(0.0, camera.far, (height, width, 1), np.float32),
+                "rgb": Box(0, 255, (height, width, 3), np.uint8),
+                "segmentation": Box(0, FIRST_BODY + 1000, (height, width, 1), np.int32),
+            }
+            spaces |= {f"{name}_{picture}": known[picture] for picture in self._pictures}
+        self._alone = isinstance(observe, str) and len(spaces) == 1
+        self.space = next(iter(spaces.values())) if self._alone else Dict(spaces)
+
+    def refresh(self) -> None:
+        """Follow a change of the simulator's scenes."""
+        for sensor in self._cameras.values():
+            sensor.refresh()
+
+    def __call__(self, state: Callable[[], Array], like: Array) -> Any:
+        """Return observations of the current states; ``state`` computes that of the same name. CUDA tensors
+        if ``like`` is one."""
+        out = {"state": state()} if "state" in self.names else {}
+        if "particles" in self.names:
+            x = self._simulator.observe(1, like)[..., :3]
+            out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
+        for name, sensor in self._cameras.items():
+            for picture, values in sensor.capture(*self._pictures, like=like).items():
+                out[f"{name}_{picture}"] = values if picture == "rgb" else values[..., None]
+        return next(iter(out.values())) if self._alone else out
+
+
+def mapped(function: Callable[..., Any], *observations: Any) -> Any:
+    """Apply a function to observations, key by key where they are by key."""
+    if not isinstance(observations[0], Mapping):
+        return function(*observations)
+    return {key: function(*(one[key] for one in observations)) for key in observations[0]}
 
 
 def _joined(rows: Sequence[Array], dtype: type) -> Array:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -20,7 +21,9 @@ from plab.envs.core import (
     compose_configs,
     refuse_options,
 )
+from plab.envs.observations import mapped
 from plab.errors import ArgumentError
+from plab.scenes import Camera
 
 __all__ = ["PlabVecEnv", "make_sb3"]
 
@@ -30,6 +33,8 @@ def make_sb3(
     num_envs: int = 1,
     *,
     contact: str = "hard",
+    observe: str | Sequence[str] = "state",
+    cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
     render_mode: str | None = None,
     render_size: tuple[int, int] = PICTURE_SIZE,
     render_target: bool = False,
@@ -41,6 +46,9 @@ def make_sb3(
         env_id: Such as ``plab/Rope-v1``.
         num_envs: Number of sub-environments.
         contact: Contact model, ``hard`` or ``soft``.
+        observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names need a policy for
+            dictionaries, such as ``MultiInputPolicy``.
+        cameras: Cameras of pictures by name.
         render_mode: ``rgb_array``, or None for no pictures.
         render_size: Width and height of pictures [pixels].
         render_target: Whether pictures show the target, as a ghost.
@@ -58,7 +66,7 @@ def make_sb3(
             f"'{env_id}' is no environment of plab's: choose plab/<Task>-v<variant>, such as plab/Rope-v1"
         )
     cfgs = compose_configs(num_envs=num_envs, **spec.kwargs | kwargs)
-    batch = EpisodeBatch(cfgs, contact=contact)
+    batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
     batch.picture_size, batch.picture_target = render_size, render_target
     return PlabVecEnv(batch, render_mode=render_mode, spec=spec)
 
@@ -130,7 +138,7 @@ class PlabVecEnv(VecEnv):
         for number, info in enumerate(infos):
             info["TimeLimit.truncated"] = result.truncated and self.truncates
             if result.truncated:
-                info["terminal_observation"] = observation[number]
+                info["terminal_observation"] = mapped(operator.itemgetter(number), observation)
         if result.truncated:
             observation, first = self.batch.reset()
             self.reset_infos = self._split(first)

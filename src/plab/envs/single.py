@@ -18,11 +18,13 @@ from plab.envs.core import (
     compose_configs,
     refuse_options,
 )
+from plab.envs.observations import mapped
+from plab.scenes import Camera
 
 __all__ = ["PlabEnv"]
 
 
-class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class PlabEnv(gymnasium.Env[Any, np.ndarray]):
     """A task as a Gymnasium environment.
 
     The start is always the same, so that the seed of :meth:`reset` only seeds ``np_random``. An episode is
@@ -41,6 +43,8 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         *,
         overrides: Sequence[str] = (),
         contact: str = "hard",
+        observe: str | Sequence[str] = "state",
+        cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
         config_dir: str | Path | None = None,
         render_mode: str | None = None,
         render_size: tuple[int, int] = PICTURE_SIZE,
@@ -53,6 +57,9 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             variant: Name of its variant.
             overrides: Overrides of the configuration, as on the command line: ``["sim.device=cuda"]``.
             contact: Contact model, ``hard`` or ``soft``.
+            observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names make it a
+                dictionary.
+            cameras: Cameras of pictures by name.
             config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
             render_size: Width and height of pictures [pixels].
@@ -63,14 +70,14 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         self.render_mode = check_render_mode(render_mode)
         cfgs = compose_configs(task, variant, overrides=overrides, config_dir=config_dir)
-        self.batch = EpisodeBatch(cfgs, contact=contact)
+        self.batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
         self.batch.picture_size, self.batch.picture_target = render_size, render_target
         self.observation_space = self.batch.observation_space
         self.action_space = self.batch.action_space
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, float]]:
+    ) -> tuple[Any, dict[str, float]]:
         """Start an episode.
 
         Args:
@@ -86,9 +93,9 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         refuse_options(options)
         super().reset(seed=seed)
         observation, info = self.batch.reset()
-        return observation[0], _only(info)
+        return _first(observation), _only(info)
 
-    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, float]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, float]]:
         """Advance by one step.
 
         Args:
@@ -103,7 +110,8 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             plab.sim.SimulationError: If the state stops being finite.
         """
         result = self.batch.step(np.asarray(action)[None])
-        return result.observation[0], float(result.reward[0]), False, result.truncated, _only(result.info)
+        observation, reward = _first(result.observation), float(result.reward[0])
+        return observation, reward, False, result.truncated, _only(result.info)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""
@@ -115,6 +123,11 @@ class PlabEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def close(self) -> None:
         """Release the simulator; closing twice is allowed."""
         self.batch.close()
+
+
+def _first(observation: Any) -> Any:
+    """Return the observation of a batch of one."""
+    return mapped(lambda rows: rows[0], observation)
 
 
 def _only(info: dict[str, np.ndarray]) -> dict[str, float]:

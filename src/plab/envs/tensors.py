@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from plab.envs.core import EpisodeBatch, Transition
+from plab.envs.observations import mapped
 from plab.sim import Simulator
 
 __all__ = ["TensorEnv", "floating"]
@@ -40,10 +42,10 @@ class TensorEnv:
         self.device = torch.device(batch.problem.simulator.device)
         self._like = torch.empty(0, device=self.device)
 
-    def reset(self) -> torch.Tensor:
+    def reset(self) -> Any:
         """Put all environments into their initial states; returns observations, shape [batch, entry]."""
         observation, _info = self.batch.reset(self._like)
-        return torch.as_tensor(observation)
+        return mapped(torch.as_tensor, observation)
 
     def step(self, actions: torch.Tensor, *, strict: bool = True) -> Transition:
         """Advance all environments by one step.
@@ -68,4 +70,4 @@ class TensorEnv:
         done = self.batch.step(actions.double().numpy(), strict=strict)
         info = {name: torch.as_tensor(values).to(actions) for name, values in done.info.items()}
         reward = torch.as_tensor(done.reward).to(actions)
-        return replace(done, observation=torch.as_tensor(done.observation), reward=reward, info=info)
+        return replace(done, observation=mapped(torch.as_tensor, done.observation), reward=reward, info=info)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,12 +21,14 @@ from plab.envs.core import (
     compose_configs,
     refuse_options,
 )
+from plab.envs.observations import mapped
 from plab.errors import ArgumentError
+from plab.scenes import Camera
 
 __all__ = ["PlabVectorEnv"]
 
 
-class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class PlabVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Sub-environments that one simulator advances together.
 
     All have the same horizon, hence their episodes end together. They are reset in the step that ends them
@@ -48,6 +51,8 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         overrides: Sequence[str] = (),
         overrides_per_env: Sequence[Sequence[str]] | None = None,
         contact: str = "hard",
+        observe: str | Sequence[str] = "state",
+        cameras: Mapping[str, Camera | Mapping[str, Any]] | None = None,
         config_dir: str | Path | None = None,
         render_mode: str | None = None,
         render_size: tuple[int, int] = PICTURE_SIZE,
@@ -63,6 +68,9 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             overrides_per_env: Further overrides, one list per sub-environment, such as
                 ``[["variant=1"], ["variant=random", "seed_scene=5"]]``; not of ``sim`` and ``method``.
             contact: Contact model, ``hard`` or ``soft``.
+            observe: What is observed, see :class:`plab.envs.core.EpisodeBatch`; several names make it a
+                dictionary.
+            cameras: Cameras of pictures by name.
             config_dir: Folder with YAML files of the user's own.
             render_mode: ``rgb_array``, or None for no pictures.
             render_size: Width and height of pictures [pixels].
@@ -80,7 +88,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             overrides_per_env=overrides_per_env,
             config_dir=config_dir,
         )
-        self.batch = EpisodeBatch(cfgs, contact=contact)
+        self.batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
         self.batch.picture_size, self.batch.picture_target = render_size, render_target
         self.num_envs = num_envs
         self.single_observation_space = self.batch.observation_space
@@ -90,7 +98,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start the episodes of all sub-environments.
 
         Args:
@@ -113,9 +121,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation, info = self.batch.reset()
         return observation, self._masked(info)
 
-    def step(
-        self, actions: ArrayLike
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all sub-environments by one step, and reset them if that ends their episodes.
 
         Args:
@@ -131,7 +137,7 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         result = self.batch.step(np.asarray(actions))
         observation, info = result.observation, self._masked(result.info)
         if result.truncated:
-            ended = self._masked({"final_obs": _array_of_arrays(observation), "final_info": info})
+            ended = self._masked({"final_obs": _rows(observation, self.num_envs), "final_info": info})
             observation, first = self.batch.reset()
             info = ended | self._masked(first)
         truncated = np.full(self.num_envs, result.truncated)
@@ -155,9 +161,9 @@ class PlabVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return info | masks
 
 
-def _array_of_arrays(rows: np.ndarray) -> np.ndarray:
-    """Return the rows of an array as entries of an array of objects, the form of ``final_obs``."""
-    out = np.empty(len(rows), object)
-    for number, row in enumerate(rows):
-        out[number] = row
+def _rows(observations: Any, count: int) -> np.ndarray:
+    """Return the observation of each environment in an array of objects, the form of ``final_obs``."""
+    out = np.empty(count, object)
+    for number in range(count):
+        out[number] = mapped(operator.itemgetter(number), observations)
     return out
