@@ -13,8 +13,8 @@ import pytest
 from browsing import browser  # noqa: F401
 from plab.config import Config
 from plab.config.compose import cuda_devices
-from plab.outcomes import Outcome
 from plab.runners.runner import SimulatorCache
+from plab.runners.tracks import Outcome
 from refusals import ending, refusal, snapshot
 from suite import DEVICE
 
@@ -67,8 +67,6 @@ def _own_logging() -> Iterator[None]:
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
     """Collect the configurations that reach the runners, instead of running them."""
-    from plab.runners.jobs import outcome
-
     configs: list[Config] = []
 
     def collect(cfg: Config, cache: SimulatorCache | None = None) -> float:
@@ -76,7 +74,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
         return 0.5
 
     def collect_batch(cfgs: list[Config], note: str, cache: SimulatorCache) -> list[Outcome]:
-        return [outcome(cfg, "finished", collect(cfg)) for cfg in cfgs]
+        return [Outcome.of(cfg, "finished", collect(cfg)) for cfg in cfgs]
 
     monkeypatch.setattr("plab.runners.run_config", collect)
     monkeypatch.setattr("plab.runners.run_batch", collect_batch)

@@ -23,13 +23,13 @@ from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.objective import scores
-from plab.outcomes import Outcome
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
 from plab.runners import RunError, run_batch, run_config, sb3
 from plab.runners.policy import Spaces, evaluation, first_policy, load_policy, policy_path, shared_batches
 from plab.runners.rl import Population, agents_of
 from plab.runners.runner import episode_columns
 from plab.runners.sb3 import Sb3Runner
+from plab.runners.tracks import Outcome
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
 

@@ -16,10 +16,9 @@ import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.outcomes import Outcome
 from plab.results import RunFile, config_hash, read, result_path
 from plab.results.locks import acquire
-from plab.runners.jobs import TogetherError
+from plab.runners.tracks import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
 from plab.sweep.plan import plan
 from plab.sweep.running import compose_jobs, look_up

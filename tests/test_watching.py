@@ -19,7 +19,7 @@ from plab.cli.run import main
 from plab.config import load_config
 from plab.results import RunFile
 from plab.results import read as read_result
-from plab.runners.jobs import Job
+from plab.runners.tracks import Track
 from plab.sim.taichi_internals import watch_compiling
 
 COARSE = ("sim.grid_size=16", "sim.horizon=2", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
@@ -76,7 +76,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
         with watch_compiling(lambda name: (compiled.append(name), tell(name))):
             yield
 
-    monkeypatch.setattr("plab.runners.runner.watch_compiling", watch)
+    monkeypatch.setattr("plab.sim.taichi_internals.watch_compiling", watch)
     monkeypatch.setattr(RunFile, "record", look)
     monkeypatch.chdir(tmp_path)
     argv = ["task=Rope", *COARSE, "method.iterations=3", "checkpoint_seconds=1e6"]
@@ -108,7 +108,7 @@ def summary(folder: Path, shown: float, judged: float, *words: str, **more: floa
     run.record(row | more, {}, best_actions=np.zeros((50, 6)), best_iteration=0, best_loss=1.5)
     numbers = dict.fromkeys(("loss", "reward", "iou", "score_printed", "iou_initial", "iou_target_self"), 0.5)
     run.finish(numbers | {"score": judged}, {})
-    return Job(cfg, run).told
+    return Track(cfg, run).summary_line
 
 
 @pytest.mark.parametrize(

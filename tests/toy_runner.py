@@ -18,7 +18,7 @@ from plab.config import Config, load_config
 from plab.config.families import FAMILIES
 from plab.results import config_hash, read, result_path
 from plab.runners import Runner
-from plab.runners.jobs import Job, RunError
+from plab.runners.tracks import RunError, Track
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -84,28 +84,35 @@ def advance(state: np.ndarray) -> np.ndarray:
     return np.modf(np.sin(state) * 1e4)[0]
 
 
-def run_toy(jobs: Sequence[Job]) -> None:
+def run_toy(tracks: Sequence[Track]) -> None:
     """Carry out a batch, and append the name of each result to ``log`` in the results folder."""
-    for job in jobs:
-        with (Path(job.cfg.results_dir) / "log").open("a") as file:
-            file.write(f"{result_path(job.cfg).name}\n")
-    states = [start(job.cfg) if job.run.result.resume is None else job.run.result.resume["x"] for job in jobs]
-    while active := [k for k, job in enumerate(jobs) if job.open and job.run.result.rows < ITERATIONS]:
+    for track in tracks:
+        with (Path(track.cfg.results_dir) / "log").open("a") as file:
+            file.write(f"{result_path(track.cfg).name}\n")
+    states = [
+        start(track.cfg) if track.run.result.resume is None else track.run.result.resume["x"]
+        for track in tracks
+    ]
+    while active := [
+        k for k, track in enumerate(tracks) if track.open and track.run.result.rows < ITERATIONS
+    ]:
         time.sleep(PAUSE)
         for k in active:
-            job, iteration = jobs[k], jobs[k].run.result.rows
-            if job.cfg.seed == FAILING_SEED and iteration == 3:
-                job.fail(RunError(WHY))
+            track, iteration = tracks[k], tracks[k].run.result.rows
+            if track.cfg.seed == FAILING_SEED and iteration == 3:
+                track.fail(RunError(WHY))
                 continue
             states[k] = advance(states[k])
-            job.run.record({"iteration": iteration, "loss": float(states[k].sum())}, {"x": states[k].copy()})
-    for job in jobs:
-        if job.open:
-            job.run.finish({"score": abs(float(job.run.result.columns["loss"][-1])) % 1.0}, {})
+            track.run.record(
+                {"iteration": iteration, "loss": float(states[k].sum())}, {"x": states[k].copy()}
+            )
+    for track in tracks:
+        if track.open:
+            track.run.finish({"score": abs(float(track.run.result.columns["loss"][-1])) % 1.0}, {})
 
 
 class ToyRunner(Runner):
     """Runner of a family; tests may replace :func:`run_toy`."""
 
     def run(self) -> None:
-        run_toy([track.job for track in self.tracks])
+        run_toy(self.tracks)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from plab.config import Config, ConfigError, ranges
-from plab.runners.jobs import RunError
 from plab.runners.libraries import torch
 from plab.runners.policy import (
     CLIP,
@@ -30,6 +29,7 @@ from plab.runners.policy import (
     shared_batches,
 )
 from plab.runners.runner import Step, Track
+from plab.runners.tracks import RunError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
@@ -256,7 +256,7 @@ class ActorRunner(PolicyRunner):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy."""
-        save_policy(track.job.run.path, self.method, self._training.policy, self._training.moments())
+        save_policy(track.run.path, self.method, self._training.policy, self._training.moments())
 
 
 def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0) -> Sequence[Config]:

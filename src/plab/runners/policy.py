@@ -150,13 +150,13 @@ class PolicyRunner(Runner):
             return f"all {episodes} episodes of training broke off, the first in {broken[0]}"
         if failure and track.best_actions is None:
             return failure
-        provenance = track.job.run.result.provenance
+        provenance = track.run.result.provenance
         for name, texts in (("episodes", broken), ("evaluations", [failure] if failure else [])):
             if texts:
                 provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
                 _log.warning(
                     "%s: iteration %d: %d %s broke off and rested until their end, the first in %s",
-                    *(track.job.run.path, track.iteration, len(texts), name, texts[0]),
+                    *(track.run.path, track.iteration, len(texts), name, texts[0]),
                 )
         return ""
 

@@ -22,7 +22,6 @@ from plab.config.families import RL, Appearance, Family, Rule, family
 from plab.results import ResultsError
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.agents import Agents, OffPolicyAgents, OffPolicyConfig, RlConfig
-from plab.runners.jobs import RunError
 from plab.runners.libraries import torch
 from plab.runners.policy import (
     Evaluation,
@@ -37,6 +36,7 @@ from plab.runners.replay import Sizes, require_file
 from plab.runners.runner import LAST, Step, Track, episode_columns
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
+from plab.runners.tracks import RunError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -287,7 +287,6 @@ class RlRunner(PolicyRunner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """See that the replay buffer is there; the networks are made with those of the others."""
-        track.job.run.result.provenance["batch"] = len(self.tracks)
         if state is not None:
             # Now, where what does not fit is answered.
             agents_of(self.method).trained_policy(track.cfg, self._spaces, state)
@@ -295,11 +294,11 @@ class RlRunner(PolicyRunner):
             try:
                 require_file(_replay_path(track), self._sizes, self._episodes(state) // self._sizes.envs)
             except ResultsError as error:
-                track.job.fail(error)
+                track.fail(error)
 
     def has_more(self, track: Track) -> bool:
         """Whether there are steps to train for."""
-        state = track.job.run.result.resume
+        state = track.run.result.resume
         return state is None or int(state["steps"]) < self._total
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
@@ -318,7 +317,7 @@ class RlRunner(PolicyRunner):
         # The first episode, of the untrained policies, compiles the kernels.
         if least > 0:
             self.enter("optimise", members)
-            columns = members[0].job.run.result.columns
+            columns = members[0].run.result.columns
             population.train(int(columns["episodes"][-1]) + self.method.evaluate_every, report)
             self.enter("evaluate", members)
         evaluations, trained = population.evaluate(), population.take_statistics()
@@ -338,7 +337,7 @@ class RlRunner(PolicyRunner):
                 trained_by = {f"train/{name}": loss for name, loss in losses[place].items()}
                 track.log.write(trained_by, population.steps)
             except ResultsError as error:
-                track.job.fail(error)
+                track.fail(error)
                 continue
             seconds = share + time.perf_counter() - start
             measured = done.measures | trained[place]
@@ -369,12 +368,12 @@ class RlRunner(PolicyRunner):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy of the last evaluation, after which nothing is sampled any more."""
-        state = track.job.run.result.resume or {}
+        state = track.run.result.resume or {}
         policy = agents_of(self.method).trained_policy(track.cfg, self._spaces, state)
         moments = None
         if getattr(self.method, "normalise", False):
             moments = state["observation_mean"], state["observation_var"]
-        save_policy(track.job.run.path, self.method, policy, moments)
+        save_policy(track.run.path, self.method, policy, moments)
         _replay_path(track).unlink(missing_ok=True)
 
     def _population_of(self, members: Sequence[Track]) -> Population:
@@ -383,11 +382,11 @@ class RlRunner(PolicyRunner):
         if self._population is None or numbers != [track.number for track in self._members]:
             # Let go of the old one first: there may be no room for two.
             self._population = None
-            cfgs, states = [t.cfg for t in members], [t.job.run.result.resume for t in members]
+            cfgs, states = [t.cfg for t in members], [t.run.result.resume for t in members]
             try:
                 self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
             except (LookupError, ValueError, TypeError) as error:
-                files = ", ".join(str(track.job.run.partial_path) for track in members)
+                files = ", ".join(str(track.run.partial_path) for track in members)
                 raise ResultsError(
                     f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
                 ) from error
@@ -418,7 +417,7 @@ class RlRunner(PolicyRunner):
             )
 
     def _least(self, tracks: Sequence[Track], default: int = 0) -> int:
-        states = [track.job.run.result.resume for track in tracks if track.job.error is None]
+        states = [track.run.result.resume for track in tracks if track.error is None]
         return min(map(self._episodes, states), default=default)
 
     def _episodes(self, state: Mapping[str, Any] | None) -> int:
@@ -426,7 +425,7 @@ class RlRunner(PolicyRunner):
 
 
 def _replay_path(track: Track) -> Path:
-    return track.job.run.path.with_suffix(REPLAY_SUFFIX)
+    return track.run.path.with_suffix(REPLAY_SUFFIX)
 
 
 FAMILY = Family(

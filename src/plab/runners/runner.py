@@ -11,18 +11,17 @@ import gc
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from plab.config import Config, ConfigError
-from plab.config.families import SOLVED, family
+from plab.config.families import family
 from plab.errors import out_of_memory
 from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
-from plab.results import BUDGETS, ResultsError, row_count
-from plab.runners.jobs import USER_ERRORS, Job, RunError, TogetherError, batch_title
-from plab.runners.loggers import RunLog
+from plab.results import ResultsError, row_count
+from plab.runners.tracks import USER_ERRORS, RunError, Step, TogetherError, Track, batch_title
 
 if TYPE_CHECKING:
     from plab.problem import Episodes, Problem
@@ -55,121 +54,6 @@ _MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError,
 """What NumPy and torch answer to a state that has other arrays than it should."""
 
 
-@dataclass(frozen=True)
-class Step:
-    """What an iteration of a run gave.
-
-    Attributes:
-        measures: What the actions are measured by: :func:`plab.runners.runner.episode_columns`, and the
-            columns of the family. Others are left out.
-        actions: Actions that it ran, in [-1, 1], shape [T, A].
-        state: What the next iteration starts from: nested dictionaries of arrays, numbers and strings.
-        episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
-            iteration.
-        steps: Environment steps that they have cost; None: those of the episodes.
-        steps_forward: Environment steps that this iteration has simulated without a gradient; None: those of
-            one episode.
-        steps_gradient: Those that it has simulated with a gradient.
-        seconds: The run's share of the wall time; None: all of it.
-        keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
-        whole: Whether the actions were run to the end; those that were not are never the best.
-    """
-
-    measures: Mapping[str, float]
-    actions: np.ndarray
-    state: Mapping[str, Any]
-    episodes: int | None = None
-    steps: int | None = None
-    steps_forward: int | None = None
-    steps_gradient: int = 0
-    seconds: float | None = None
-    keep: bool = False
-    whole: bool = True
-
-
-class Track:
-    """One run of a batch on its way: its job, its place in the batch, how far it has come.
-
-    Attributes:
-        job: Configuration, file, and how it ended.
-        number: Number of the run in its batch, and of its environment in a simulator that they share.
-        iteration: Number of the iteration that is next.
-        best_loss: Loss of the best actions so far, NaN before the first iteration.
-        best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
-            iteration.
-        log: Takes what ``logger`` is to show beside the rows, which it is given.
-    """
-
-    def __init__(self, job: Job, number: int) -> None:
-        """Take up a run where its file stands."""
-        self.job, self.number = job, number
-        self.log = RunLog(job.cfg, job.run)
-        result = job.run.result
-        columns, rows = result.columns, result.rows
-        self.iteration, self.best_loss = rows, result.best_loss
-        self.best_actions = result.best_actions
-        self._by_score = family(job.cfg.method.family).ranking == "score"
-        known = self._by_score and rows > 0
-        self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
-        # Files that were begun before there were budgets go on without.
-        self._budget = {name: 0 for name in BUDGETS if name in columns or not rows}
-        self._budget |= {name: int(columns[name][-1]) for name in self._budget if rows}
-
-    @property
-    def solved(self) -> bool:
-        """Whether its score is the highest there is, where that is what it looks for."""
-        return self._best_score >= SOLVED
-
-    @property
-    def cfg(self) -> Config:
-        """Its configuration."""
-        return self.job.cfg
-
-    def fail(self, why: str) -> None:
-        """Break the run off in its current iteration; the others of the batch go on."""
-        self.job.fail(RunError(f"iteration {self.iteration}: {why}"))
-
-    def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
-        """Write an iteration to the file; return its row.
-
-        Args:
-            step: What the iteration gave.
-            columns: Which of the measures.
-
-        Raises:
-            ResultsError: If the file cannot be written.
-        """
-        horizon, before = len(step.actions), sum(self._budget.values())
-        done = before // horizon if self._budget else self.iteration
-        episodes = done if step.episodes is None else step.episodes
-        steps = episodes * horizon if step.steps is None else step.steps
-        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
-        forward = horizon if step.steps_forward is None else step.steps_forward
-        spent = dict(zip(BUDGETS, (forward, step.steps_gradient), strict=True))
-        self._budget = {name: known + spent[name] for name, known in self._budget.items()}
-        row |= self._budget
-        row |= {name: step.measures[name] for name in columns}
-        row["seconds"] = cast(float, step.seconds)
-        # Written so that the first loss beats the NaN that stands for none.
-        better = not row["loss"] >= self.best_loss
-        # Of several with the highest score the one of lowest loss.
-        if self._by_score and row["score"] != self._best_score:
-            better = row["score"] > self._best_score
-        better = better and step.whole
-        best: dict[str, Any] = {
-            "best_actions": step.actions,
-            "best_iteration": self.iteration,
-            "best_loss": row["loss"],
-        }
-        self.job.run.record(row, step.state, keep=step.keep, **(best if better else {}))
-        self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
-        self.iteration += 1
-        if better:
-            self.best_loss, self.best_actions = row["loss"], step.actions
-            self._best_score = row["score"]
-        return row
-
-
 class Runner:
     """Takes the runs of a batch from where their files stand to the end, and finishes the files.
 
@@ -187,18 +71,20 @@ class Runner:
     problem: Problem
     report: Report
 
-    def __init__(self, jobs: Sequence[Job], note: str, cache: SimulatorCache) -> None:
-        """Take over some jobs; nothing is built yet.
+    def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
+        """Take over some runs; nothing is built yet.
 
         Args:
-            jobs: The runs, alike as far as :func:`plab.sweep.plan` asks for.
+            tracks: The runs, alike as far as :func:`plab.sweep.plan` asks for.
             note: Shown before the progress.
             cache: Simulators of earlier runs.
         """
-        self.tracks = [Track(job, number) for number, job in enumerate(jobs)]
+        self.tracks = list(tracks)
+        for number, track in enumerate(tracks):
+            track.number = number
         self.cache, self._note = cache, note
-        self._family = family(jobs[0].cfg.method.family)
-        self._clock = _Clock(self.tracks)
+        self._family = family(tracks[0].cfg.method.family)
+        self._phase, self._since, self._timed = "", 0.0, self.tracks
 
     def _unfinished(self) -> ConfigError:
         name = self.tracks[0].cfg.method.family
@@ -269,7 +155,7 @@ class Runner:
         """Report how it goes after an iteration, of several runs on average."""
         loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
         best = np.mean([track.best_loss for track in tracks])
-        contact = " and ".join(dict.fromkeys(track.job.contact for track in tracks))
+        contact = " and ".join(dict.fromkeys(track.contact for track in tracks))
         mean = "" if len(rows) == 1 else "mean "
         text = f"{mean}loss {loss:.5g} {contact} score {score:.3f} best {best:.5g}"
         self.report(min(track.iteration for track in tracks), text)
@@ -277,8 +163,13 @@ class Runner:
     # ------------------------------------------------------------------------------------ what hooks may use
 
     def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
-        """Count the wall time from now on as that of another phase, of other runs if some are given."""
-        self._clock.enter(phase, tracks)
+        """Count the wall time from now on as that of another phase, of other runs if some are given; an
+        empty phase is none."""
+        now = time.perf_counter()
+        if self._phase:
+            for track in self._timed:
+                track.run.spend(self._phase, (now - self._since) / len(self._timed))
+        self._phase, self._since, self._timed = phase, now, list(tracks or self._timed)
 
     def actions_at_rest(self) -> np.ndarray:
         """Return actions of all environments, shape [batch, T, A], at rest: those of runs that have ended."""
@@ -299,15 +190,28 @@ class Runner:
         kind = type(self)
         if kind.build is Runner.build or (kind.step is Runner.step and kind.iterate is Runner.iterate):
             raise self._unfinished()
+        from plab.config.compose import require_runnable
+        from plab.sim import DeviceError
+
         with self.context(), simulation_errors(), ExitStack() as logs:
             for track in self.tracks:
                 logs.callback(track.log.close)
             try:
-                with self._waiting("build"):
-                    self._build()
+                try:
+                    with self._waiting("build"), simulation_errors():
+                        self.enter("build")
+                        for track in self.tracks:
+                            require_runnable(track.cfg)
+                        self.build()
+                except Exception as error:
+                    if len(self.tracks) > 1 and not isinstance(error.__cause__, DeviceError):
+                        raise TogetherError(str(error)) from error
+                    raise
+                for track in self.tracks:
+                    self._start(track)
                 self._optimise()
             finally:
-                self._clock.stop()
+                self.enter("")
                 self.close()
             with self._waiting("final evaluation"):
                 self._conclude()
@@ -321,34 +225,15 @@ class Runner:
         enabled = self.tracks[0].cfg.progress
         return show_waiting(f"{self._heading()} {what}", watch_compiling, enabled=enabled)
 
-    def _build(self) -> None:
-        # Imported here, as the simulator is: composing needs the records of runners.
-        from plab.config.compose import require_runnable
-
-        self.enter("build")
-        try:
-            for track in self.tracks:
-                require_runnable(track.cfg)
-            with simulation_errors():
-                self.build()
-        except Exception as error:
-            from plab.sim import DeviceError
-
-            if len(self.tracks) > 1 and not isinstance(error.__cause__, DeviceError):
-                raise TogetherError(str(error)) from error
-            raise
-        for track in self.tracks:
-            result = track.job.run.result
-            result.labels = self.problem.labels
-            if self._family.batching:
-                result.provenance["batch"] = len(self.tracks)
-            self._start(track)
-
     def _start(self, track: Track) -> None:
         """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
         from plab.sim import DeviceError, SimulationError
 
-        state, scene = track.job.run.result.resume, self.problem.scenes[0]
+        result, scene = track.run.result, self.problem.scenes[0]
+        result.labels = self.problem.labels
+        if self._family.batching:
+            result.provenance["batch"] = len(self.tracks)
+        state = result.resume
         best, shape = track.best_actions, (scene.horizon, scene.action_dim)
         if state is None:
             self.start(track, None)
@@ -360,8 +245,8 @@ class Runner:
         except (DeviceError, SimulationError, RunError, *USER_ERRORS):
             raise
         except _MISFITS as error:
-            reason, file = " ".join(str(error).split()), track.job.run.partial_path
-            track.job.fail(
+            reason, file = " ".join(str(error).split()), track.run.partial_path
+            track.fail(
                 ResultsError(f"{file} cannot be gone on from: {reason[:300]}; start afresh with force=true")
             )
 
@@ -380,8 +265,8 @@ class Runner:
             plain_every=every,
             compiling=watch_compiling,
         ) as self.report:
-            while active := [track for track in self.tracks if track.job.open and self.has_more(track)]:
-                self._clock.enter(phase, active)
+            while active := [track for track in self.tracks if track.open and self.has_more(track)]:
+                self.enter(phase, active)
                 with simulation_errors(f"iteration {active[0].iteration}: "):
                     rows = self._rows(active)
                 phase = "optimise"
@@ -398,34 +283,34 @@ class Runner:
             try:
                 rows.append(track.record(step, columns))
             except ResultsError as error:
-                track.job.fail(error)
+                track.fail(error)
             start = time.perf_counter()
         return rows
 
     def _conclude(self) -> None:
         """Run the best actions in the hard contact model, and finish the files."""
-        for track in (one for one in self.tracks if one.job.open):
+        for track in (one for one in self.tracks if one.open):
             try:
                 self.conclude(track)
             except ResultsError as error:
-                track.job.fail(error)
-        left = [track for track in self.tracks if track.job.open]
+                track.fail(error)
+        left = [track for track in self.tracks if track.open]
         if not left:
             return
         best = self.actions_at_rest()
         for track in left:
             best[track.number] = track.best_actions
-        self._clock.enter("evaluate", left)
+        self.enter("evaluate", left)
         with simulation_errors("final evaluation: "):
             episodes = self.judge(best)
-        self._clock.stop()
+        self.enter("")
         for track in left:
             self._finish(track, episodes)
 
     def _finish(self, track: Track, episodes: Episodes) -> None:
         number = track.number
         if number in episodes.failures:
-            track.job.fail(RunError(f"final evaluation: {episodes.failures[number]}"))
+            track.fail(RunError(f"final evaluation: {episodes.failures[number]}"))
             return
         masses = {
             "initial": self.problem.initial_mass,
@@ -435,32 +320,11 @@ class Runner:
         judged = measures(episodes, number)
         try:
             # After the last row, whose steps are those before it.
-            steps = int(track.job.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
+            steps = int(track.run.result.columns["steps"][-1]) + track.cfg.sim.horizon
             track.log.write({f"final/{name}": judged[name] for name in judged}, steps)
-            track.job.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
+            track.run.finish(judged, {name: mass[number] for name, mass in masses.items()})
         except ResultsError as error:
-            track.job.fail(error)
-
-
-class _Clock:
-    """Adds up the wall time of phases, each run its share."""
-
-    def __init__(self, tracks: Sequence[Track]) -> None:
-        self._tracks, self._phase, self._since = tracks, "", 0.0
-
-    def enter(self, phase: str, tracks: Sequence[Track] | None = None) -> None:
-        """End the phase that is under way and begin another, of other runs if some are given."""
-        self.stop()
-        self._phase, self._since = phase, time.perf_counter()
-        self._tracks = tracks or self._tracks
-
-    def stop(self) -> None:
-        """End the phase that is under way, if one is."""
-        if self._phase:
-            seconds = (time.perf_counter() - self._since) / len(self._tracks)
-            for track in self._tracks:
-                track.job.run.spend(self._phase, seconds)
-        self._phase = ""
+            track.fail(error)
 
 
 # ----------------------------------------------------------------------------------- simulators and measures

@@ -31,11 +31,11 @@ from plab.config.families import family
 from plab.envs.sb3 import PlabVecEnv
 from plab.results.schema import REPLAY_SUFFIX
 from plab.runners.agents import LARGEST, OffPolicyConfig, RlConfig
-from plab.runners.jobs import RunError
 from plab.runners.loggers import RunLog
 from plab.runners.policy import PolicyRunner, Spaces, evaluation, save_policy, shared_batches
 from plab.runners.replay import ReplayBuffer, Sizes, require_file
 from plab.runners.runner import Step, Track
+from plab.runners.tracks import RunError
 
 __all__ = ["ModelKind", "Sb3Runner", "off_policy"]
 
@@ -134,7 +134,7 @@ class Sb3Runner(PolicyRunner):
         # The first episode, of the untrained policy, compiles the kernels.
         if track.iteration > 0:
             self.enter("optimise")
-            columns = track.job.run.result.columns
+            columns = track.run.result.columns
             due = int(columns["episodes"][-1]) + self.method.evaluate_every
             watch.begin(float(columns["score"][-1]))
             while self._episodes < due and self._steps < self._total:
@@ -163,7 +163,7 @@ class Sb3Runner(PolicyRunner):
 
     def conclude(self, track: Track) -> None:
         """Keep the policy."""
-        save_policy(track.job.run.path, self.method, self._model.policy, None)
+        save_policy(track.run.path, self.method, self._model.policy, None)
         _replay_path(track).unlink(missing_ok=True)
 
     @property
@@ -330,4 +330,4 @@ class _Diagnostics(KVWriter):
 
 
 def _replay_path(track: Track) -> Path:
-    return track.job.run.path.with_suffix(REPLAY_SUFFIX)
+    return track.run.path.with_suffix(REPLAY_SUFFIX)

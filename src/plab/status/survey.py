@@ -14,12 +14,14 @@ from typing import Any, TypeAlias, cast
 
 from plab.config.selection import Selection, SelectionError, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
-from plab.outcomes import MOST_RUNS
 from plab.results import ResultsError, Row, row_count
 from plab.results.locks import held
 from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
 from plab.results.schema import parse_member
 from plab.results.table import readable_rows, sources_of
+
+MOST_RUNS = 100_000
+"""Largest number of runs of a selection."""
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; ``interrupted`` resumes when its command is given again."""

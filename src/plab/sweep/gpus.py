@@ -16,9 +16,9 @@ from typing import Any, TypeAlias
 from plab import runners
 from plab.config import Config, ConfigError
 from plab.config.compose import cuda_devices
-from plab.outcomes import Outcome
 from plab.progress import forward_to, show_several
 from plab.runners.runner import SimulatorCache
+from plab.runners.tracks import Outcome
 
 __all__ = ["choose", "gpu_workers"]
 

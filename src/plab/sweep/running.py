@@ -21,13 +21,12 @@ from plab.config import Config, ConfigError
 from plab.config.compose import check_sources, choices, compose, finish, hydra_app, require_runnable
 from plab.config.words import combinations, parse
 from plab.errors import tell
-from plab.outcomes import Outcome, report
 from plab.plugins import passed_on
 from plab.results import ResultsError, RunFile, read, result_path
 from plab.results.locks import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
-from plab.runners.jobs import outcome
 from plab.runners.runner import SimulatorCache
+from plab.runners.tracks import Outcome, report
 from plab.scenes import SceneError
 from plab.sweep.gpus import gpu_workers
 from plab.sweep.plan import plan
@@ -254,16 +253,16 @@ def look_up(cfg: Config) -> Outcome:
     """Say from its files how a run ended whose process cannot say it any more."""
     path = result_path(cfg)
     if (done := _finished_before(cfg)) is not None:
-        return outcome(cfg, "finished", done.score)
+        return Outcome.of(cfg, "finished", done.score)
     if held(path):
-        return outcome(cfg, "elsewhere", message=f"{path} is being computed by another process")
+        return Outcome.of(cfg, "elsewhere", message=f"{path} is being computed by another process")
     try:
         left = read(path.with_suffix(PARTIAL_SUFFIX))
     except ResultsError:
-        return outcome(cfg, "lost", message="no result, and no process computes it now")
+        return Outcome.of(cfg, "lost", message="no result, and no process computes it now")
     if left.status == "failed":
-        return outcome(cfg, "failed", message=left.message)
-    return outcome(cfg, "lost", message=f"{left.rows} iterations, and no process computes it now")
+        return Outcome.of(cfg, "failed", message=left.message)
+    return Outcome.of(cfg, "lost", message=f"{left.rows} iterations, and no process computes it now")
 
 
 def _finished_before(cfg: Config) -> Outcome | None:
@@ -277,4 +276,4 @@ def _finished_before(cfg: Config) -> Outcome | None:
         result = RunFile(cfg).result if left else read(path)
     except ResultsError:
         return None
-    return outcome(cfg, "before", result.score) if result.status == "finished" else None
+    return Outcome.of(cfg, "before", result.score) if result.status == "finished" else None

@@ -387,7 +387,7 @@ class PlannerRunner(Runner):
                 request = pending.pop(track)
                 spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
                 try:
-                    if track.job.open:
+                    if track.open:
                         pending[track] = asking[track].send(answer)
                 except StopIteration as stop:
                     shown[track] = stop.value

@@ -1,0 +1,269 @@
+"""Runs of a batch and how each ended: tracks that runners move on, and outcomes that a sweep reports."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from plab.config import Config
+from plab.config.families import SOLVED, family
+from plab.errors import TRACEBACK, ConfigError, PlabError, tell, traceback_wanted
+from plab.results import BUDGETS, ResultsError, RunFile, result_path
+from plab.results.schema import counts_last
+from plab.runners.loggers import RunLog
+from plab.scenes import SceneError
+from plab.targets import TargetError
+
+__all__ = ["USER_ERRORS", "Outcome", "RunError", "Step", "TogetherError", "Track", "batch_title", "report"]
+
+USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
+"""What a user has to put right: mistakes in the configuration, files that cannot be read or written."""
+
+
+class RunError(PlabError, RuntimeError):
+    """A run that cannot go on; the message says in which iteration and why."""
+
+    exit_code = 1
+
+
+class TogetherError(RuntimeError):
+    """Runs that cannot be simulated together, for the reason that is the cause of this error."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What an iteration of a run gave.
+
+    Attributes:
+        measures: What the actions are measured by: :func:`plab.runners.runner.episode_columns`, and the
+            columns of the family. Others are left out.
+        actions: Actions that it ran, in [-1, 1], shape [T, A].
+        state: What the next iteration starts from: nested dictionaries of arrays, numbers and strings.
+        episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
+            iteration.
+        steps: Environment steps that they have cost; None: those of the episodes.
+        steps_forward: Environment steps that this iteration has simulated without a gradient; None: those of
+            one episode.
+        steps_gradient: Those that it has simulated with a gradient.
+        seconds: The run's share of the wall time; None: all of it.
+        keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
+        whole: Whether the actions were run to the end; those that were not are never the best.
+    """
+
+    measures: Mapping[str, float]
+    actions: np.ndarray
+    state: Mapping[str, Any]
+    episodes: int | None = None
+    steps: int | None = None
+    steps_forward: int | None = None
+    steps_gradient: int = 0
+    seconds: float | None = None
+    keep: bool = False
+    whole: bool = True
+
+
+class Track:
+    """One run of a batch: configuration, file, place in the batch, how far it has come, and how it ended.
+
+    Attributes:
+        cfg: Its configuration.
+        run: Its file.
+        number: Number of the run in its batch, and of its environment in a simulator that they share.
+        error: Why it broke off, if it did.
+        iteration: Number of the iteration that is next.
+        best_loss: Loss of the best actions so far, NaN before the first iteration.
+        best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
+            iteration.
+        log: Takes what ``logger`` is to show beside the rows, which it is given.
+    """
+
+    def __init__(self, cfg: Config, run: RunFile) -> None:
+        """Take up a run where its file stands."""
+        self.cfg, self.run, self.number = cfg, run, 0
+        self.error: Exception | None = None
+        self.finished_before = run.finished
+        self.log = RunLog(cfg, run)
+        result = run.result
+        columns, rows = result.columns, result.rows
+        self.iteration, self.best_loss = rows, result.best_loss
+        self.best_actions = result.best_actions
+        self._by_score = family(cfg.method.family).ranking == "score"
+        known = self._by_score and rows > 0
+        self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
+        self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
+
+    @property
+    def open(self) -> bool:
+        """Whether it has neither finished nor broken off."""
+        return self.error is None and not self.run.finished
+
+    @property
+    def solved(self) -> bool:
+        """Whether its score is the highest there is, where that is what it looks for."""
+        return self._best_score >= SOLVED
+
+    @property
+    def contact(self) -> str:
+        """Contact model in which its rows are measured."""
+        return family(self.cfg.method.family).contact or self.cfg.method.contact
+
+    @property
+    def summary_line(self) -> str:
+        """One-line summary of a finished run: its score, and the score of its rows if that differs."""
+        result = self.run.result
+        text = f"score {result.score:.4f}"
+        if counts_last(result.config) and "train_score" in result.columns:
+            shown = float(result.columns["score"][-1])
+            if shown != result.score:
+                return f"{text} in its last training episodes ({shown:.4f} without exploration)"
+        # Runners that do everything themselves may have rows without a score.
+        if counts_last(result.config) or self.contact == "hard" or "score" not in result.columns:
+            return text
+        shown = float(result.columns["score"][result.best_iteration])
+        if f"{shown:.4f}" == f"{result.score:.4f}":
+            return text
+        return f"{text} in the hard contact model ({shown:.4f} in the {self.contact} one of its iterations)"
+
+    def outcome(self) -> Outcome:
+        """Return how the run ended."""
+        error = self.error
+        if error is None:
+            status = "before" if self.finished_before else "finished"
+            return Outcome.of(self.cfg, status, self.run.result.score)
+        refused, foreseen = isinstance(error, USER_ERRORS), isinstance(error, (RunError, *USER_ERRORS))
+        what = str(error) if foreseen else f"{type(error).__name__}: {error}"
+        if not (foreseen or traceback_wanted()):
+            what += f"; a bug: {TRACEBACK}=1 shows where"
+        return Outcome.of(self.cfg, "refused" if refused else "failed", message=what)
+
+    def fail(self, why: str | Exception) -> None:
+        """Break the run off, also in its file, which keeps what it computed; the others of the batch go on.
+
+        A run that is refused before it computes anything leaves no file.
+
+        Args:
+            why: An error, or what went wrong in the current iteration.
+        """
+        self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
+        if isinstance(error, ResultsError) or (isinstance(error, USER_ERRORS) and not self.run.advanced):
+            # Of a ResultsError the file itself is what failed: nothing more can be written to it.
+            self.run.withdraw()
+            return
+        if isinstance(error, USER_ERRORS) and not self.run.result.rows:
+            # Nothing has been computed that a file could keep.
+            return
+        foreseen = isinstance(error, (RunError, *USER_ERRORS))
+        try:
+            self.run.close("failed", str(error) if foreseen else f"{type(error).__name__}: {error}")
+        except ResultsError as another:
+            self.error = another
+
+    def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
+        """Write an iteration to the file; return its row.
+
+        Args:
+            step: What the iteration gave.
+            columns: Which of the measures.
+
+        Raises:
+            ResultsError: If the file cannot be written.
+        """
+        horizon, before = len(step.actions), sum(self._budget.values())
+        episodes = before // horizon if step.episodes is None else step.episodes
+        steps = episodes * horizon if step.steps is None else step.steps
+        row: dict[str, float] = {"iteration": self.iteration, "episodes": episodes, "steps": steps}
+        forward = horizon if step.steps_forward is None else step.steps_forward
+        spent = dict(zip(BUDGETS, (forward, step.steps_gradient), strict=True))
+        self._budget = {name: known + spent[name] for name, known in self._budget.items()}
+        row |= self._budget
+        row |= {name: step.measures[name] for name in columns}
+        row["seconds"] = cast(float, step.seconds)
+        # Written so that the first loss beats the NaN that stands for none.
+        better = not row["loss"] >= self.best_loss
+        # Of several with the highest score the one of lowest loss.
+        if self._by_score and row["score"] != self._best_score:
+            better = row["score"] > self._best_score
+        better = better and step.whole
+        best: dict[str, Any] = {
+            "best_actions": step.actions,
+            "best_iteration": self.iteration,
+            "best_loss": row["loss"],
+        }
+        self.run.record(row, step.state, keep=step.keep, **(best if better else {}))
+        self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
+        self.iteration += 1
+        if better:
+            self.best_loss, self.best_actions = row["loss"], step.actions
+            self._best_score = row["score"]
+        return row
+
+
+def title(cfg: Config) -> str:
+    """Return what tells a run from others, in a few words."""
+    return f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
+
+
+def batch_title(cfgs: Sequence[Config]) -> str:
+    """Return what the runs of a batch have in common, and how many they are; of one run its title."""
+    if len(cfgs) == 1:
+        return title(cfgs[0])
+    return f"{cfgs[0].task.name}, {len(cfgs)} runs"
+
+
+_UNFINISHED = {
+    "failed": "failed",
+    "refused": "refused",
+    "elsewhere": "under way in another process",
+    "lost": "not under way",
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one run of a sweep ended.
+
+    Attributes:
+        title: Task, variant, method and seed.
+        path: The run's final file.
+        status: ``finished``, ``before`` (finished by an earlier process), ``failed``, ``refused`` (a mistake
+            of the user's), ``elsewhere`` (another process computes it) or ``lost`` (its process has ended).
+        score: Score of the final evaluation, NaN if there is none.
+        message: Why it has not finished, one line.
+    """
+
+    title: str
+    path: str
+    status: str
+    score: float = math.nan
+    message: str = ""
+
+    @classmethod
+    def of(cls, cfg: Config, status: str, score: float = math.nan, message: str = "") -> Outcome:
+        """Return the outcome of a configuration's run."""
+        return cls(title(cfg), str(result_path(cfg)), status, score, " ".join(message.split()))
+
+    @property
+    def finished(self) -> bool:
+        """Whether the result is there."""
+        return self.status in ("finished", "before")
+
+
+def report(outcomes: Sequence[Outcome]) -> int:
+    """Say how a sweep ended: in a line, and in one more on standard error per run without a result.
+
+    Returns:
+        Exit code: 0 if every result is there, 2 if something is the user's to put right, else 1.
+    """
+    count = Counter(one.status for one in outcomes)
+    parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
+    parts += [f"{count[status]} {text}" for status, text in _UNFINISHED.items() if count[status]]
+    print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)
+    for one in outcomes:
+        if not one.finished:
+            tell(f"{one.title}: {one.message}")
+    return 2 if count["refused"] else int(any(not one.finished for one in outcomes))
