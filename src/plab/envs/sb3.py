@@ -77,13 +77,11 @@ class PlabVecEnv(VecEnv):
     Attributes:
         batch: The episodes, with their scenes, targets and simulator.
         spec: Gymnasium's specification of one sub-environment, if there is one.
-        truncates: Whether infos report the end of an episode as a time limit (``TimeLimit.truncated``).
         strict: Whether a sub-environment that breaks off is an error; otherwise it keeps its last numbers
             until its episode ends, see :meth:`plab.envs.core.EpisodeBatch.step`, and its infos hold the
             reason under ``broken``.
     """
 
-    truncates = True
     strict = True
 
     def __init__(
@@ -136,7 +134,7 @@ class PlabVecEnv(VecEnv):
         for number, text in result.failures.items():
             infos[number]["broken"] = text
         for number, info in enumerate(infos):
-            info["TimeLimit.truncated"] = result.truncated and self.truncates
+            info["TimeLimit.truncated"] = result.truncated
             if result.truncated:
                 info["terminal_observation"] = mapped(operator.itemgetter(number), observation)
         if result.truncated:
