@@ -43,6 +43,19 @@ class Simulator:
     All environments share the numbers of particles and manipulators, the manipulators' shapes, grid and time
     step; positions, sizes, material and targets may differ. One process has one device and precision at a
     time.
+
+    Attributes:
+        scenes: One scene per environment.
+        device: ``cpu`` or ``cuda``.
+        precision: ``float32`` or ``float64``.
+        memory_mb: Budget for all fields and arrays with a gradient [MB].
+        batch: Number of environments.
+        terms: Terms of the loss, in the order of :attr:`Measures.terms`.
+        particle_count: Particles per environment.
+        manipulator_count: Manipulators per environment, static ones included.
+        action_dim: Action components per environment step.
+        grid_size: Grid nodes per axis.
+        substeps: Substeps per environment step.
     """
 
     def __init__(
@@ -85,13 +98,20 @@ class Simulator:
         """
         require_alike(scenes)
         self.scenes = tuple(scenes)
-        self.memory_mb = memory_mb
+        self.device, self.precision, self.memory_mb = device, precision, memory_mb
+        first, self.batch = self.scenes[0], len(self.scenes)
+        self.particle_count, self.manipulator_count = first.particle_count, len(first.manipulators)
+        self.action_dim, self.grid_size, self.substeps = first.action_dim, first.grid_size, first.substeps
         self._runtime = start_runtime(device, precision, threads)
         require_memory(self.scenes, precision, device)
-        self._engine = _engine_class(device)(
-            self.scenes, self._runtime, full_gradient, deterministic, _singular_values
-        )
+        engine: Any = CpuEngine
+        if device == "cuda":
+            from plab.sim.cuda_engine import CudaEngine
+
+            engine = CudaEngine
+        self._engine = engine(self.scenes, self._runtime, full_gradient, deterministic, _singular_values)
         self._engine.attach(terms)
+        self.terms: tuple[LossTerm, ...] = tuple(term for term in self._engine.terms if term.weighted)
         free_with(self._engine)
         self._engine.fill_parameters(self.scenes)
         register_user(self)
@@ -108,53 +128,6 @@ class Simulator:
         self.set_contact("soft")
         self.set_weights({term.name: term.weight for term in self.terms})
         self.reset()
-
-    # -- sizes --------------------------------------------------------------------------------------
-
-    @property
-    def device(self) -> str:
-        """``cpu`` or ``cuda``."""
-        return self._runtime.device
-
-    @property
-    def precision(self) -> str:
-        """``float32`` or ``float64``."""
-        return self._runtime.precision
-
-    @property
-    def batch(self) -> int:
-        """Number of environments."""
-        return len(self.scenes)
-
-    @property
-    def particle_count(self) -> int:
-        """Particles per environment."""
-        return self.scenes[0].particle_count
-
-    @property
-    def manipulator_count(self) -> int:
-        """Manipulators per environment, static ones included."""
-        return len(self.scenes[0].manipulators)
-
-    @property
-    def action_dim(self) -> int:
-        """Action components per environment step."""
-        return self.scenes[0].action_dim
-
-    @property
-    def terms(self) -> tuple[LossTerm, ...]:
-        """Terms of the loss, in the order of :attr:`Measures.terms`."""
-        return tuple(term for term in self._engine.terms if term.weighted)
-
-    @property
-    def grid_size(self) -> int:
-        """Grid nodes per axis."""
-        return self.scenes[0].grid_size
-
-    @property
-    def substeps(self) -> int:
-        """Substeps per environment step."""
-        return self.scenes[0].substeps
 
     def memory_bytes(self) -> int:
         """Bytes of all fields and arrays that the simulator holds now, on its device; without Taichi itself,
@@ -429,12 +402,9 @@ class Simulator:
             SimulationError: If state, loss or gradient stop being finite and ``strict`` is set.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
-        self.reset()
         if gradient and not self.terms:
             raise ArgumentError("there is no loss to differentiate: Simulator(scenes, terms=...)")
-        array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
-        plan = self._tape.plan(steps, self.memory_mb) if gradient else None
-        poses = self._pose_history(steps, self._initial_poses)
+        array, steps, poses, plan = self._started(actions, gradient)
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         self._particles.losses(terms, 0)
         self._tape.forward(array, poses, None if gradient else terms, steps, plan)
@@ -482,11 +452,8 @@ class Simulator:
             SimulationError: If the state stops being finite.
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
-        self.reset()
-        array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
-        poses = self._pose_history(steps, self._initial_poses)
+        array, steps, poses, plan = self._started(actions, gradient)
         recorder = StateRecorder(self._particles, actions, every_step, mass, steps)
-        plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         self._tape.forward(array, poses, None, steps, plan, after=recorder.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         self._engine.place(poses, steps, self._pose, 0)
@@ -503,11 +470,9 @@ class Simulator:
             return bar
 
         version = self._version
-
-        def current() -> bool:
-            return gradient and self._version == version
-
-        return recorder.recording(shown[1:].swapaxes(0, 1), back, current)
+        return recorder.recording(
+            shown[1:].swapaxes(0, 1), back, lambda: gradient and self._version == version
+        )
 
     def closed_loop(
         self,
@@ -580,8 +545,7 @@ class Simulator:
         """
         self._require_gradient()
         assert self._tape.bar is not None
-        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
-        return self._particles.unpack(self._tape.bar.to_numpy(), poses, self._particles.order.initial)
+        return self._adjoint(self._tape.bar, self._particles.order.initial)
 
     def material_gradient(self) -> np.ndarray:
         """Gradient of the last :meth:`rollout`'s loss with respect to the material.
@@ -618,8 +582,7 @@ class Simulator:
         self._engine.pose_bar.fill(0)
         self._particles.losses(self._scratch_terms, 0)
         self._engine.loss_gradient_kernel(self._particles.current, 0, bar)
-        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
-        return self._particles.unpack(bar.to_numpy(), poses)
+        return self._adjoint(bar)
 
     def steps_before_contact(self, steps: int) -> int:
         """Environment steps of the rollout just done, of ``steps``, before a manipulator that moves touches
@@ -632,6 +595,15 @@ class Simulator:
 
     # -- internals ------------------------------------------------------------------------------------
 
+    def _started(
+        self, actions: np.ndarray | torch.Tensor, gradient: bool
+    ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
+        """Reset; return actions, number of steps, pose history, and steps of a segment with a gradient."""
+        self.reset()
+        array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
+        plan = self._tape.plan(steps, self.memory_mb) if gradient else None
+        return array, steps, self._pose_history(steps, self._initial_poses), plan
+
     def _judged(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Loss terms and soft IoU from measures of shape [..., batch, measure]; see
         :class:`plab.sim.term_phases.TermPhases`."""
@@ -641,6 +613,10 @@ class Simulator:
         iou = judges[0] if judges else peak * np.nan
         # Those that are measured only come last.
         return Measures(values[..., : len(self.terms)], iou)
+
+    def _adjoint(self, bar: ti.Ndarray, order: np.ndarray | None = None) -> State:
+        poses = self._engine.pose_bar.to_numpy().reshape(self.batch, -1, 8)[:, : self.manipulator_count]
+        return self._particles.unpack(bar.to_numpy(), poses, order)
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
         """Make the scenes' start the initial state."""
@@ -662,8 +638,7 @@ class Simulator:
         if not is_current(self._runtime):
             raise RuntimeError(
                 "this simulator's memory is gone: Taichi was started anew with another device, precision or "
-                "number of "
-                "threads; build the simulator again"
+                "number of threads; build the simulator again"
             )
 
     @contextmanager
@@ -688,11 +663,3 @@ class Simulator:
             raise RuntimeError("build the simulator with full_gradient=True for this gradient")
         if self._tape.bar is None:
             raise RuntimeError("there is no gradient yet: call rollout(actions, gradient=True) first")
-
-
-def _engine_class(device: str) -> type:
-    if device == "cuda":
-        from plab.sim.cuda_engine import CudaEngine
-
-        return CudaEngine
-    return CpuEngine
