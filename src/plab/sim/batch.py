@@ -68,7 +68,6 @@ def initial_poses(scenes: Sequence[Scene]) -> np.ndarray:
 
 
 def _unit(rotation: Sequence[float]) -> list[float]:
-    """A quaternion of length 1; YAML files round theirs."""
     q = np.asarray(rotation, float)
     return list(q / np.linalg.norm(q))
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import taichi as ti
 
-from plab.sim.cpu_tiles import KEY, NODE, MaterialTiles, TransferTiles
+from plab.sim.cpu_tiles import KEY, NODE, TilePhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import PosePhases
 from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STATE, STENCILS, STRAINS
@@ -39,7 +39,7 @@ CLEARLY = 1.5
 """A team that takes so many times as long as the first one is not tried ``RECENT`` times at the start."""
 
 
-class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases):
+class CpuPhases(TilePhases, GridPhases, PosePhases, TermPhases):
     """All phases, for one chunk at a time."""
 
     shares = CHUNKS
@@ -58,12 +58,10 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
 
     @ti.func
     def first_tile(self, c):
-        """First tile of a chunk."""
         return c * self.tiles // self.chunks
 
     @ti.func
     def lanes_of(self, tile):
-        """Particles in a tile."""
         return ti.min(self.lanes, self.particles - tile * self.lanes)
 
     @ti.func
@@ -157,7 +155,6 @@ class CpuPhases(TransferTiles, MaterialTiles, GridPhases, PosePhases, TermPhases
 
     @ti.func
     def grid_chunk_adjoint(self, e, c, s):
-        """Grid update and its adjoint for a share of the environment's blocks."""
         for entry in range(self.first_entry(e, c), self.first_entry(e, c + 1)):
             block = self.block_list[entry]
             holders = self.block_chunks[e * self.blocks + block]
@@ -393,7 +390,6 @@ class CpuEngine(CpuPhases):
 
     @ti.func
     def barrier(self, team, size):
-        """Wait until every thread of the team is here."""
         if size > 1:
             ticket = ti.atomic_add(self.arrivals[team * PADDING], 1)
             goal = (ticket // size + 1) * size
@@ -413,7 +409,6 @@ class CpuEngine(CpuPhases):
     def losses_of_team(
         self, state: ti.template(), slot, e, team, rank, size, stamp, terms: ti.template(), at
     ):
-        """Measures of one environment."""
         for c in range(self.first_chunk(rank, size), self.first_chunk(rank + 1, size)):
             self.scatter_mass_chunk(state, slot, e, c, stamp)
         self.barrier(team, size)

@@ -79,14 +79,15 @@ def ask(
     return result
 
 
-class TransferTiles(ParticlePhases):
-    """Particle-to-grid and grid-to-particle transfers of tiles, and their adjoints."""
+class TilePhases(ParticlePhases):
+    """Transfers between tiles of particles and the grid, return mapping and stress, and their adjoints."""
 
     def _allocate(self) -> None:
         grids = self.batch * self.chunks
         # Before all others: behind them, the gradient's kernel has 1 % more instructions for addresses.
         self.stencils = ti.Vector.field(self.lanes, self.real, shape=grids * STENCILS)
         self.bases = ti.Vector.field(self.lanes, ti.i32, shape=grids * BASES)
+        self.strains = ti.Vector.field(self.lanes, self.real, shape=grids * STRAINS)
         super()._allocate()
         # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
         self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
@@ -241,13 +242,7 @@ class TransferTiles(ParticlePhases):
         self.block_first[e, self.chunks] = count
         self.block_count[e] = count
 
-
-class MaterialTiles(ParticlePhases):
-    """Return mapping and stress of tiles, and their adjoints."""
-
-    def _allocate(self) -> None:
-        self.strains = ti.Vector.field(self.lanes, self.real, shape=self.batch * self.chunks * STRAINS)
-        super()._allocate()
+    # -- material -----------------------------------------------------------------------------------
 
     @ti.func
     def strain_tile(self, state_at, source, e, entry9, at, kind: ti.template()):

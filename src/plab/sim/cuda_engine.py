@@ -102,18 +102,7 @@ class CudaEngine(CudaPhases):
 
     # -- public methods -----------------------------------------------------------------------------
 
-    def step(
-        self,
-        state: ti.Ndarray,
-        poses: ti.Ndarray,
-        actions: ti.Ndarray,
-        slot: int,
-        stride: int,
-        t: int,
-        pose_before: int,
-        pose_after: int,
-        stamp: int,
-    ) -> None:
+    def step(self, state, poses, actions, slot, stride, t, pose_before, pose_after, stamp) -> None:
         """One environment step from time slot ``slot``; each substep moves ``stride`` slots (0: in place)."""
         if self.resident:
             self.resident_step_kernel(state, poses, actions, slot, stride, t, pose_before, pose_after, stamp)
@@ -124,18 +113,7 @@ class CudaEngine(CudaPhases):
             self.substep_kernel(state, before, before + stride, s, t * self.substeps + s, stamp)
 
     def step_adjoint(
-        self,
-        state: ti.Ndarray,
-        bar: ti.Ndarray,
-        poses: ti.Ndarray,
-        actions: ti.Ndarray,
-        actions_bar: ti.Ndarray,
-        terms: ti.Ndarray,
-        at: int,
-        slot: int,
-        t: int,
-        stamp: int,
-        contact: int,
+        self, state, bar, poses, actions, actions_bar, terms, at, slot, t, stamp, contact
     ) -> None:
         """Adjoint of one environment step with states in slots ``slot`` to ``slot + substeps`` and of its
         loss, with the measures that it is made of written to ``terms`` from entry ``at``.

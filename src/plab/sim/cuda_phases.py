@@ -607,7 +607,6 @@ class CudaPhases(OrderPhases, PosePhases):
 
     @ti.func
     def gather_thread(self, state: ti.template(), before, after, q, time, parts: ti.template()):
-        """Grid to particle, for thread q's own particle."""
         e, particle, own = self.own_particle(q, parts)
         if own:
             tile = particle // self.lanes

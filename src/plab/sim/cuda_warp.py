@@ -87,7 +87,6 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def node4(self, grid: ti.template(), node):
-        """The 4-vector at a node of a gathered grid."""
         out = ti.Vector.zero(self.real, 4)
         if ti.static(self.real == ti.f32):
             for half in ti.static(range(2)):
@@ -100,12 +99,10 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def node_address(self, grid: ti.template(), node):
-        """Address of a node of a gathered grid."""
         return ti.get_addr(grid, 0) + ti.static(4 * SIZES[self.real]) * ti.cast(node, ti.u64)
 
     @ti.func
     def node_slope(self, grid: ti.template(), node):
-        """The last component at a node of a gathered grid."""
         out = ti.cast(0.0, self.real)
         if ti.static(self.real == ti.f32):
             out = ti.bit_cast(ti.cast(grid[2 * node + 1] >> 32, ti.i32), ti.f32)
@@ -201,7 +198,6 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def sum_of_warp(self, value):
-        """Sum of the lanes' float64 values, in the warp's first lane."""
         out = value
         for k in ti.static(range(RUN_BITS)):
             out += self.wide_from_above(out, 1 << k)
@@ -380,14 +376,12 @@ class OrderPhases(WarpPhases):
 
     @ti.func
     def list_block(self, entry, stamp):
-        """Take a block into the list of all environments, unless it is in it."""
         if self.block_stamp[entry] < stamp:
             if ti.atomic_max(self.block_stamp[entry], stamp) < stamp:
                 self.block_list[ti.atomic_add(self.block_count[0], 1)] = entry
 
     @ti.func
     def cell_of(self, state: ti.template(), slot, e, particle):
-        """Array index of a particle's base node."""
         entry = self.tile_entry(slot, e, particle // self.lanes)
         base, _fx = self.stencil(self.vector(state, entry, particle % self.lanes))
         return base

@@ -41,7 +41,6 @@ def slid(t, rn, friction):
 
 @ti.func
 def slid_adjoint(t, rn, friction, bar):
-    """Adjoints of t and rn under :func:`slid`, given the adjoint of its result."""
     length = t.norm()
     t_bar = t * 0.0
     rn_bar = 0.0 * rn
@@ -70,7 +69,6 @@ class GridPhases(Storage):
 
     @ti.func
     def position(self, i):
-        """Position of a node from its array index."""
         return (ti.cast(i, self.real) - 1.0) * self.dx
 
     @ti.func
@@ -154,7 +152,6 @@ class GridPhases(Storage):
 
     @ti.func
     def note_contact(self, e):
-        """Note that a moving manipulator touches an environment's body."""
         if self.touched[e] == 0:
             self.touched[e] = 1
 
@@ -229,7 +226,6 @@ class GridPhases(Storage):
 
     @ti.func
     def wall_free_adjoint(self, i, v, bar, axis: ti.template()):
-        """Adjoint of v under :meth:`wall_free`."""
         out = bar
         node = i[axis] - 1
         if (node < WALL and v[axis] < 0.0) or (node > self.n - WALL and v[axis] > 0.0):
@@ -248,7 +244,6 @@ class GridPhases(Storage):
 
     @ti.func
     def floor_adjoint(self, v, friction, bar):
-        """Adjoint of v under :meth:`floor`."""
         out = v * 0.0
         if friction < STICKING:
             t_bar, vy_bar = slid_adjoint(ti.Vector([v[0], v[2]]), v[1], friction, ti.Vector([bar[0], bar[2]]))
@@ -272,7 +267,6 @@ class GridPhases(Storage):
 
     @ti.func
     def walls_adjoint(self, i, v, friction, bar):
-        """Adjoint of v under :meth:`walls`."""
         v1 = self.wall_free(i, v, 0)
         v2 = v1
         floored = self.rubs(i, v1, friction)

@@ -31,7 +31,6 @@ def quat_mul(a, b):
 
 @ti.func
 def conjugate(q):
-    """Conjugate quaternion."""
     return vec4(q[0], -q[1], -q[2], -q[3])
 
 
@@ -59,7 +58,6 @@ def half_angle(h2):
 
 @ti.func
 def rotvec_adjoint(w, q_bar):
-    """Adjoint of the rotation vector under :func:`quat_from_rotvec`."""
     h2 = 0.25 * w.dot(w)
     s, ds, _c = half_angle(h2)
     v_bar = vec3(q_bar[1], q_bar[2], q_bar[3])
@@ -70,7 +68,6 @@ def rotvec_adjoint(w, q_bar):
 
 @ti.func
 def rotation_matrix(q):
-    """Rotation matrix of a unit quaternion, 3x3."""
     return mat3(
         [
             [
@@ -213,7 +210,6 @@ def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap,
 
 @ti.func
 def quaternion(pose):
-    """The rotation of a pose."""
     return vec4(pose[3], pose[4], pose[5], pose[6])
 
 

@@ -63,7 +63,6 @@ def affine_field(value, last, a: ti.template(), f, scale):
 
 @ti.func
 def as_matrix(a: ti.template()):
-    """A row-major tuple of 9 scalars as a 3x3 matrix."""
     return ti.Matrix([[a[0], a[1], a[2]], [a[3], a[4], a[5]], [a[6], a[7], a[8]]])
 
 
@@ -89,12 +88,10 @@ class ParticlePhases(Storage):
 
     @ti.func
     def load(self, state: ti.template(), entry, lane, count: ti.template()):
-        """``count`` scalars of one particle."""
         return [state[entry + i][lane] for i in range(count)]
 
     @ti.func
     def vector(self, state: ti.template(), entry, lane):
-        """Three scalars of one particle as a vector."""
         return ti.Vector([state[entry][lane], state[entry + 1][lane], state[entry + 2][lane]])
 
     @ti.func

@@ -112,7 +112,6 @@ class ParticleOrder:
         return self._engine.batch * self._engine.tiles * self._engine.lanes
 
     def allocate(self, steps: int) -> ti.Ndarray:
-        """Allocate the moves of several environment steps, for :meth:`sort`."""
         return ti.ndarray(ti.i32, shape=steps * self.places)
 
     def reset(self) -> None:
@@ -174,7 +173,6 @@ class Particles:
         self._stamp = 0
 
     def array(self, slots: int) -> ti.Ndarray:
-        """Allocate an array of states, all 0."""
         engine = self.engine
         return ti.ndarray(engine.lane_type, shape=slots * engine.batch * engine.tiles * STATE)
 

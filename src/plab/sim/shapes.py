@@ -12,10 +12,6 @@ import taichi as ti
 from plab.scenes import MANIPULATOR_SHAPES, SceneError
 
 
-def missing(*_arguments: object) -> object:
-    """Stands for a function that a shape does not have."""
-
-
 @dataclass(frozen=True)
 class Surface:
     """What contact needs to know of one shape.
@@ -31,9 +27,9 @@ class Surface:
         round: Whether it is the same however it is turned.
     """
 
-    distance: Callable = missing
-    hessian_product: Callable = missing
-    gap_slope: Callable = missing
+    distance: Callable
+    hessian_product: Callable
+    gap_slope: Callable | None = None
     round: bool = False
 
 
@@ -50,7 +46,6 @@ def ball(q, r):
 
 @ti.func
 def ball_hessian_product(q, w):
-    """Hessian of :func:`ball` times w."""
     length = ti.max(q.norm(), 1e-12)
     n = q / length
     return (w - n * n.dot(w)) / length
@@ -80,7 +75,6 @@ def sphere_distance(p, size, _gap):
 
 @ti.func
 def sphere_hessian_product(p, _size, _gap, w):
-    """Hessian of :func:`sphere_distance` times w."""
     return ball_hessian_product(p, w)
 
 
@@ -92,7 +86,6 @@ def capsule_distance(p, size, _gap):
 
 @ti.func
 def capsule_hessian_product(p, size, _gap, w):
-    """Hessian of :func:`capsule_distance` times w."""
     return rod_hessian_product(on_segment(p, -0.5 * size[0], 0.5 * size[0]), w)
 
 
@@ -117,7 +110,6 @@ def chopsticks_distance(p, size, gap):
 
 @ti.func
 def chopsticks_hessian_product(p, size, gap, w):
-    """Hessian of :func:`chopsticks_distance` times w."""
     return rod_hessian_product(stick_point(p, size, gap), w)
 
 
@@ -153,7 +145,6 @@ def solid(q, half):
 
 @ti.func
 def solid_hessian_product(q, half, w):
-    """Hessian of :func:`solid` times w."""
     out = ti.max(ti.abs(q) - half, 0.0)
     length = out.norm()
     h = q * 0.0
@@ -176,7 +167,6 @@ def box_distance(p, size, _gap):
 
 @ti.func
 def box_hessian_product(p, size, _gap, w):
-    """Hessian of :func:`box_distance` times w."""
     return solid_hessian_product(p, size, w)
 
 
@@ -218,7 +208,6 @@ def torus_distance(p, size, _gap):
 
 @ti.func
 def torus_hessian_product(p, size, _gap, w):
-    """Hessian of :func:`torus_distance` times w."""
     rho, safe, radial = planar(p[1], p[0], p[2])
     q = ti.Vector([rho - size[0], p[1]])
     _d, m = ball(q, size[1])
@@ -236,7 +225,6 @@ def cylinder_distance(p, size, _gap):
 
 @ti.func
 def cylinder_hessian_product(p, size, _gap, w):
-    """Hessian of :func:`cylinder_distance` times w."""
     rho, safe, radial = planar(p[1], p[0], p[2])
     q = ti.Vector([rho, p[1]])
     half = ti.Vector([size[0], size[1]])
@@ -260,18 +248,11 @@ SURFACES: dict[str, Surface] = {
 
 
 def require_surfaces(shapes: Iterable[str]) -> None:
-    """Raise SceneError if a shape lacks a function that contact with it needs."""
+    """Raise SceneError if a shape lacks a surface, or a gripping one the slope of its gap."""
     for shape in shapes:
-        surface = SURFACES.get(shape, Surface())
-        needed = {"distance": surface.distance, "hessian_product": surface.hessian_product}
-        if MANIPULATOR_SHAPES[shape].grips:
-            needed["gap_slope"] = surface.gap_slope
-        lacking = [name for name, function in needed.items() if function is missing]
-        if lacking:
-            raise SceneError(
-                f"shape '{shape}' has no {' and no '.join(lacking)}: "
-                f"complete SURFACES['{shape}'] in plab/sim/shapes.py"
-            )
+        surface = SURFACES.get(shape)
+        if surface is None or (MANIPULATOR_SHAPES[shape].grips and surface.gap_slope is None):
+            raise SceneError(f"shape '{shape}': complete SURFACES['{shape}'] in plab/sim/shapes.py")
 
 
 @ti.func

@@ -619,7 +619,6 @@ class Simulator:
         return self._particles.unpack(bar.to_numpy(), poses, order)
 
     def _start_from(self, particles: Sequence[np.ndarray] | None) -> None:
-        """Make the scenes' start the initial state."""
         positions = [sample_particles(s) for s in self.scenes] if particles is None else list(particles)
         self._particles.order.start_from(positions)
         self._engine.fill_bodies(self.scenes, self._particles.order.initial)

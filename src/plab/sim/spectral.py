@@ -45,14 +45,12 @@ def product_nt(a: ti.template(), b: ti.template()):
 
 @ti.func
 def composed(u: ti.template(), s: ti.template(), v: ti.template()):
-    """U diag(s) V^T."""
     scaled = ti.Matrix([[u[i, j] * s[j] for j in range(3)] for i in range(3)])
     return product_nt(scaled, v)
 
 
 @ti.func
 def unit_or(v, fallback):
-    """v / |v|, or ``fallback`` where v vanishes."""
     n = v.norm()
     out = fallback
     if n > 1e-30:
@@ -62,7 +60,6 @@ def unit_or(v, fallback):
 
 @ti.func
 def any_normal(v):
-    """A unit vector perpendicular to the unit vector v."""
     axis = ti.Vector([1.0, 0.0, 0.0])
     if ti.abs(v[0]) > 0.6:
         axis = ti.Vector([0.0, 1.0, 0.0])

@@ -118,7 +118,6 @@ def broken_gradients(gradient: np.ndarray | torch.Tensor) -> dict[int, str]:
 
 
 def _all_finite(values: np.ndarray | torch.Tensor) -> np.ndarray:
-    """Return which vectors along the last of three axes are finite, shape of the first two."""
     return values.isfinite().all(2).cpu().numpy() if on_device(values) else np.isfinite(values).all(2)
 
 

@@ -163,7 +163,6 @@ class Storage:
         return MANIPULATOR_SHAPES[shape].moves
 
     def turns(self, shape: str) -> bool:
-        """Whether manipulators of this shape rotate."""
         return MANIPULATOR_SHAPES[shape].turns
 
     def rotated(self, shape: str) -> bool:

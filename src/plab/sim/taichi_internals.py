@@ -150,7 +150,6 @@ def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
 
 
 def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
-    """Tell when the next launch of a kernel, which does the rest of the compiling, is over."""
 
     def launch(*args: Any) -> Any:
         # Only of this launch: the attribute hides the method.

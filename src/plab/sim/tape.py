@@ -208,18 +208,10 @@ class Tape:
             history, slot = self._place(t)
             if add is not None:
                 add(t, history, slot + engine.substeps, self.bar)
+            entry, contact = self._entry(t), int(t >= contact_free)
+            stamp = self._particles.take_stamps(engine.substeps + 1)
             engine.step_adjoint(
-                history,
-                self.bar,
-                poses,
-                actions,
-                actions_bar,
-                terms,
-                self._entry(t),
-                slot,
-                t,
-                self._particles.take_stamps(engine.substeps + 1),
-                int(t >= contact_free),
+                history, self.bar, poses, actions, actions_bar, terms, entry, slot, t, stamp, contact
             )
             if engine.sorts:
                 engine.move_back(self.bar, self._spare_bar, self._moves, t)
@@ -227,7 +219,6 @@ class Tape:
         return actions_bar
 
     def _recompute(self, k: int, actions: ti.Ndarray, poses: ti.Ndarray) -> None:
-        """Fill the history with the states of segment k."""
         self._engine.copy_slot(self._checkpoints, k, self._history[0], 0)
         for t in range(k * self._length, (k + 1) * self._length):
             self._keep_step(t, actions, poses, known=True)

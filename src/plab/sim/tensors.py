@@ -150,7 +150,6 @@ def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor
 
 
 def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
-    """Copy numbers to an array of Taichi's, of one entry at least."""
     array = ti.ndarray(ti.f64, shape=max(1, numbers.shape[0]))
     if not numbers.shape[0]:
         return array

@@ -127,12 +127,10 @@ class TermPhases(Storage):
 
     @ti.func
     def in_tensor(self, node):
-        """Whether the mass tensor has a node."""
         return node.min() >= 0 and node.max() < self.n
 
     @ti.func
     def node_slope(self, grid: ti.template(), node):
-        """The loss's slope at a node."""
         return grid[node][3]
 
     @ti.func
@@ -192,7 +190,6 @@ class TermPhases(Storage):
 
     @ti.func
     def particle_measures(self, e, x, v):
-        """What a particle adds to the terms of the particles."""
         values = ti.Vector.zero(ti.f64, ti.static(max(1, len(self.particle_terms))))
         for k, _column, term in ti.static(self.particle_terms):
             values[k] = ti.cast(term.measure(e, x, v), ti.f64)
