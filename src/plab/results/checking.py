@@ -104,10 +104,8 @@ def _advice(path: Path, reason: str) -> str:
 def faults(run: RunResult) -> list[str]:
     """Return the faults of a run that could be read."""
     found = [*_status(run), *_iterations(run), *_best(run)]
-    if any(not (np.isfinite(seconds) and seconds >= 0) for seconds in run.wall_time.values()):
-        found.append("wall_time has seconds that are negative or not finite")
     if run.status == "finished":
-        found += [*_evaluation(run), *_masses(run), *_complete(run)]
+        found += [*_evaluation(run), *_complete(run)]
     return list(dict.fromkeys(found))
 
 
@@ -118,8 +116,6 @@ def _status(run: RunResult) -> Iterator[str]:
     partial = run.path is not None and run.path.name.endswith(PARTIAL_SUFFIX)
     if partial == (run.status == "finished"):
         yield f"the name says that the run is {'not ' if partial else ''}finished, the status is {run.status}"
-    if run.status == "failed" and not run.message:
-        yield "it failed without a message"
     if config_hash(run.config) != run.config_hash:
         yield "config_hash is not that of config"
 
@@ -127,8 +123,6 @@ def _status(run: RunResult) -> Iterator[str]:
 def _iterations(run: RunResult) -> Iterator[str]:
     table = run.iterations
     if table.empty:
-        if run.status == "finished":
-            yield "it has no iterations"
         return
     family, common = known_family(run.config["method"]["family"]), (*COLUMNS, *loss_columns(run.config))
     wanted = common if family is None else (*common, *family.columns)
@@ -137,43 +131,37 @@ def _iterations(run: RunResult) -> Iterator[str]:
     if missing := [name for name in wanted if name not in table]:
         yield f"iterations lack {', '.join(missing)}"
         return
-    if endless := [n for n in table if n not in may_be_nan and not np.isfinite(table[n]).all()]:
+    if endless := [name for name in table if name not in may_be_nan and not np.isfinite(table[name]).all()]:
         yield f"iterations are not finite: {', '.join(endless)}"
     if not np.array_equal(table["iteration"], np.arange(len(table))):
         yield "iterations are not numbered 0, 1, 2, ..."
-    for name in ("episodes", "steps", *BUDGETS):
-        if (np.diff(table[name]) < 0).any():
-            yield f"{name} decrease"
-    for name in ("iou", "score"):
-        if not table[name].between(0.0, 1.0).all():
-            yield f"{name} leaves [0, 1]"
+    if falling := [name for name in ("episodes", "steps", *BUDGETS) if (np.diff(table[name]) < 0).any()]:
+        yield f"{', '.join(falling)} decrease"
+    if outside := [name for name in ("iou", "score") if not table[name].between(0.0, 1.0).all()]:
+        yield f"{', '.join(outside)} leaves [0, 1]"
 
 
 def _best(run: RunResult) -> Iterator[str]:
-    actions, table = run.best_actions, run.iterations
+    actions, table, horizon = run.best_actions, run.iterations, run.config["sim"]["horizon"]
     if actions is None:
         if not table.empty:
             yield "it has iterations, but no best actions"
         return
-    if actions.ndim != 2 or len(actions) != run.config["sim"]["horizon"]:
-        yield f"best actions have shape {list(actions.shape)}, not [{run.config['sim']['horizon']}, A]"
+    if actions.ndim != 2 or len(actions) != horizon:
+        yield f"best actions have shape {list(actions.shape)}, not [{horizon}, A]"
     if not (np.abs(actions) <= 1.0).all():
         yield "best actions leave [-1, 1]"
     if not 0 <= run.best_iteration < len(table):
         yield f"there is no iteration {run.best_iteration}, which is to be the best"
-        return
-    own, known = table.iloc[run.best_iteration], known_family(run.config["method"]["family"])
-    by_score = known is not None and known.ranking == "score"
-    if by_score and own["score"] != table["score"].max():
-        yield f"the score of the best is {own['score']:g}, the highest {table['score'].max():g}"
-    lowest = own["loss"] if by_score else table["loss"].min()
-    if run.best_loss != lowest:
-        of = "of its iteration" if by_score else "the lowest in the iterations"
-        yield f"the best loss is {run.best_loss:g}, {of} {lowest:g}"
+    elif run.best_loss != (loss := table["loss"][run.best_iteration]):
+        yield f"the best loss is {run.best_loss:g}, that of its iteration {loss:g}"
 
 
 def _evaluation(run: RunResult) -> Iterator[str]:
-    values = run.evaluation
+    values, size = run.evaluation, run.config["sim"]["grid_size"]
+    for name, mass in run.masses.items():
+        if mass.shape != (size,) * 3 or not np.isfinite(mass).all():
+            yield f"mass {name} has shape {list(mass.shape)}, not {[size] * 3}, or is not finite somewhere"
     if missing := [name for name in (*EVALUATION, *loss_columns(run.config)) if name not in values]:
         yield f"evaluation lacks {', '.join(missing)}"
         return
@@ -188,29 +176,6 @@ def _evaluation(run: RunResult) -> Iterator[str]:
             yield f"{name} is {values[name]:g}, by the IoUs it should be {getattr(again, name):g}"
 
 
-def _masses(run: RunResult) -> Iterator[str]:
-    size = run.config["sim"]["grid_size"]
-    for name, mass in run.masses.items():
-        if mass.shape != (size,) * 3:
-            yield f"mass {name} has shape {list(mass.shape)}, not {[size] * 3}"
-        elif not (np.isfinite(mass).all() and _possible(mass, run.config["protocol"]["floor"])):
-            yield f"mass {name} is negative or not finite somewhere"
-
-
-def _possible(mass: np.ndarray, floor: str) -> bool:
-    """Return whether particles can spread a tensor of masses, shape [n, n, n].
-
-    Masses are not negative, with one exception: with the release's floor, a particle within 0.13 cells of a
-    lower face has a negative weight for the second node along that axis, and at least 9/2 times as much for
-    the first one.
-    """
-    allowed = np.zeros(mass.shape, bool)
-    if floor == "release":
-        for axis in range(3):
-            allowed[(slice(None),) * axis + (1,)] = True
-    return not ((mass < 0.0) & ~allowed).any() and bool(mass.min() >= -2.0 / 9.0 * mass.max())
-
-
 def _complete(run: RunResult) -> Iterator[str]:
     method, table = run.config["method"], run.iterations
     wanted, own = row_count(method), known_family(method["family"])
@@ -218,7 +183,6 @@ def _complete(run: RunResult) -> Iterator[str]:
     solved = by_score and table["score"].max() >= SOLVED
     if wanted is not None and len(table) != wanted and not (solved and len(table) < wanted):
         yield f"it is finished after {len(table)} of {wanted} iterations"
-    if "episodes" in method and "episodes" in table and len(table):
-        done = int(table["episodes"].iloc[-1])
-        if done < method["episodes"]:
-            yield f"it is finished after {done} of {method['episodes']} episodes"
+    done = int(table["episodes"].iloc[-1]) if len(table) else 0
+    if done < method.get("episodes", 0):
+        yield f"it is finished after {done} of {method['episodes']} episodes"

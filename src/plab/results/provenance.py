@@ -1,18 +1,17 @@
-"""Where a result comes from: versions, platform, commit, device, start time."""
+"""Provenance of a result: versions, platform, commit, device, start time."""
 
 from __future__ import annotations
 
 import functools
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-
-__all__ = ["now", "provenance", "version_changes"]
 
 _PACKAGES = {
     "plab": "plab",
@@ -73,13 +72,12 @@ def _version(distribution: str) -> str:
 
 
 def _processor() -> str:
-    """Return the CPU's model name where Linux tells it, else what the platform module says."""
+    """Return the CPU's model name on Linux, else what the platform module knows."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     except OSError:
-        return platform.processor()
-    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
+        found = None
+    return found[1].strip() if found else platform.processor()
 
 
 @functools.cache

@@ -105,14 +105,13 @@ def scores(
     found, unreadable = readable_rows(source)
     fitting = [row for row in found if chosen(row.values, row.config)]
     columns = list(dict.fromkeys((*_NAMES, *_SETTINGS, "status", "score", *keys)))
-    for key in keys:
-        if fitting and all(_value(row, key) is None for row in fitting):
-            raise SelectionError(f"no run has '{key}': give columns of plab.results.load, or dotted keys")
+    table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
+    if strange := [key for key in keys if fitting and table[key].map(lambda value: value is None).all()]:
+        raise SelectionError(f"no run has '{strange[0]}': give columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
         raise SelectionError(
             f"there is no column '{missing[0]}' to sort by; choose from: {', '.join(columns)}"
         )
-    table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
     by = [*sort, *(name for name in _NAMES if name not in sort)]
     directions = [not descending] * len(sort) + [True] * (len(by) - len(sort))
     ordered = table.sort_values(by, ascending=directions, key=_comparable, kind="stable")
