@@ -456,21 +456,20 @@ class RunFile:
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._progress, self._reported = self.path.with_suffix(_PROGRESS_SUFFIX), time.monotonic()
         self._lock: Lock | None = None
-        # What is there before the run begins: folders made for it, files, iterations.
+        # State before the run begins: folders made for it, files, number of iterations.
         self._made: list[Path] = []
         self._found: set[Path] = set()
         self._known = 0
         _refuse_newer(self.path, self.partial_path)
         if not config["force"] and self._is_finished():
-            if lock_path(self.path).exists() or self.partial_path.exists():
-                self._clear_up()
+            self._clear_up()
             return
         try:
             self._made = make_folder(self.path.parent)
             # A file without a name, of which a process that is killed leaves nothing.
             with tempfile.TemporaryFile(dir=self.path.parent) as probe:
                 probe.write(bytes(_PROBE_BYTES))
-            self._lock_and_look(config["force"])
+            self._lock_and_resume(config["force"])
         except OSError as error:
             self._let_go()
             if error.errno in NO_LOCKS:
@@ -482,14 +481,14 @@ class RunFile:
             self._let_go()
             raise
 
-    def _lock_and_look(self, force: bool) -> None:
-        """Take the run's lock, then see what there is: whoever had it before may have changed everything."""
+    def _lock_and_resume(self, force: bool) -> None:
+        # Files are looked at under the lock: its last holder may have changed everything.
         self._lock = acquire(self.path)
         if self._lock is None:
             raise RunBusyError(f"{self.path} is being computed by another process")
         self._remove_temporary()
         if force:
-            # It would be gone on with, but its replay buffer is about to be another one's.
+            # Its replay buffer is about to be replaced.
             self.partial_path.unlink(missing_ok=True)
         elif not self._is_finished():
             self._take_up_earlier()
@@ -500,22 +499,21 @@ class RunFile:
         self._known = self._state[0].rows
 
     def _clear_up(self) -> None:
-        """Remove what a process left that was killed just after it had finished the run."""
-        # Where nothing can be removed it stays: the result is there.
+        """Remove files left by a process that was killed just after it had finished the run."""
+        if not (lock_path(self.path).exists() or self.partial_path.exists()):
+            return
+        # Where nothing can be removed it stays. A held lock means that the run is being computed again.
         with suppress(OSError):
-            lock = acquire(self.path)
-            # Otherwise somebody computes it again, by force.
-            if lock is not None:
+            if (lock := acquire(self.path)) is not None:
                 try:
                     self._remove_temporary()
-                    # The replay buffer of a repetition that was killed; a run's own is gone before it ends.
                     self.path.with_suffix(REPLAY_SUFFIX).unlink(missing_ok=True)
                     self.partial_path.unlink(missing_ok=True)
                 finally:
                     lock.release()
 
     def _files(self) -> list[Path]:
-        """Return what there is of the run beside its lock, whoever has made it."""
+        """Return the files of the run beside its lock, whoever has made them."""
         stem, lock = f"{self.path.stem}.", lock_path(self.path)
         return [path for path in self.path.parent.iterdir() if path.name.startswith(stem) and path != lock]
 
@@ -525,9 +523,9 @@ class RunFile:
                 path.unlink(missing_ok=True)
 
     def withdraw(self) -> None:
-        """Let go of a run that is refused: what it has made is gone, unless it can go on from there.
+        """Let go of a run that is refused, and remove its files, unless it can resume from them.
 
-        What an earlier process has left stays as it was.
+        Files of an earlier process stay.
         """
         if self._lock is not None and not self.partial_path.exists():
             for path in set(self._files()) - self._found:
@@ -540,12 +538,12 @@ class RunFile:
 
     def _let_go(self) -> None:
         self.release()
-        # Those of task and method may have been made by another run that was refused, too.
+        # Folders of task and method may have been made by another run that was refused, too.
         remove_folders(self._made or self.path.parents[:2])
 
     @property
     def result(self) -> RunResult:
-        """What is known so far; from an earlier process where there was one."""
+        """Result so far; from an earlier process where there was one."""
         known, pending = self._state
         rows: list[dict[str, float]] = []
         while pending:
@@ -566,7 +564,7 @@ class RunFile:
         return self.result.rows > self._known
 
     def release(self) -> None:
-        """Let go of the run's lock, so that somebody else may take it up; nothing may be written after."""
+        """Let go of the run's lock, so that another process may resume it; nothing may be written after."""
         if self._lock is not None:
             with suppress(OSError):
                 self._progress.unlink(missing_ok=True)
@@ -608,7 +606,7 @@ class RunFile:
             replace_file(self._progress, json.dumps(content, default=float).encode(), sync=False)
 
     def close(self, status: str, message: str) -> None:
-        """Mark an unfinished run ``failed`` or ``stopped``, keeping what it computed in the partial file."""
+        """Mark an unfinished run ``failed`` or ``stopped``, and keep its state in the partial file."""
         self._state = dataclasses.replace(self.result, status=status, message=message), ()
         try:
             self._write()
@@ -633,24 +631,22 @@ class RunFile:
         )
         write(result, self.path, compress=True)
         self._state = result, ()
-        # The result is there: where nothing can be removed any more, whoever comes next does it.
+        # What cannot be removed is left to the next process.
         with suppress(OSError):
             self.partial_path.unlink(missing_ok=True)
         self.release()
 
     def _is_finished(self) -> bool:
-        """Look whether there is a complete result, and take it."""
-        try:
+        """Take the complete result if there is one."""
+        with suppress(ResultsError):
             earlier = read(self.path)
-        except ResultsError:
-            return False
-        if earlier.status != "finished" or earlier.config_hash != self.result.config_hash:
-            return False
-        self._state = earlier, ()
-        return True
+            if earlier.status == "finished" and earlier.config_hash == self.result.config_hash:
+                self._state = earlier, ()
+                return True
+        return False
 
     def _take_up_earlier(self) -> None:
-        """Continue from what an earlier process left; files that cannot be used are moved aside."""
+        """Continue from an earlier process's state; files that cannot be used are moved aside."""
         for path in (self.path, self.partial_path):
             if not path.exists():
                 continue
@@ -666,25 +662,25 @@ class RunFile:
             if changes := version_changes(earlier.provenance, self.result.provenance):
                 listed = ", ".join(changes)
                 _log.warning("resuming %s, begun with other versions: %s", self.partial_path, listed)
-            first = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
-            known = dataclasses.replace(earlier, status="running", message="", provenance=first, path=None)
+            origin = {**earlier.provenance, "resumed": int(earlier.provenance.get("resumed", 0)) + 1}
+            known = dataclasses.replace(earlier, status="running", message="", provenance=origin, path=None)
             self._state = known, ()
 
 
 def _extended(
     columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, float]]
 ) -> dict[str, np.ndarray]:
-    """Return columns, shape [iteration] each, with some rows more; what either lacks is NaN."""
+    """Return columns, shape [iteration] each, with more rows; missing values are NaN."""
     known = len(next(iter(columns.values()), ()))
-
-    def column(name: str) -> np.ndarray:
+    extended = {}
+    for name in dict.fromkeys((*columns, *rows[0])):
         new = [row.get(name, math.nan) for row in rows]
         # Counts stay integers, all else is float64, whatever type of number a method gives.
         counts = all(isinstance(number, int | np.integer) for number in new)
         added = np.array(new, np.int64 if counts else np.float64)
-        return np.concatenate([columns.get(name, np.full(known, math.nan)), added]) if known else added
-
-    return {name: column(name) for name in dict.fromkeys((*columns, *rows[0]))}
+        before = columns.get(name, np.full(known, math.nan))
+        extended[name] = np.concatenate([before, added]) if known else added
+    return extended
 
 
 def _move_aside(path: Path, reason: ResultsError) -> None:
@@ -703,7 +699,8 @@ def _refuse_newer(*paths: Path) -> None:
         try:
             with opened(path):
                 pass
-        except ResultsError as error:
-            # Missing or damaged: what is done about it depends on what it was.
-            if isinstance(error, NewerSchemaError):
-                raise
+        except NewerSchemaError:
+            raise
+        except ResultsError:
+            # Missing or damaged files are dealt with under the lock.
+            continue

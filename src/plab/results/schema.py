@@ -44,8 +44,15 @@ COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation, beside those of :func:`loss_columns`."""
 
-_NO_EFFECT = ("results_dir", "progress", "force", "logger", "checkpoint_seconds")
-"""Configuration keys that cannot change a result, hence are left out of the hash."""
+_NO_EFFECT = {
+    "": ("results_dir", "progress", "force", "logger", "checkpoint_seconds"),
+    # Gradients are the same bits for any spacing of checkpoints.
+    "sim": ("memory_mb",),
+    # Name and score change no number, and the contact term is that of the method.
+    "protocol": ("name", "score", "contact"),
+    "task": ("release",),
+}
+"""Configuration keys by section that cannot change a result, hence are left out of the hash."""
 
 _NEEDED: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("task", "method", "sim", "protocol"), dict),
@@ -173,34 +180,25 @@ def stored_config(text: str) -> dict[str, Any]:
 
 def config_hash(cfg: Any) -> str:
     """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
-    plain = {key: value for key, value in config_dict(cfg).items() if key not in _NO_EFFECT}
-    # Gradients are the same bits for any spacing of checkpoints.
-    plain["sim"] = {key: value for key, value in plain["sim"].items() if key != "memory_mb"}
-    # The protocol's name and score change no number, and its contact term is what the method says.
-    unused = ("name", "score", "contact")
-    plain["protocol"] = {key: value for key, value in plain["protocol"].items() if key not in unused}
-    plain["task"] = {key: value for key, value in plain["task"].items() if key != "release"}
-    # What a file holds counts, not where it is.
-    plain["task"] = _without_places(plain["task"])
+    plain = config_dict(cfg)
+    for section, keys in _NO_EFFECT.items():
+        part = plain[section] if section else plain
+        for key in keys:
+            part.pop(key, None)
+    _drop_places(plain["task"])
     if isinstance(lookup(plain, "targets.source"), str):
         # The target comes from a file, whatever the task's recipe is.
-        plain["task"] = _without_recipe(plain["task"])
+        for task in (plain["task"], *plain["task"].get("variants", {}).values()):
+            task.pop("target", None)
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
-def _without_places(node: Any) -> Any:
-    """Return a part of a configuration without the places of its files."""
-    if not isinstance(node, dict):
-        return node
-    kept = {key: value for key, value in node.items() if key != "file" or isinstance(value, dict)}
-    return {key: _without_places(value) for key, value in kept.items()}
-
-
-def _without_recipe(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task's configuration without the recipe of its target, the variants' included."""
-    variants = {name: _without_recipe(own) for name, own in task.get("variants", {}).items()}
-    kept = {key: value for key, value in task.items() if key != "target"}
-    return kept | ({"variants": variants} if variants else {})
+def _drop_places(node: Any) -> None:
+    """Remove the paths of files from a part of a configuration: their SHA-256 is what counts."""
+    for key, value in list(node.items()) if isinstance(node, dict) else ():
+        if key == "file" and not isinstance(value, dict):
+            del node[key]
+        _drop_places(value)
 
 
 def counts_last(config: Mapping[str, Any]) -> bool:
@@ -238,11 +236,6 @@ def member_name(config: Mapping[str, Any], digest: str) -> Path:
     """Return a run's place inside a results folder or an archive, by its configuration and its hash."""
     folder = Path(f"{config['task']['name']}-v{config['variant']}") / config["method"]["name"]
     return folder / f"seed{config['seed']}-{digest[:8]}{SUFFIX}"
-
-
-def final_path(partial: Path) -> Path:
-    """Return the file that takes the place of a partial one when its run ends."""
-    return partial.with_name(partial.name.removesuffix(PARTIAL_SUFFIX) + SUFFIX)
 
 
 def parse_member(path: Path) -> dict[str, str] | None:
