@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -15,13 +16,24 @@ from plab.bench import accuracy, speed
 from plab.cli.report import main
 from plab.config.selection import select
 from plab.report.accuracy import precision_summary
-from plab.report.agreement import VERDICTS, verdict, verdict_grid, verdicts
 from plab.report.collect import NAMES, collect
 from plab.report.formats import MINUS
 from plab.report.notebooks import NOTEBOOKS, notebook_folder
 from plab.report.reference import ACCURACY, PRECISION, SPEED, Benchmark, measured, origin
 from plab.results import ResultsError
 from plab.results.examples import measurements
+
+
+@pytest.fixture(scope="module")
+def cell() -> SimpleNamespace:
+    """The functions of the notebook on the reproduction that judge cells."""
+    cells = pytest.importorskip("jupytext").read(notebook_folder() / "reproduction.py").cells
+    space: dict[str, object] = {}
+    exec(
+        "\n".join(cell.source for cell in cells if "import" in cell.source or "def verdict(" in cell.source),
+        space,
+    )
+    return SimpleNamespace(**{name: value for name, value in space.items() if not name.startswith("__")})
 
 
 @pytest.mark.parametrize(
@@ -35,11 +47,11 @@ from plab.results.examples import measurements
         ("too few runs", math.nan, math.nan),
     ],
 )
-def test_verdict_follows_the_rule(expected: str, low: float, high: float) -> None:
+def test_verdict_follows_the_rule(cell, expected: str, low: float, high: float) -> None:
     middle = 0.1 if math.isnan(low) else (low + high) / 2
-    assert verdict({"runs": 3, "difference": middle, "low": low, "high": high}) == expected
-    assert expected in VERDICTS
-    assert verdict({"runs": 0, "difference": math.nan, "low": math.nan, "high": math.nan}) == "no runs"
+    assert cell.verdict({"runs": 3, "difference": middle, "low": low, "high": high}) == expected
+    assert expected in cell.VERDICTS
+    assert cell.verdict({"runs": 0, "difference": math.nan, "low": math.nan, "high": math.nan}) == "no runs"
 
 
 @pytest.fixture(scope="module")
@@ -54,12 +66,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_incomplete_cells_are_judged_on_what_is_there_and_say_so(results: Path) -> None:
+def test_incomplete_cells_are_judged_on_what_is_there_and_say_so(cell, results: Path) -> None:
     runs = collect(results, select([], NAMES))
-    judged = verdicts(runs).set_index(["task", "method"])["verdict"]
+    judged = cell.verdicts(runs).set_index(["task", "method"])["verdict"]
     assert judged[("Rope", "adam")] == "same" and judged[("Rope", "ppo")] in ("lower", "undecided")
     assert judged[("Move", "adam")] == "no runs"
-    grid = verdict_grid(verdicts(runs)).set_index("task")
+    grid = cell.verdict_grid(cell.verdicts(runs)).set_index("task")
     assert re.fullmatch(rf"same [+{MINUS}]0\.0\d \(6/15\)", grid.loc["Rope", "Adam"])
 
 
