@@ -24,7 +24,7 @@ from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.objective import scores
 from plab.results import ResultsError, RunFile, RunResult, read, result_path
-from plab.runners import RunError, run_batch, run_config, sb3
+from plab.runners import RunError, actors, run_batch, run_config, sb3
 from plab.runners.policy import Spaces, evaluation, first_policy, load_policy, policy_path, shared_batches
 from plab.runners.rl import Population, agents_of
 from plab.runners.runner import episode_columns
@@ -365,10 +365,10 @@ def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) 
 
 def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, lone, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        break_evaluation(patch, sb3, 0)
+        break_evaluation(patch, actors, 0)
         with pytest.raises(RunError, match="iteration 0: environment step 1, substep 1"):
             run_config(make_config(tmp_path / "first", "tqc"), CACHE)
-    break_evaluation(monkeypatch, sb3, 2)
+    break_evaluation(monkeypatch, actors, 2)
     result = run(make_config(tmp_path, "tqc"))
     assert result.provenance["broken_evaluations"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()

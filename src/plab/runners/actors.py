@@ -103,6 +103,11 @@ class ActorTraining(ABC):
         self.broken: list[str] = []
         self._measured: dict[str, list[float]] = {}
 
+    @property
+    def steps(self) -> int:
+        """Transitions of training so far."""
+        return self.episodes * self._batch.horizon
+
     @staticmethod
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
         """Return the policy that training begins with, on the CPU."""
@@ -178,12 +183,22 @@ class ActorRunner(PolicyRunner):
     """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy.
 
     Attributes:
-        training: What learns, from the configuration and the environments.
+        training: What learns, from the configuration and the environments: an :class:`ActorTraining`, or a
+            class with its public interface.
         columns: What rows hold of it.
     """
 
-    training: ClassVar[type[ActorTraining]]
+    training: ClassVar[type[Any]]
     columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
+
+    def require_torch_device(self) -> None:
+        """Raise ConfigError if torch does not have the device, or it is not the simulator's."""
+        super().require_torch_device()
+        if self.method.torch_device != (device := self.tracks[0].cfg.sim.device):
+            raise ConfigError(
+                f"the gradient of {self.method.algorithm} goes from the simulator's device to that of its "
+                f"networks: set method.torch_device={device}, as sim.device"
+            )
 
     def environments(self, method: Any) -> int:
         """Return how many environments are trained in together."""
@@ -193,11 +208,6 @@ class ActorRunner(PolicyRunner):
         """Make the environments of the training, and the one in the hard contact model that judges."""
         cfg, method = self.tracks[0].cfg, self.method
         self.require_torch_device()
-        if method.torch_device != cfg.sim.device:
-            raise ConfigError(
-                f"the gradient of {method.algorithm} goes from the simulator's device to that of its "
-                f"networks: set method.torch_device={cfg.sim.device}, as sim.device"
-            )
         count = self.environments(method)
         kinds = (training_scenes(cfg, method, count), count, method.contact), ([cfg], 1, "hard")
         self._training_batch, self._evaluation = shared_batches(self.cache, *kinds)
@@ -216,10 +226,10 @@ class ActorRunner(PolicyRunner):
     def step(self, track: Track) -> Step:
         """Train until the next evaluation is due, except before the first, and run the policy once."""
         training, horizon = self._training, track.cfg.sim.horizon
-        before = training.episodes
+        before, begun = training.episodes, training.steps
         if track.iteration > 0:
             self.enter("optimise")
-            due = before + self.method.evaluate_every
+            due = int(track.run.result.columns["episodes"][-1]) + self.method.evaluate_every
             while training.episodes < due and training.episodes < training.total_episodes:
                 training.train()
             self.enter("evaluate")
@@ -227,7 +237,7 @@ class ActorRunner(PolicyRunner):
         broken, training.broken = training.broken, []
         if why := self.unusable(track, broken, training.episodes - before, done.failure):
             raise RunError(f"iteration {track.iteration}: {why}")
-        trained = (training.episodes - before) * horizon
+        trained = training.steps - begun
         every, differentiated = training.round_episodes
         with_gradient = trained // every * differentiated
         return Step(
@@ -235,7 +245,7 @@ class ActorRunner(PolicyRunner):
             done.actions,
             training.state(),
             episodes=training.episodes,
-            steps=training.episodes * horizon,
+            steps=training.steps,
             steps_forward=horizon + trained - with_gradient,
             steps_gradient=with_gradient,
             keep=True,
@@ -265,7 +275,7 @@ def training_scenes(cfg: Config, method: ActorConfig, count: int, turn: int = 0)
     from plab.config import drawn_configs
     from plab.problem import fits
 
-    if not method.scenes:
+    if not getattr(method, "scenes", 0):
         return [cfg]
     some = min(method.scenes, count)
     seeds = [FIRST_SCENE + (turn * some + k) % method.scenes for k in range(some)]

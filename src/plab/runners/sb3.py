@@ -10,10 +10,8 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,19 +23,21 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecMonitor
 
+from plab.config import Config
 from plab.config.families import family
+from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.results.schema import REPLAY_SUFFIX
+from plab.runners.actors import ActorRunner
 from plab.runners.agents import LARGEST, OffPolicyConfig, RlConfig
 from plab.runners.loggers import RunLog
-from plab.runners.policy import PolicyRunner, Spaces, evaluation, save_policy, shared_batches
+from plab.runners.policy import Policy, PolicyRunner, Spaces
 from plab.runners.replay import ReplayBuffer, Sizes, require_file
-from plab.runners.runner import Step, Track
-from plab.runners.tracks import RunError
+from plab.runners.tracks import Track
 
-__all__ = ["ModelKind", "Sb3Runner", "off_policy"]
+__all__ = ["ModelKind", "Sb3Runner", "Sb3Training", "off_policy"]
 
 
 @dataclass(frozen=True)
@@ -82,108 +82,97 @@ def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
     }
 
 
-class Sb3Runner(PolicyRunner):
-    """Trains a policy; each iteration is some episodes of training, then one of the deterministic policy."""
+class Sb3Training:
+    """A model in training, between episodes or, without a replay buffer, updates; as
+    :class:`plab.runners.actors.ActorTraining`.
 
-    kind = RlConfig
+    Attributes:
+        model: The model.
+        broken: When and why episodes broke off since they were last asked for.
+        episode_actions: Actions of the episodes under way, each of shape [env, A].
+        replay_path: File of the replay buffer.
+        report: Takes a short text when episodes have ended.
+    """
 
-    def build(self) -> None:
-        """Make the environments of the training, and the one in the hard contact model that judges."""
-        self.require_torch_device()
-        cfg, method = self.tracks[0].cfg, self.method
-        kinds = ([cfg], method.num_envs, method.contact), ([cfg], 1, "hard")
-        self._training, self._evaluation = shared_batches(self.cache, *kinds)
-        self.problem = self._evaluation.problem
-        self._kind = family(method.family).rules[method.algorithm].what
-        horizon, rollout = cfg.sim.horizon, self._kind.rollout_steps
-        self._horizon = horizon
+    round_episodes = 1, 0
+    report: Callable[[str], None]
+
+    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
+        """Make the environments and an untrained model."""
+        self._method: Any = cfg.method
+        self._kind: ModelKind = family(cfg.method.family).rules[self._method.algorithm].what
+        method, horizon, rollout = self._method, batch.horizon, self._kind.rollout_steps
         self._cycle = method.num_envs * (horizon if rollout is None else rollout(method))
         self._total = math.ceil(method.episodes * horizon / self._cycle) * self._cycle
-        spaces = self._training.observation_space, self._training.action_space
+        spaces = batch.observation_space, batch.action_space
         self._sizes = Sizes(method.num_envs, horizon, *(space.shape[0] for space in spaces))
-
-    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the model, or take that of the last checkpoint."""
-        envs = PlabVecEnv(self._training)
+        envs = PlabVecEnv(batch)
         envs.strict = False
-        env = VecMonitor(envs)
-        self._watch = _Watch(self._report)
-        if state is None:
-            arguments = self._kind.arguments(self.method, env)
-            if isinstance(self.method, OffPolicyConfig):
-                kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(self.method, self._total)}
-                arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
-            seed, device = track.cfg.seed, self.method.torch_device
-            self._model = self._kind.model("MlpPolicy", env, seed=seed, device=device, **arguments)
-        else:
-            self._restore(env, state)
-            if self._replay is not None and self._steps < self._total:
-                path, episodes = _replay_path(track), self._episodes // self._sizes.envs
-                require_file(path, self._sizes, episodes)
-                self._replay.kept.read([path], self._steps // self._sizes.envs)
-        outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
-        self._model.set_logger(Logger(folder=None, output_formats=outputs))
+        self._env = VecMonitor(envs)
+        arguments = self._kind.arguments(method, self._env)
+        if isinstance(method, OffPolicyConfig):
+            kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(method, self._total)}
+            arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
+        device = method.torch_device
+        self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
+        self.broken: list[str] = []
+        self.episode_actions: list[np.ndarray] = []
+        self._ended: dict[str, list[float]] = {}
+        self._watch = _Watch(self)
 
-    def has_more(self, track: Track) -> bool:
-        """Whether there are steps to train for."""
-        return self._steps < self._total or track.iteration == 0
+    @property
+    def steps(self) -> int:
+        """Transitions of training so far."""
+        return self.model.num_timesteps
 
-    def step(self, track: Track) -> Step:
-        """Train until the next evaluation is due, except before the first, and run the policy once."""
-        watch, model, before = self._watch, self._model, self._steps
-        # The first episode, of the untrained policy, compiles the kernels.
-        if track.iteration > 0:
-            self.enter("optimise")
-            columns = track.run.result.columns
-            due = int(columns["episodes"][-1]) + self.method.evaluate_every
-            watch.begin(float(columns["score"][-1]))
-            while self._episodes < due and self._steps < self._total:
-                model.learn(self._cycle, callback=watch, reset_num_timesteps=False)
-            self.enter("evaluate")
-        done = evaluation(self._evaluation, lambda seen: model.predict(seen, deterministic=True)[0])
-        broken, rewards, scores = watch.take()
-        if why := self.unusable(track, broken, len(rewards), done.failure):
-            raise RunError(f"iteration {track.iteration}: {why}")
+    @property
+    def episodes(self) -> int:
+        """Episodes of training so far."""
+        return self.steps // self._sizes.horizon
+
+    @property
+    def total_episodes(self) -> int:
+        """Episodes of the whole training, in whole cycles."""
+        return self._total // self._sizes.horizon
+
+    @property
+    def policy(self) -> BasePolicy:
+        """The policy."""
+        return self.model.policy
+
+    def train(self) -> None:
+        """Train for one cycle: a batch of episodes, or an update."""
+        self.model.learn(self._cycle, callback=self._watch, reset_num_timesteps=False)
+
+    def note(self, actions: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> None:
+        """Note a step of training: actions, shape [env, A], and infos."""
+        if "episode" not in infos[0]:
+            self.episode_actions.append(np.array(actions))
+            return
+        self.episode_actions.clear()
+        self.broken += [info["broken"] for info in infos if "broken" in info]
+        rewards = [float(info["episode"]["r"]) for info in infos]
+        self._ended.setdefault("train_reward", []).extend(rewards)
+        self._ended.setdefault("train_score", []).extend(info["score"] for info in infos)
+        self.report(f"reward {np.mean(rewards):.4g} in training")
+
+    def predictor(self) -> Policy:
+        """Return the deterministic policy."""
+        return Policy(self.policy, None, None)
+
+    def moments(self) -> None:
+        """Return None: observations are not scaled."""
+
+    def take_statistics(self, names: Sequence[str]) -> dict[str, float]:
+        """Return means over the episodes that ended since the last time; NaN without any."""
+        ended, self._ended = self._ended, {}
+        return {name: float(np.mean(ended[name])) if name in ended else math.nan for name in names}
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that further training depends on; the replay buffer is written to its file."""
         if self._replay is not None:
-            self._replay.kept.write(0, _replay_path(track))
-        trained = {"train_reward": rewards, "train_score": scores}
-        means = {name: float(np.mean(ended)) if ended else math.nan for name, ended in trained.items()}
-        counts = self._episodes, self._steps, self._steps - before + len(done.actions)
-        # Kept each time: the replay buffer's file follows the training, and the state has to follow it.
-        return Step(
-            done.measures | means, done.actions, self._state(), *counts, keep=True, whole=not done.failure
-        )
-
-    def extent(self) -> tuple[int, int, int]:
-        """Return how many episodes of training there are, and after how many there is an evaluation."""
-        return self._episodes, self._total // self._horizon, self.method.evaluate_every
-
-    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Leave it to the training, which reports every batch of episodes."""
-
-    def conclude(self, track: Track) -> None:
-        """Keep the policy."""
-        save_policy(track.run.path, self.method, self._model.policy, None)
-        _replay_path(track).unlink(missing_ok=True)
-
-    @property
-    def _steps(self) -> int:
-        return self._model.num_timesteps
-
-    @property
-    def _episodes(self) -> int:
-        return self._steps // self._horizon
-
-    def _report(self, text: str) -> None:
-        self.report(self._episodes, text)
-
-    @property
-    def _replay(self) -> _Replay | None:
-        return getattr(self._model, "replay_buffer", None)
-
-    def _state(self) -> dict[str, Any]:
-        """Return everything that further training depends on, except the replay buffer's content."""
-        model, written = self._model, io.BytesIO()
+            self._replay.kept.write(0, self.replay_path)
+        model, written = self.model, io.BytesIO()
         model.save(written)
         random = {
             "numpy": np.random.get_state(),  # noqa: NPY002
@@ -191,27 +180,65 @@ class Sb3Runner(PolicyRunner):
             "cuda": torch.cuda.get_rng_state() if model.device.type == "cuda" else None,
             "actions": model.action_space.np_random.bit_generator.state,
         }
+        shape = -1, self._sizes.envs, self._sizes.actions
         return {
             "model": np.frombuffer(written.getvalue(), np.uint8),
             "random": np.frombuffer(pickle.dumps(random), np.uint8),
-            "episode_actions": self._watch.episode_actions(self._sizes),
+            "episode_actions": np.array(self.episode_actions, np.float32).reshape(shape),
         }
 
-    def _restore(self, env: VecEnv, state: Mapping[str, Any]) -> None:
-        """Take up the model of a checkpoint, its random numbers, and the episodes that were under way."""
-        env.reset()
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`: the model, its random numbers, and the episodes that were under way.
+
+        Raises:
+            plab.results.ResultsError: If the training goes on and its replay buffer is gone.
+        """
+        self._env.reset()
         for actions in state["episode_actions"]:
-            env.step(actions)
-            self._watch.actions.append(actions)
+            self._env.step(actions)
+            self.episode_actions.append(actions)
         written = io.BytesIO(state["model"].tobytes())
-        device = self.method.torch_device
-        self._model = self._kind.model.load(written, env, device, force_reset=False)
+        device = self._method.torch_device
+        self.model = self._kind.model.load(written, self._env, device, force_reset=False)
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])
         if random["cuda"] is not None:
             torch.cuda.set_rng_state(random["cuda"])
-        self._model.action_space.np_random.bit_generator.state = random["actions"]
+        self.model.action_space.np_random.bit_generator.state = random["actions"]
+        if self._replay is not None and self.steps < self._total:
+            require_file(self.replay_path, self._sizes, self.episodes // self._sizes.envs)
+            self._replay.kept.read([self.replay_path], self.steps // self._sizes.envs)
+
+    @property
+    def _replay(self) -> _Replay | None:
+        return getattr(self.model, "replay_buffer", None)
+
+
+class Sb3Runner(ActorRunner):
+    """Trains a model; each iteration is some episodes of training, then one of the deterministic policy."""
+
+    kind = RlConfig
+    training = Sb3Training
+
+    def require_torch_device(self) -> None:
+        """Raise ConfigError if torch does not have the device; the simulator may be on another."""
+        PolicyRunner.require_torch_device(self)
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Make the model, or take that of the file."""
+        self._training = training = Sb3Training(track.cfg, self._training_batch)
+        training.replay_path = track.run.path.with_suffix(REPLAY_SUFFIX)
+        training.report = lambda text: self.report(training.episodes, text)
+        if state is not None:
+            training.restore(state)
+        outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
+        training.model.set_logger(Logger(folder=None, output_formats=outputs))
+
+    def conclude(self, track: Track) -> None:
+        """Keep the policy, and no replay buffer."""
+        super().conclude(track)
+        self._training.replay_path.unlink(missing_ok=True)
 
 
 class _Replay(LibraryBuffer):
@@ -265,46 +292,15 @@ class _Replay(LibraryBuffer):
 
 
 class _Watch(BaseCallback):
-    """Follows the training: notes actions of the episodes under way, and reports those that end.
+    """Follows the training step by step."""
 
-    Attributes:
-        actions: Actions of the episodes under way, each of shape [env, A].
-    """
-
-    def __init__(self, report: Callable[[str], None]) -> None:
+    def __init__(self, training: Sb3Training) -> None:
         super().__init__()
-        self._report = report
-        self.actions: list[np.ndarray] = []
-        self._ended: tuple[list[str], list[float], list[float]] = [], [], []
-
-    def begin(self, score: float) -> None:
-        """Begin to measure the pace, after an evaluation with a score."""
-        self._score, self._since = score, (time.perf_counter(), self.num_timesteps)
-
-    def take(self) -> tuple[list[str], list[float], list[float]]:
-        """Return why episodes broke off, and rewards and scores of all that ended, since the last call."""
-        ended, self._ended = self._ended, ([], [], [])
-        return ended
-
-    def episode_actions(self, sizes: Sizes) -> np.ndarray:
-        """Return the actions of the episodes under way, shape [step, env, A]."""
-        return np.array(self.actions, np.float32).reshape(-1, sizes.envs, sizes.actions)
+        self._training = training
 
     def _on_step(self) -> bool:
-        infos = self.locals["infos"]
-        if "episode" not in infos[0]:
-            # Algorithms without a replay buffer keep the actions as drawn, and step with clipped ones.
-            self.actions.append(np.array(self.locals.get("clipped_actions", self.locals["actions"])))
-            return True
-        self.actions.clear()
-        broken, rewards, scores = self._ended
-        broken += [info["broken"] for info in infos if "broken" in info]
-        rewards += [float(info["episode"]["r"]) for info in infos]
-        scores += [info["score"] for info in infos]
-        began, before = self._since
-        pace = (self.num_timesteps - before) / (time.perf_counter() - began)
-        reward = np.mean(rewards[-len(infos) :])
-        self._report(f"{pace:.0f} steps/s reward {reward:.4g} hard score {self._score:.3f}")
+        # Algorithms without a replay buffer keep the actions as drawn, and step with clipped ones.
+        self._training.note(self.locals.get("clipped_actions", self.locals["actions"]), self.locals["infos"])
         return True
 
 
@@ -327,7 +323,3 @@ class _Diagnostics(KVWriter):
 
     def close(self) -> None:
         """Leave the log to the run."""
-
-
-def _replay_path(track: Track) -> Path:
-    return track.run.path.with_suffix(REPLAY_SUFFIX)
