@@ -37,9 +37,9 @@ __all__ = ["ReplayedDemonstration", "main", "replay"]
 HEADING = """\
 # Demonstrations
 
-Look up what the best actions known score in each variant, in the hard contact model; made by `plab
-demonstrations --markdown docs/demonstrations.md`, which prints more.
-[suite.md](suite.md#demonstrations) explains.
+Look up the scores of the best known actions in each variant, in the hard contact model.
+`plab demonstrations --markdown docs/demonstrations.md` writes this table, and prints more.
+[The suite](suite.md#demonstrations) explains how the actions were found.
 
 """
 
