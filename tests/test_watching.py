@@ -44,7 +44,7 @@ def test_a_bar_shows_which_kernel_is_compiled_and_for_how_long(screen, monkeypat
         now[0] += 65.0
         yield tell
 
-    with progress.show_waiting("Rope build", compiler):
+    with progress.show_progress("Rope build", 0, None, compiling=compiler):
         pass
     assert "Rope build compiling step_kernel, 65 s" in screen.getvalue()
     tells: list[Callable[[str], None]] = []

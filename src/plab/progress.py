@@ -23,7 +23,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-__all__ = ["Report", "Watcher", "forward_to", "show_line", "show_progress", "show_several", "show_waiting"]
+__all__ = ["Report", "Watcher", "forward_to", "show_line", "show_progress", "show_several"]
 
 Report = Callable[[int, str], None]
 """Takes the number of steps done and a short text about how it goes."""
@@ -86,13 +86,6 @@ def show_progress(
         yield _plain(title, start, total, plain_every)
     else:
         yield lambda done, text: None
-
-
-@contextmanager
-def show_waiting(title: str, compiling: Watcher, *, enabled: bool = True) -> Iterator[None]:
-    """Show on a terminal that something is made ready in the ``with`` block, and what is compiled."""
-    with show_progress(title, 0, None, enabled=enabled, compiling=compiling):
-        yield
 
 
 def show_line(text: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from plab.config import Config
@@ -19,6 +19,9 @@ __all__ = ["RunLog"]
 
 PROJECT = "plab"
 """Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
+
+Write = Callable[[Mapping[str, float], int], object]
+"""Logs finite numbers by name at some environment steps."""
 
 _LONGEST_ID = 128
 """Letters of a run's id there, at most."""
@@ -30,7 +33,7 @@ class RunLog:
     def __init__(self, cfg: Config, run: RunFile) -> None:
         """Keep the run's configuration and file."""
         self._cfg, self._run = cfg, run
-        self._logger: TensorBoard | WeightsAndBiases | None = None
+        self._logger: tuple[Write, Callable[[], object]] | None = None
 
     @property
     def wanted(self) -> bool:
@@ -42,11 +45,12 @@ class RunLog:
         if that fails."""
         if not self.wanted:
             return
-        finite = {name: float(value) for name, value in values.items() if math.isfinite(value)}
         try:
             if self._logger is None:
-                self._logger = _KINDS[self._cfg.logger](self._cfg, self._run, steps)
-            self._logger.write(finite, steps)
+                opened = {"tensorboard": _tensorboard, "wandb": _wandb}[self._cfg.logger]
+                self._logger = opened(self._cfg, self._run, steps)
+            write, _ = self._logger
+            write({name: float(value) for name, value in values.items() if math.isfinite(value)}, steps)
         except (OSError, RuntimeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ResultsError(f"logger={self._cfg.logger} fails: {reason}; logger=none goes on") from error
@@ -56,67 +60,52 @@ class RunLog:
         if self._logger is not None:
             # All rows have been written; what they belong to is in the result file.
             with suppress(OSError, RuntimeError):
-                self._logger.close()
+                self._logger[1]()
             self._logger = None
 
 
-class TensorBoard:
-    """TensorBoard's event files, in the folder ``<name>.tensorboard`` beside the result."""
+def _tensorboard(cfg: Config, run: RunFile, steps: int) -> tuple[Write, Callable[[], object]]:
+    """Begin an event file of TensorBoard in the folder ``<name>.tensorboard`` beside the result.
 
-    def __init__(self, cfg: Config, run: RunFile, steps: int) -> None:
-        """Begin a file; what an earlier process has logged from ``steps`` on is not shown any more."""
-        # Imported here: it is optional.
-        from torch.utils.tensorboard.writer import SummaryWriter
+    What an earlier process has logged from ``steps`` on is not shown any more.
+    """
+    # Imported here: it is optional.
+    from torch.utils.tensorboard.writer import SummaryWriter
 
-        self._writer = SummaryWriter(str(run.path.with_suffix(".tensorboard")), purge_step=steps)
+    writer = SummaryWriter(str(run.path.with_suffix(".tensorboard")), purge_step=steps)
 
-    def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers, to be seen at once."""
+    def write(values: Mapping[str, float], steps: int) -> None:
         for name, value in values.items():
-            self._writer.add_scalar(name, value, steps)
-        self._writer.flush()
+            writer.add_scalar(name, value, steps)
+        # To be seen at once.
+        writer.flush()
 
-    def close(self) -> None:
-        """Close the file."""
-        self._writer.close()
-
-
-class WeightsAndBiases:
-    """A run at Weights & Biases, which goes on where one of the same configuration was; its own files are in
-    the folder ``wandb`` of ``results_dir``."""
-
-    def __init__(self, cfg: Config, run: RunFile, steps: int) -> None:
-        """Begin the run, or go on with it; how, ``WANDB_MODE`` and wandb's other variables say."""
-        # Imported here: it is optional.
-        import wandb
-
-        name = f"{cfg.task.name}-v{cfg.variant}-{cfg.method.name}-{run.path.stem}"
-        try:
-            self._run = wandb.init(
-                project=os.environ.get("WANDB_PROJECT") or PROJECT,
-                name=name,
-                id=re.sub(r"[^\w.-]", "_", name)[:_LONGEST_ID],
-                dir=cfg.results_dir,
-                config=run.result.config,
-                resume="allow",
-                # The runs of a batch are logged side by side.
-                reinit="create_new",
-                settings=wandb.Settings(silent=True, console="off"),
-            )
-        except wandb.Error as error:
-            raise RuntimeError(f"{error} (WANDB_MODE=offline needs no account)") from error
-        self._run.define_metric("*", step_metric="steps")
-
-    def write(self, values: Mapping[str, float], steps: int) -> None:
-        """Log numbers."""
-        self._run.log({**values, "steps": steps})
-
-    def close(self) -> None:
-        """End the run."""
-        self._run.finish()
+    return write, writer.close
 
 
-_KINDS: dict[str, type] = {
-    "tensorboard": TensorBoard,
-    "wandb": WeightsAndBiases,
-}
+def _wandb(cfg: Config, run: RunFile, steps: int) -> tuple[Write, Callable[[], object]]:
+    """Begin a run at Weights & Biases, or go on with that of the same configuration.
+
+    Its own files are in the folder ``wandb`` of ``results_dir``; ``WANDB_MODE`` and wandb's other variables
+    apply.
+    """
+    # Imported here: it is optional.
+    import wandb
+
+    name = f"{cfg.task.name}-v{cfg.variant}-{cfg.method.name}-{run.path.stem}"
+    try:
+        begun = wandb.init(
+            project=os.environ.get("WANDB_PROJECT") or PROJECT,
+            name=name,
+            id=re.sub(r"[^\w.-]", "_", name)[:_LONGEST_ID],
+            dir=cfg.results_dir,
+            config=run.result.config,
+            resume="allow",
+            # The runs of a batch are logged side by side.
+            reinit="create_new",
+            settings=wandb.Settings(silent=True, console="off"),
+        )
+    except wandb.Error as error:
+        raise RuntimeError(f"{error} (WANDB_MODE=offline needs no account)") from error
+    begun.define_metric("*", step_metric="steps")
+    return lambda values, steps: begun.log({**values, "steps": steps}), begun.finish

@@ -19,7 +19,7 @@ import numpy as np
 from plab.config import Config, ConfigError
 from plab.config.families import family
 from plab.errors import out_of_memory
-from plab.progress import PLAIN_EVERY, Report, show_progress, show_waiting
+from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import ResultsError, row_count
 from plab.runners.tracks import USER_ERRORS, RunError, Step, TogetherError, Track, batch_title
 
@@ -223,7 +223,7 @@ class Runner:
         from plab.sim.taichi_internals import watch_compiling
 
         enabled = self.tracks[0].cfg.progress
-        return show_waiting(f"{self._heading()} {what}", watch_compiling, enabled=enabled)
+        return show_progress(f"{self._heading()} {what}", 0, None, enabled=enabled, compiling=watch_compiling)
 
     def _start(self, track: Track) -> None:
         """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
@@ -265,27 +265,22 @@ class Runner:
             plain_every=every,
             compiling=watch_compiling,
         ) as self.report:
+            columns = (*episode_columns(self.problem.term_names), *self._family.columns)
             while active := [track for track in self.tracks if track.open and self.has_more(track)]:
                 self.enter(phase, active)
+                rows, start = [], time.perf_counter()
                 with simulation_errors(f"iteration {active[0].iteration}: "):
-                    rows = self._rows(active)
+                    for track, step in self.iterate(active):
+                        if step.seconds is None:
+                            step = replace(step, seconds=time.perf_counter() - start)
+                        try:
+                            rows.append(track.record(step, columns))
+                        except ResultsError as error:
+                            track.fail(error)
+                        start = time.perf_counter()
                 phase = "optimise"
                 if rows:
                     self.tell(rows, active)
-
-    def _rows(self, active: Sequence[Track]) -> list[dict[str, float]]:
-        """Do one iteration of each active run, and return the rows of those that came through."""
-        columns = (*episode_columns(self.problem.term_names), *self._family.columns)
-        rows, start = [], time.perf_counter()
-        for track, step in self.iterate(active):
-            if step.seconds is None:
-                step = replace(step, seconds=time.perf_counter() - start)
-            try:
-                rows.append(track.record(step, columns))
-            except ResultsError as error:
-                track.fail(error)
-            start = time.perf_counter()
-        return rows
 
     def _conclude(self) -> None:
         """Run the best actions in the hard contact model, and finish the files."""
