@@ -10,7 +10,6 @@ import logging
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,9 @@ _LEAST_SHARE = 1e-4
 
 _BLOCK = 8192
 """Points drawn at a time. Which of them are inside depends on it, so it must not change."""
+
+_PAIRS = 1 << 21
+"""Pairs of a point and a triangle that are tested together, limited by their memory."""
 
 _TRIED = 1 << 15
 """Points tried when the enclosed volume is compared with that of the faces."""
@@ -121,10 +123,7 @@ class Mesh:
         self.extent, self.volume = (high - low) / longest, volume / longest**3
         self.thickness = 4 * volume / float(surface.area) / longest
         self.vertices, self.faces = (surface.vertices - (low / 2 + high / 2)) / longest, surface.faces
-        flat = self.vertices[:, ::2][self.faces]
-        # A margin for rounding: the exact test follows.
-        self._radii = (np.ptp(flat, axis=1).max(axis=1) / 2) * (1 + 1e-9) + 1e-12
-        self._centers = (flat.min(axis=1) + flat.max(axis=1)) / 2
+        self._sort_into_squares()
         self._require_volume(file)
 
     def __eq__(self, other: object) -> bool:
@@ -136,19 +135,19 @@ class Mesh:
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return which points, shape [point, 3], are inside, by their winding numbers; bool, shape
         [point]."""
-        # Imported here: SciPy's start-up would be paid by every `--help`.
-        from scipy.spatial import KDTree
-
         winding = np.zeros(len(points), dtype=np.int64)
-        for start in range(0, len(points), _BLOCK):
-            block = points[start : start + _BLOCK]
-            near = KDTree(block[:, ::2]).query_ball_point(self._centers, self._radii, p=np.inf)
-            triangle = np.repeat(np.arange(len(near)), [len(found) for found in near])
-            point = np.fromiter(chain.from_iterable(near), np.int64, len(triangle))
-            above, height, sense = self._crossings(block[point][:, ::2], self.faces[triangle])
-            point = point[above]
-            counts = height > block[point, 1]
-            np.add.at(winding, start + point[counts], sense[counts])
+        square = self._square(points[:, ::2]) @ np.array([self._squares, 1])
+        counts = np.diff(self._ends, prepend=0)[square]
+        starts = self._ends[square] - counts
+        blocks = np.flatnonzero(np.diff(np.cumsum(counts) // _PAIRS)) + 1
+        for block in np.split(np.arange(len(points)), blocks):
+            which, nth = _repeated(counts[block])
+            point = block[which]
+            triangle = self._triangles[starts[point] + nth]
+            met, height, sense = self._crossings(points[point][:, ::2], self.faces[triangle])
+            point = point[met]
+            above = height > points[point, 1]
+            np.add.at(winding, point[above], sense[above])
         return winding != 0
 
     def fill(self, count: int, draw: Callable[[tuple[int, int]], np.ndarray]) -> np.ndarray:
@@ -167,6 +166,27 @@ class Mesh:
             parts.append(points[self.inside(points)])
             found += len(parts[-1])
         return np.concatenate([np.empty((0, 3)), *parts])[:count]
+
+    def _sort_into_squares(self) -> None:
+        """Sort the triangles into the squares of a grid in (x, z) that they reach."""
+        corners = self.vertices[:, ::2][self.faces]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        self._squares = min(256, int(np.sqrt(len(self.faces) / 2)) + 1)
+        while True:
+            first, last = self._square(low), self._square(high)
+            wide = last - first + 1
+            # Long triangles lie in many squares: fewer squares then.
+            if self._squares == 1 or wide.prod(axis=1).sum() <= 8 * len(self.faces) + 65536:
+                break
+            self._squares //= 2
+        triangle, nth = _repeated(wide.prod(axis=1))
+        across = wide[triangle, 1]
+        square = (first[triangle, 0] + nth // across) * self._squares + first[triangle, 1] + nth % across
+        self._triangles = triangle[np.argsort(square, kind="stable")]
+        self._ends = np.cumsum(np.bincount(square, minlength=self._squares**2))
+
+    def _square(self, flat: np.ndarray) -> np.ndarray:
+        return np.clip(((flat + 0.5) * self._squares).astype(np.int64), 0, self._squares - 1)
 
     def _crossings(self, at: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return which vertical lines at (x, z), shape [pair, 2], cross a triangle each, shape [pair, 3]; and
@@ -203,3 +223,9 @@ class Mesh:
                 f"{file} bounds {share / expected:.2f} times the volume that its faces add up to: unite "
                 "parts that overlap, and let all faces look outwards"
             )
+
+
+def _repeated(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return each index as often as it counts, and the number of its repetition."""
+    index = np.repeat(np.arange(len(counts)), counts)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(counts) - counts, counts)
