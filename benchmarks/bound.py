@@ -17,8 +17,7 @@ import numpy as np
 import taichi as ti
 
 from plab.bench.workload import GRADIENT, KINDS, Workload, build, time_calls
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, load_config
 from plab.sim.cpu_engine import SPLIT

@@ -21,8 +21,7 @@ import pandas as pd
 
 from common_scene import common_actions, common_scene, grid_terms, own_components
 from plab.bench.accuracy import angle
-from plab.cli.arguments import Parser, positive, task_list, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, positive, task_list, to_write
 from plab.cli.tables import measure_table, write_markdown
 from plab.config import build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks

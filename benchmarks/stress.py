@@ -35,8 +35,7 @@ from plab.bench.stability import (
     options_of,
     summarise,
 )
-from plab.cli.arguments import Parser, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, to_write
 from plab.cli.tables import measure_table, write_csv
 from plab.config import build_scene, load_config
 from plab.config.suite import suite_tasks

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from plab.cli.arguments import Parser, positive, sources_and_words, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, positive, sources_and_words, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, drawn_configs, load_config
 from plab.config.selection import OBSERVED

@@ -9,7 +9,8 @@ import pytest
 
 import plab.demonstrations as demonstrations
 import synthetic
-from plab.cli.demonstrations import main, replay
+from plab.cli.suite import demonstrations as main
+from plab.cli.suite import replay
 from plab.config import Config, build_scene, load_config
 from plab.demonstrations import action_names, known_actions, load_actions, recorded_scores, save_actions
 from plab.results import config_dict

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from plab.cli.main import COMMANDS
+from plab.cli.main import main as command_line
 from plab.cli.run import parser
 from plab.config import choices, load_config
 from plab.config.selection import select
@@ -116,7 +117,7 @@ def parsed(name: str, argv: list[str], monkeypatch: pytest.MonkeyPatch) -> argpa
 
         monkeypatch.setattr(argparse.ArgumentParser, way, parse)
     with pytest.raises(Parsed):
-        importlib.import_module("plab.bench" if name == "bench" else f"plab.cli.{name}").main(argv)
+        command_line([name, *argv])
     return options[0]
 
 

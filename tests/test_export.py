@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plab.cli.export import main
+from plab.cli.rollouts import export as main
 from plab.config import load_config
 from plab.render.recording import RecordedRollout, record_with_motion
 

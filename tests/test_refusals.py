@@ -18,21 +18,12 @@ import synthetic
 import unseen
 from plab import bench
 from plab.bench import accuracy, speed, stability
-from plab.cli import (
-    demonstrations,
-    export,
-    leaderboard,
-    render,
-    report,
-    results,
-    status,
-    submit,
-    targets,
-    verify,
-    view,
-)
+from plab.cli import report, results, status
 from plab.cli.main import main as plab_main
+from plab.cli.rollouts import export, render, view
 from plab.cli.run import main
+from plab.cli.submissions import leaderboard, submit, verify
+from plab.cli.suite import demonstrations, targets
 from plab.config import load_config
 from plab.config.compose import check_sources
 from plab.envs.sb3 import make_sb3
@@ -182,23 +173,23 @@ TOOLS = [
     (status.main, ". task=Ropee", "did you mean Rope?"),
     (status.main, ". seed=-1", "seed"),
     (report.main, "tables nowhere", "nowhere"),
-    (render.main, "a.h5 task=Rope", "task=Rope"),
-    (render.main, "task=Rope --output a.avi", "a.avi"),
-    (render.main, "task=Rope seed=3", "seed=3"),
-    (render.main, "task=Rope targets.source=nowhere", "nowhere"),
-    (render.main, "task=Rope --contact-sheet a.png", "task=Rope"),
-    (view.main, "nowhere.h5", "nowhere.h5"),
-    (view.main, "task=Rope --output a.htm", "a.htm"),
-    (export.main, "task=Rope --format usd", "usd"),
-    (targets.main, "--task Nope", "Nope"),
-    (targets.main, "--task Rope sim.grid_size=7", "sim.grid_size"),
-    (targets.main, "--task Rope method.lr=0.1", "method.lr=0.1"),
-    (targets.main, "--task Rope --rebuild targets.source=files", "--rebuild"),
-    (demonstrations.main, "--task Move --record sim.grid_size=32", "resolution"),
-    (demonstrations.main, "--task Move nowhere", "nowhere"),
-    (submit.main, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
-    (verify.main, "nowhere", "nowhere"),
-    (leaderboard.main, "nowhere", "nowhere"),
+    (render, "a.h5 task=Rope", "task=Rope"),
+    (render, "task=Rope --output a.avi", "a.avi"),
+    (render, "task=Rope seed=3", "seed=3"),
+    (render, "task=Rope targets.source=nowhere", "nowhere"),
+    (render, "task=Rope --contact-sheet a.png", "task=Rope"),
+    (view, "nowhere.h5", "nowhere.h5"),
+    (view, "task=Rope --output a.htm", "a.htm"),
+    (export, "task=Rope --format usd", "usd"),
+    (targets, "--task Nope", "Nope"),
+    (targets, "--task Rope sim.grid_size=7", "sim.grid_size"),
+    (targets, "--task Rope method.lr=0.1", "method.lr=0.1"),
+    (targets, "--task Rope --rebuild targets.source=files", "--rebuild"),
+    (demonstrations, "--task Move --record sim.grid_size=32", "resolution"),
+    (demonstrations, "--task Move nowhere", "nowhere"),
+    (submit, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
+    (verify, "nowhere", "nowhere"),
+    (leaderboard, "nowhere", "nowhere"),
     (speed.main, "--batch 0", "--batch"),
     (stability.main, "--quick --family nothing", "nothing"),
     (accuracy.main, "--task Table", "Table"),
@@ -218,11 +209,11 @@ IN_THE_WAY = [
     (main, "results_dir=blocked/results"),
     (results.main, f"pack results --output blocked/{ARCHIVE}"),
     (report.main, "tables results --out blocked/tables"),
-    (render.main, "task=Rope --output blocked/a.png"),
-    (view.main, "task=Rope --output blocked/a.html"),
-    (export.main, "task=Rope --output blocked"),
-    (targets.main, "--task Rope --csv blocked/a.csv"),
-    (demonstrations.main, "--task Move --markdown blocked/a.md"),
+    (render, "task=Rope --output blocked/a.png"),
+    (view, "task=Rope --output blocked/a.html"),
+    (export, "task=Rope --output blocked"),
+    (targets, "--task Rope --csv blocked/a.csv"),
+    (demonstrations, "--task Move --markdown blocked/a.md"),
     (speed.main, "--csv blocked/a.csv"),
 ]
 
@@ -232,7 +223,7 @@ def test_outputs_that_cannot_be_written(told, tmp_path):
     synthetic.save(synthetic.run(tmp_path / "results"))
     for entry, argv in IN_THE_WAY:
         assert "blocked" in told(argv.split(), entry).partition(": ")[2]
-    assert "results" in told(["task=Rope", "--output", "results"], export.main)
+    assert "results" in told(["task=Rope", "--output", "results"], export)
 
 
 SHAPES = {
@@ -247,7 +238,7 @@ def test_actions_of_a_result_that_do_not_fit(told, tmp_path):
     for name, actions in SHAPES.items():
         made = dataclasses.replace(synthetic.run(tmp_path / name[:4]), best_actions=actions)
         path = synthetic.save(made).relative_to(tmp_path)
-        line = told([str(path), "--output", "a.png"], render.main)
+        line = told([str(path), "--output", "a.png"], render)
         assert str(path) in line and "actions" in line, name
 
 
@@ -286,8 +277,8 @@ def test_rollouts_of_no_steps_and_of_no_numbers():
 
 NO_RAY = pytest.mark.skipif(find_spec("ray") is not None, reason="the extra ray is installed")
 EXTRAS = [
-    ("pyvista", "render", render.main, "task=Rope"),
-    ("PIL", "render", render.main, "task=Rope --output a.gif"),
+    ("pyvista", "render", render, "task=Rope"),
+    ("PIL", "render", render, "task=Rope --output a.gif"),
     ("tensorboard", "tensorboard", main, "task=Move method=adam logger=tensorboard"),
     ("wandb", "wandb", main, "-m task=Move method=sac logger=wandb"),
     pytest.param(

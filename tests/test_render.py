@@ -14,7 +14,7 @@ import torch
 
 import reference_mpm
 from plab import results
-from plab.cli.render import main
+from plab.cli.rollouts import render as main
 from plab.config import build_scene, choices, load_config
 from plab.objective import spread_mass
 from plab.render import graphics
@@ -375,7 +375,7 @@ def test_known_demonstrations_are_replayed_and_others_are_of_zeros(monkeypatch, 
 @pytest.mark.nightly
 def test_the_contact_sheet_and_the_film_strip(monkeypatch):
     some = {name: path for name, path in choices("task").items() if name in ("Move", "Rope", "Torus")}
-    monkeypatch.setattr("plab.cli.render.choices", lambda group, config_dir: some)
+    monkeypatch.setattr("plab.cli.rollouts.choices", lambda group, config_dir: some)
     monkeypatch.setattr(
         "plab.demonstrations.known_actions", lambda cfg: np.zeros((2, build_scene(cfg).action_dim))
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from argparse import Namespace
 from contextlib import closing
 from pathlib import Path
 
@@ -12,9 +13,8 @@ import pandas as pd
 import pytest
 
 import synthetic
-from plab.cli.render import _parse as parse_render
-from plab.cli.render import main as render
 from plab.cli.results import main
+from plab.cli.rollouts import render, settle
 from plab.config.selection import Selection
 from plab.report.collect import collect
 from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, table, write
@@ -228,7 +228,7 @@ def test_scores(folder: Path, told, capsys) -> None:
 def test_pictures_are_of_the_run_with_the_highest_score(folder: Path, told) -> None:
     pack(folder, folder.parent / "all.plab.zip.xz")
     for source in (folder, folder.parent / "all.plab.zip.xz"):
-        options = parse_render([str(source), "task=Rope"])
+        options = Namespace(what=[str(source), "task=Rope"], output=None)
+        assert settle(options, ".png") == Path("Rope-v1-adam-seed1.png")
         assert read(options.result).config["seed"] == 1
-        assert options.output == Path("Rope-v1-adam-seed1.png")
     assert str(folder) in told([str(folder), "seed=3"], render)

@@ -20,7 +20,7 @@ import yaml
 import plab
 import synthetic
 from browsing import browsing, press
-from plab.cli import leaderboard, submit, verify
+from plab.cli.submissions import leaderboard, submit, verify
 from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table
@@ -296,7 +296,7 @@ def test_results_become_a_submission(tmp_path: Path, card: Path, capsys: pytest.
     for variant in "12":
         result(folder, variant)
     result(folder, seed=1)
-    assert submit.main([str(folder), "seed=0", "--card", str(card), "--output", str(out)]) == 0
+    assert submit([str(folder), "seed=0", "--card", str(card), "--output", str(out)]) == 0
     assert capsys.readouterr().out.startswith(f"{out}: plans for 2 configuration(s), ")
     found = read(out)
     assert [e.configuration.name for e in found.entries] == ["Move-v1", "Move-v2"]
@@ -311,12 +311,12 @@ def test_mistakes_of_verify_and_leaderboard(tmp_path: Path, path: Path, told: Ca
     empty.mkdir()
     for source in (missing, str(empty), "sim.device=cpu"):
         named = "name a submission" if "=" in source else source
-        assert named in told([source], verify.main)
-    assert missing in told([missing], leaderboard.main)
-    line = told([str(path)], verify.main)
+        assert named in told([source], verify)
+    assert missing in told([missing], leaderboard)
+    line = told([str(path)], verify)
     assert str(path) in line and "scene of Move-v1" in line
     with_manifest(path, {"physics": 99, "plab": "9.0"})
-    line = told([str(path)], verify.main)
+    line = told([str(path)], verify)
     assert "physics version 99" in line and "9.0" in line
 
 
@@ -420,7 +420,7 @@ def test_the_paper_and_own_runs_are_the_first_entries(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_it_and_takes_no_text_for_html(folder: Path, tmp_path: Path) -> None:
-    assert leaderboard.main([str(folder), "--out", str(tmp_path)]) == 0
+    assert leaderboard([str(folder), "--out", str(tmp_path)]) == 0
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "&lt;b&gt;bold&lt;/b&gt;" in text and "<b>bold" not in text
     assert '<a href="https://example.org/mine" rel="nofollow noopener">plans</a>' in text
@@ -431,7 +431,7 @@ def test_the_page_shows_it_and_takes_no_text_for_html(folder: Path, tmp_path: Pa
 @pytest.mark.nightly
 @browsing
 def test_the_page_filters_and_sorts(browser, folder: Path, tmp_path: Path) -> None:
-    assert leaderboard.main([str(folder), "--out", str(tmp_path)]) == 0
+    assert leaderboard([str(folder), "--out", str(tmp_path)]) == 0
     browser.get((tmp_path / "index.html").as_uri())
     rows = "[...document.querySelector('.board').tBodies[0].rows].filter((row) => !row.hidden)"
     names = f"return {rows}.map((row) => row.cells[0].innerText.split('\\n')[0])"

@@ -17,7 +17,7 @@ from gymnasium.wrappers import RescaleAction
 from onnx import TensorProto, helper
 
 import plab  # noqa: F401
-from plab.cli import submit, verify
+from plab.cli.submissions import submit, verify
 from plab.config import load_config
 from plab.envs.core import EpisodeBatch
 from plab.envs.vector import PlabVectorEnv
@@ -63,7 +63,7 @@ def env() -> Iterator[gymnasium.Env]:
 
 def submission(tmp_path: Path, *argv: str) -> Path:
     made = tmp_path / "mine.plabsub.zip"
-    assert submit.main([*argv, "--card", str(CARD), "--output", str(made)]) == 0
+    assert submit([*argv, "--card", str(CARD), "--output", str(made)]) == 0
     return made
 
 
@@ -164,7 +164,7 @@ def test_claims_are_simulated_again_in_both_precisions(
         return replace(usual(self, actions, strict=strict), failures={4: "at step 2: not finite"})
 
     monkeypatch.setattr(EpisodeBatch, "step", broken)
-    assert verify.main([str(recorded), *COARSE]) == 1
+    assert verify([str(recorded), *COARSE]) == 1
     out, err = capsys.readouterr()
     false, broke = err.splitlines()
     assert all(
@@ -260,11 +260,11 @@ def test_a_policy_is_run_only_if_asked(
     assert [e.configuration.variant for e in entries] == ["1", "2", *UNSEEN[:2]]
     assert len({e.digests for e in entries}) == 4 and {e.steps for e in entries} == {60}
     assert max(e.score for e in entries) > 0
-    assert verify.main([str(made), *COARSE, "--float32"]) == 1
+    assert verify([str(made), *COARSE, "--float32"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "policies/RollingPin.pt" in line and "--run-policies" in line
     assert read_verification(read(made)).outcomes == {NOT_RUN}
-    assert verify.main([str(made), *COARSE, "--run-policies", "--float32"]) == 0
+    assert verify([str(made), *COARSE, "--run-policies", "--float32"]) == 0
     assert read_verification(read(made)).outcomes == {HOLDS}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from plab.cli.targets import moments
+from plab.cli.suite import moments
 from plab.config import load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.demonstrations import known_actions

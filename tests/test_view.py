@@ -20,7 +20,7 @@ from PIL import Image
 
 from browsing import BROWSER, DRIVER, browsing
 from plab import results
-from plab.cli.view import main
+from plab.cli.rollouts import view as main
 from plab.config import build_scene, load_config
 from plab.demonstrations import known_actions
 from plab.objective import spread_mass

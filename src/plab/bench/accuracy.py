@@ -30,8 +30,7 @@ from typing import cast
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.arguments import Parser, folder, positive, task_list
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, folder, positive, task_list
 from plab.cli.tables import measure_table
 from plab.config import build_scene
 from plab.demonstrations import known_actions

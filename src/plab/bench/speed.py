@@ -26,8 +26,7 @@ from plab.bench.workload import (
     peak_rss_mb,
     time_calls,
 )
-from plab.cli.arguments import Parser, positive, task_list, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, positive, task_list, to_write
 from plab.cli.tables import measure_table, write_markdown
 from plab.config import Config, load_config
 from plab.config.suite import suite_tasks

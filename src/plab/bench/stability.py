@@ -23,8 +23,7 @@ from typing import cast
 import numpy as np
 
 from plab.bench.workload import with_particles
-from plab.cli.arguments import Parser, positive, to_write
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table, print_table
 from plab.config import ConfigError, build_scene
 from plab.config.suite import SUITE_VARIANTS, suite_tasks

@@ -1,4 +1,4 @@
-"""The command ``plab``: one subcommand per module of this package.
+"""The command ``plab`` and its subcommands.
 
 plab run task=Rope method=adam seed=0     one run, or a sweep with -m
 plab status                               finished, running, failed and missing runs
@@ -25,21 +25,22 @@ from plab.errors import PlabError, pick, tell
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS = (
-    "run",
-    "status",
-    "report",
-    "results",
-    "render",
-    "view",
-    "export",
-    "demonstrations",
-    "targets",
-    "submit",
-    "verify",
-    "leaderboard",
-    "bench",
-)
+COMMANDS = {
+    "run": "plab.cli.run:main",
+    "status": "plab.cli.status:main",
+    "report": "plab.cli.report:main",
+    "results": "plab.cli.results:main",
+    "render": "plab.cli.rollouts:render",
+    "view": "plab.cli.rollouts:view",
+    "export": "plab.cli.rollouts:export",
+    "demonstrations": "plab.cli.suite:demonstrations",
+    "targets": "plab.cli.suite:targets",
+    "submit": "plab.cli.submissions:submit",
+    "verify": "plab.cli.submissions:verify",
+    "leaderboard": "plab.cli.submissions:leaderboard",
+    "bench": "plab.bench:main",
+}
+"""Module and function of each subcommand."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print((__doc__ or "").partition("\n\n")[2].rstrip())
         return 0
     if name not in COMMANDS:
-        tell(f"unknown command {name}; {pick(name, COMMANDS)}")
+        tell(f"unknown command {name}; {pick(name, list(COMMANDS))}")
         return PlabError.exit_code
-    module = importlib.import_module("plab.bench" if name == "bench" else f"plab.cli.{name}")
-    return int(module.main(rest))
+    module, _, function = COMMANDS[name].partition(":")
+    return int(getattr(importlib.import_module(module), function)(rest))

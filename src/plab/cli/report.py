@@ -15,8 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from plab.cli.arguments import Parser, add_sources, folder, sources_and_words
-from plab.cli.command import command_line
+from plab.cli.command import Parser, add_sources, command_line, folder, sources_and_words
 from plab.config.selection import select
 from plab.errors import tell
 from plab.progress import show_progress

@@ -13,16 +13,16 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from plab.cli.arguments import (
+from plab.cli.command import (
     Parser,
     add_forms,
     add_sources,
+    command_line,
     folder,
     positive,
     results_source,
     sources_and_words,
 )
-from plab.cli.command import command_line
 from plab.cli.tables import print_table
 from plab.config.selection import Selection, SelectionError, require_possible, select
 from plab.errors import tell

@@ -1,4 +1,4 @@
-"""Choice of a rollout on a command line: a run's best actions, or the best actions known for a task."""
+"""The commands ``plab render``, ``view`` and ``export``, which show a rollout: of a run, or of a task."""
 
 from __future__ import annotations
 
@@ -9,79 +9,202 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plab.cli.arguments import Parser, positive, sources_and_words
-from plab.config import load_config
+from plab.cli.command import Parser, command_line, folder, positive, require_writable, sources_and_words
+from plab.config import choices, load_config
 from plab.config.compose import check_sources
 from plab.config.selection import one_protocol, select
 from plab.config.words import IDLE, require_effect
-from plab.render.graphics import RenderError
+from plab.render.graphics import RenderError, require_graphics, require_packages
 
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["WITHOUT_EFFECT", "make_parser", "rollout", "settle"]
+__all__ = ["export", "render", "view"]
 
 WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
 """Keys of a configuration that change no picture."""
 
+_FRAME, _CELL, _STRIP_FRAME = (480, 360), (360, 150), (240, 180)
+"""Pixels of a film's frame, of a cell of the contact sheet, and of a frame of the film strip."""
 
-def make_parser(name: str, text: str, every: str) -> Parser:
-    """Return a parser with the arguments that choose a rollout, of which ``every`` says what has a frame
-    every K environment steps."""
+_LARGEST = 4096
+"""Pixels of a frame's side, at most: what every OpenGL can draw, and H.264 can hold."""
+
+
+@command_line
+def render(argv: Sequence[str]) -> None:
+    """Draw a run's best actions, the best actions known for a task, or all tasks.
+
+    plab render RESULT_FILE [--output FILE]
+    plab render (FOLDER | ARCHIVE | example) ... [task=... method=...] [--output FILE]
+    plab render KEY=VALUE ... [--output FILE]
+    plab render --contact-sheet FILE [KEY=VALUE ...]     start and target of every task and variant
+    plab render --film-strip FILE [KEY=VALUE ...]        frames of the best actions known for every task
+
+    Of folders and archives it takes the run with the highest score. The suffix of FILE decides what is
+    written:
+      .png         start, target and the rollout's end, side by side
+      .gif, .mp4   the rollout, with the target's ghost in it
+
+    EXAMPLES
+      plab render results/Rope-v1/adam/seed0-12ab34cd.h5
+      plab render example task=Rope method=adam --output rope.gif
+      plab render task=Torus variant=2 --output torus.gif
+    """
+    parser = _parser("render", render.__doc__, "a film")
+    add = parser.add_argument
+    add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
+    add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
+    add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
+    add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
+    options = parser.parse_intermixed_args(argv)
+    sheets = {".png": options.contact_sheet, ".jpg": options.film_strip}
+    suffix, path = next(((suffix, path) for suffix, path in sheets.items() if path), (".png", None))
+    if path is not None:
+        _check_sheet(parser, options, path, suffix)
+    else:
+        settle(options, suffix)
+        path = options.output
+    require_writable(path)
+    require_graphics()
+    # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
+    from plab.render import pictures
+    from plab.render.recording import demonstration, record, starts
+
+    if options.contact_sheet:
+        rows = {task: starts(cfgs) for task, cfgs in _of_all_tasks(options, variants=True)}
+        pictures.save_contact_sheet(rows, path, options.size or _CELL)
+    elif options.film_strip:
+        films = [record(cfg, demonstration(cfg)) for _, (cfg,) in _of_all_tasks(options, variants=False)]
+        pictures.save_film_strip(films, path, options.size or _STRIP_FRAME)
+    else:
+        pictures.check_output(path)
+        pictures.save(record(*rollout(options)), path, options.size or _FRAME, options.every or 1)
+    print(path)
+
+
+@command_line
+def view(argv: Sequence[str]) -> None:
+    """Write a page on which a run's best actions, or the best actions known for a task, are played in 3-D.
+
+    plab view RESULT_FILE [--output FILE.html]
+    plab view KEY=VALUE ... [--output FILE.html]
+
+    It plays in any browser: particles, manipulators, and the target as a ghost.
+
+    EXAMPLES
+      plab view results/Rope-v1/adam/seed0-12ab34cd.h5
+      plab view task=Torus variant=2 --output torus.html
+    """
+    parser = _parser("view", view.__doc__, "the page")
+    what = "by default a .html named like the result or the task"
+    parser.add_argument("--output", type=folder, metavar="FILE", help=what)
+    options = parser.parse_intermixed_args(argv)
+    output = settle(options, ".html")
+    if output.suffix.lower() != ".html":
+        raise RenderError(f"cannot write {output}: its suffix must be .html")
+    require_writable(output)
+    require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
+    from plab.render.recording import record_with_motion
+    from plab.view.page import page
+
+    text = page(record_with_motion(*rollout(options)), options.every)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(text, encoding="utf-8")
+    print(output)
+
+
+@command_line
+def export(argv: Sequence[str]) -> None:
+    """Write a run's best actions, or the best actions known for a task, for ParaView or Blender.
+
+    plab export RESULT_FILE [--format vtk|ply] [--output FOLDER]
+    plab export KEY=VALUE ... [--format vtk|ply] [--output FOLDER]
+
+    What is written into the folder:
+      vtk   for ParaView: particles, surface of the plasticine, manipulators, each a series (.pvd) over time
+      ply   for Blender: surface of the plasticine and manipulators, with colours, a file per frame
+    Both hold the target's surface, too.
+
+    EXAMPLES
+      plab export results/Rope-v1/adam/seed0-12ab34cd.h5
+      plab export task=Torus variant=2 --format ply --output torus
+    """
+    parser = _parser("export", export.__doc__, "the series")
+    parser.add_argument("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
+    what = "by default named like the result or the task"
+    parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)
+    options = parser.parse_intermixed_args(argv)
+    output = settle(options, f"-{options.format}")
+    require_writable(output / "target")
+    if output.is_dir() and any(output.iterdir()):
+        raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
+    require_packages("exports need", {"pyvista": "PyVista"}, "render")
+    from plab.export.files import write_ply, write_vtk
+    from plab.render.recording import record_with_motion
+
+    recording = record_with_motion(*rollout(options))
+    output.mkdir(parents=True, exist_ok=True)
+    (write_vtk if options.format == "vtk" else write_ply)(recording, output, options.every or 1)
+    print(output)
+
+
+# ---------------------------------------------------------------------------------------- choice of a rollout
+
+
+def _parser(name: str, text: str | None, every: str) -> Parser:
     parser = Parser(name, text)
     add = parser.add_argument
-    add(
-        "what",
-        nargs="*",
-        metavar="RESULTS | KEY=VALUE",
-        help="keys are those of plab run",
-    )
+    add("what", nargs="*", metavar="RESULTS | KEY=VALUE", help="keys are those of plab run")
     add("--every", type=positive, metavar="K", help=f"{every} has a frame every K environment steps")
     add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for plab run")
     return parser
 
 
-def settle(arguments: argparse.Namespace, ending: str) -> None:
+def settle(options: argparse.Namespace, ending: str) -> Path:
     """Find the rollout, as far as can be done without simulating.
 
     Adds ``result``, the result file or None, and ``config``, the configuration where there is none; and
     ``output`` where it was not given: named like the result, with ``ending`` for ``.h5``, and beside it (but
     not inside an archive), or like the task.
 
+    Returns:
+        The output.
+
     Raises:
         RenderError: If nothing is chosen, or two things are.
         plab.config.ConfigError: If the configuration is wrong.
     """
-    usual = _usual_output(arguments, ending)
-    arguments.output = arguments.output or usual
+    usual = _usual_output(options, ending)
+    options.output = options.output or usual
+    return options.output
 
 
-def _usual_output(arguments: argparse.Namespace, ending: str) -> Path:
-    sources, words = sources_and_words(arguments.what, default=None)
+def _usual_output(options: argparse.Namespace, ending: str) -> Path:
+    sources, words = sources_and_words(options.what, default=None)
     if sources and all(map(_holds_many, sources)):
-        arguments.result, name = _best(sources, words)
+        options.result, name = _best(sources, words)
         return Path(f"{name}{ending}")
     require_effect(words, WITHOUT_EFFECT, "a picture")
     if len(sources) > 1 or (sources and words):
-        raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(arguments.what)}'")
+        raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'")
     if sources:
-        # Imported here: it loads pandas, for which no mistake above should have to wait.
+        # Imported here, as below: it loads pandas, for which no mistake should have to wait.
         from plab.results.run_file import split_archive
 
-        arguments.result = sources[0]
-        folder = Path() if split_archive(arguments.result) else arguments.result.parent
-        return folder / (arguments.result.stem + ending)
+        (options.result,) = sources
+        place = Path() if split_archive(options.result) else options.result.parent
+        return place / (options.result.stem + ending)
     if not words:
         raise RenderError("say what to show: a result file, or a task such as task=Torus; --help explains")
-    arguments.result = None
-    cfg = arguments.config = load_config(words, arguments.config_dir)
+    options.result = None
+    cfg = options.config = load_config(words, options.config_dir)
     check_sources(cfg)
     return Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
 
 
 def _holds_many(source: Path) -> bool:
     """Return whether a source is a folder or an archive of results."""
-    # Imported here, as below: it loads pandas, for which no mistake should have to wait.
     from plab.results.schema import ARCHIVE_SUFFIX
 
     return str(source).endswith(ARCHIVE_SUFFIX) or source.is_dir()
@@ -103,10 +226,48 @@ def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
     return best.path, f"{task}-v{variant}-{method}-seed{seed}"
 
 
-def rollout(arguments: argparse.Namespace) -> tuple[Config, np.ndarray]:
+def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
     """Return configuration and actions, shape [T, A], of the rollout that :func:`settle` found."""
     from plab.render import recording
 
-    if arguments.result:
-        return recording.result(arguments.result)
-    return arguments.config, recording.demonstration(arguments.config)
+    if options.result:
+        return recording.result(options.result)
+    return options.config, recording.demonstration(options.config)
+
+
+# ------------------------------------------------------------------------------------- pictures of all tasks
+
+
+def _check_sheet(parser: Parser, options: argparse.Namespace, path: Path, suffix: str) -> None:
+    """Refuse what goes with no picture of all tasks."""
+    require_effect([word for word in options.what if "=" in word], WITHOUT_EFFECT, "a picture")
+    own = ("task=", "variant=") if options.contact_sheet else ("task=",)
+    unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
+    unwanted += ["--output"] if options.output else []
+    unwanted += ["--film-strip"] if options.contact_sheet and options.film_strip else []
+    if unwanted:
+        parser.error(f"a picture of all tasks: leave out '{unwanted[0]}'")
+    if path.suffix.lower() != suffix:
+        raise RenderError(f"cannot write {path}: it has to be a {suffix}")
+
+
+def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[str, list[Config]]]:
+    """Return the configurations of every task, of all its variants or of the default one."""
+    from omegaconf import OmegaConf
+
+    found = []
+    for task, path in choices("task", options.config_dir).items():
+        own = [[f"variant={name}"] for name in OmegaConf.load(path).variants] if variants else [[]]
+        words = [[f"task={task}", *variant, *options.what] for variant in own]
+        found.append((task, [load_config(each, options.config_dir) for each in words]))
+    return [(task, cfgs) for task, cfgs in found if cfgs]
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Read a size such as 480x360; H.264 needs even numbers."""
+    numbers = [int(number) for number in text.split("x") if number.isdecimal()]
+    if len(numbers) != 2 or any(number % 2 or not 16 <= number <= _LARGEST for number in numbers):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a size such as 480x360, of even numbers from 16 to {_LARGEST}"
+        )
+    return numbers[0], numbers[1]

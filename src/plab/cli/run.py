@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
-from plab.cli.arguments import Parser
-from plab.cli.command import command_line
+from plab.cli.command import Parser, command_line
 from plab.config import ConfigError, load_config
 from plab.config.compose import (
     EXPERIMENT,

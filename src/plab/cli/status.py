@@ -10,8 +10,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from plab.cli.arguments import Parser, add_forms, add_sources, sources_and_words
-from plab.cli.command import command_line
+from plab.cli.command import Parser, add_forms, add_sources, command_line, sources_and_words
 from plab.cli.tables import print_table
 from plab.config.selection import select
 from plab.status.survey import NAMES, STATES, Survey, survey

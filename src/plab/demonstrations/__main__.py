@@ -1,8 +1,6 @@
-"""``python -m plab.demonstrations``: see :mod:`plab.cli.demonstrations`."""
+"""``python -m plab.demonstrations``: the same as ``plab demonstrations``."""
 
-import sys
-
-from plab.cli.demonstrations import main
+from plab.cli.suite import demonstrations
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(demonstrations())

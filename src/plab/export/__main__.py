@@ -1,8 +1,6 @@
-"""``python -m plab.export``: rollouts for ParaView and Blender; see :mod:`plab.cli.export`."""
+"""``python -m plab.export``: the same as ``plab export``."""
 
-import sys
-
-from plab.cli.export import main
+from plab.cli.rollouts import export
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(export())

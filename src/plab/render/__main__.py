@@ -1,8 +1,6 @@
-"""``python -m plab.render``: pictures and films; see :mod:`plab.cli.render`."""
+"""``python -m plab.render``: the same as ``plab render``."""
 
-import sys
-
-from plab.cli.render import main
+from plab.cli.rollouts import render
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(render())

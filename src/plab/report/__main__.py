@@ -1,8 +1,6 @@
-"""``python -m plab.report``: tables, curves, notebooks and a page; see :mod:`plab.cli.report`."""
-
-import sys
+"""``python -m plab.report``: the same as ``plab report``."""
 
 from plab.cli.report import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,8 +1,6 @@
-"""``python -m plab.results``: result files; see :mod:`plab.cli.results`."""
-
-import sys
+"""``python -m plab.results``: the same as ``plab results``."""
 
 from plab.cli.results import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

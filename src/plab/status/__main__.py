@@ -1,8 +1,6 @@
-"""``python -m plab.status``: what is done, running, failed and missing; see :mod:`plab.cli.status`."""
-
-import sys
+"""``python -m plab.status``: the same as ``plab status``."""
 
 from plab.cli.status import main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -1,8 +1,6 @@
-"""``python -m plab.targets``: build and describe the suite's targets; see :mod:`plab.cli.targets`."""
+"""``python -m plab.targets``: the same as ``plab targets``."""
 
-import sys
-
-from plab.cli.targets import main
+from plab.cli.suite import targets
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(targets())

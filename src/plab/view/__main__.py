@@ -1,8 +1,6 @@
-"""``python -m plab.view``: a page that plays a rollout; see :mod:`plab.cli.view`."""
+"""``python -m plab.view``: the same as ``plab view``."""
 
-import sys
-
-from plab.cli.view import main
+from plab.cli.rollouts import view
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(view())

@@ -1,0 +1,219 @@
+"""The commands ``plab submit``, ``verify`` and ``leaderboard``."""
+
+from __future__ import annotations
+
+import shlex
+from argparse import ArgumentTypeError
+from collections.abc import Sequence
+from pathlib import Path
+
+import plab
+from plab.cli.command import Parser, command_line, folder, seed, sources_and_words, to_write
+from plab.cli.tables import print_table
+from plab.config.selection import select
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.errors import PlabError, tell
+from plab.report.series import BUDGETS
+from plab.report.templates import asset, render
+from plab.scenes import PRECISIONS
+from plab.submissions.board import board
+from plab.submissions.collecting import from_policies, from_sources, submission_files
+from plab.submissions.submission import (
+    CARD_BYTES,
+    SUFFIX,
+    UNSEEN,
+    Submission,
+    SubmissionError,
+    inconsistency,
+    parse_card,
+    read,
+    write,
+)
+from plab.submissions.verifying import TOLERANCE, Verification, write_verification
+from plab.submissions.verifying import verify as simulate_again
+from plab.targets.store import PHYSICS_VERSION
+
+__all__ = ["leaderboard", "submit", "verify"]
+
+EXIT_NOT_TRUE = 1
+
+_PACKAGE = "plab.submissions"
+"""Where the files of the page are."""
+
+
+@command_line
+def submit(argv: Sequence[str]) -> None:
+    """Pack what a method produced into one file for the leaderboard.
+
+    plab submit recordings --card card.yaml --output mine.plabsub.zip
+    plab submit results method=adam seed=0 --card card.yaml --output adam.plabsub.zip
+    plab submit --policy Move=move.pt --steps 100000 --card card.yaml --output policy.plabsub.zip
+
+    Recordings are written by plab.submissions.record; words such as method=adam choose among results. A
+    policy is run here, to see what it reaches; overrides such as sim.device=cuda may follow.
+    """
+    parser = Parser("submit", submit.__doc__)
+    add = parser.add_argument
+    what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
+    add("sources", nargs="*", metavar="RESULTS | KEY=VALUE", help=what)
+    add("--card", type=Path, required=True, help="YAML file about the method")
+    add("--output", type=to_write, required=True, help=f"file to write, <name>{SUFFIX}")
+    what = "TASK=FILE: TorchScript (.pt) or ONNX (.onnx) for a task's variants; may be repeated"
+    add("--policy", type=_policy, action="append", default=[], help=what)
+    add("--steps", type=seed, help="with --policy: environment steps that the training of each took")
+    what = f"with --policy: act in the {len(UNSEEN)} unseen configurations of the task, too"
+    add("--unseen", action="store_true", help=what)
+    options = parser.parse_intermixed_args(argv)
+    sources, words = sources_and_words(options.sources, default=None)
+    if bool(options.policy) == bool(sources):
+        parser.error("give either recordings or results, or --policy")
+    if bool(options.policy) != (options.steps is not None):
+        parser.error("--policy and --steps go together")
+    if options.unseen and not options.policy:
+        parser.error("--unseen is for --policy")
+    try:
+        with options.card.open("rb") as file:
+            card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
+    except OSError as error:
+        raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
+    if options.policy:
+        variants = (*SUITE_VARIANTS, *UNSEEN) if options.unseen else SUITE_VARIANTS
+        entries, files = from_policies(dict(options.policy), variants, options.steps, words)
+        submission = Submission(card, tuple(entries), files)
+    else:
+        chosen = select(words, ("task", "variant", "method", "seed"))
+        submission = Submission(card, tuple(from_sources(sources, chosen)))
+    if fault := inconsistency(submission):
+        raise SubmissionError(fault)
+    write(submission, options.output)
+    configurations = {entry.configuration for entry in submission.entries}
+    size = options.output.stat().st_size / 1e3
+    print(f"{options.output}: {submission.track} for {len(configurations)} configuration(s), {size:.1f} kB")
+
+
+def _policy(text: str) -> tuple[str, Path]:
+    """Read ``Move=move.pt``."""
+    task, _, name = text.partition("=")
+    path = Path(name)
+    if task not in suite_tasks() or path.suffix not in (".pt", ".onnx"):
+        raise ArgumentTypeError(f"'{text}' is not like Move=move.pt or Move=move.onnx")
+    return task, path
+
+
+@command_line
+def verify(argv: Sequence[str]) -> int:
+    """Simulate submissions again and say what they really score, in float32 and in float64.
+
+    plab verify mine.plabsub.zip
+    plab verify submissions --run-policies sim.device=cuda
+
+    Exit code: 0 if all claims hold, 1 if one does not or was not run, 2 if a file cannot be judged. What was
+    found is kept beside each file, for plab leaderboard. Plans are data; policies are programs of other
+    people, and run only if --run-policies is given.
+    """
+    parser = Parser("verify", verify.__doc__)
+    what = f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda"
+    parser.add_argument("arguments", nargs="+", help=what)
+    what = "run the policies in the files: programs of other people, so do it where they can do no harm"
+    parser.add_argument("--run-policies", action="store_true", help=what)
+    parser.add_argument("--float32", action="store_true", help="leave float64 out")
+    options = parser.parse_intermixed_args(argv)
+    sources, words = sources_and_words(options.arguments, default=None)
+    if not sources:
+        parser.error("name a submission, or a folder of them")
+    precisions = PRECISIONS[:1] if options.float32 else PRECISIONS
+    codes = []
+    for path in _submissions(sources):
+        try:
+            submission = read(path)
+            found = simulate_again(
+                submission, words, run_policies=options.run_policies, precisions=precisions
+            )
+        except PlabError as error:
+            # A file that cannot be judged does not keep the others from it.
+            tell(str(error))
+            codes.append(error.exit_code)
+            continue
+        _show(submission, found, precisions)
+        # Of a policy that was not run one line is enough.
+        for why in dict.fromkeys(verdict.why for verdict in found.verdicts if verdict.why):
+            tell(f"{path}: {why}")
+        kept = write_verification(found, path)
+        good = sum(verdict.outcome == "holds" for verdict in found.verdicts)
+        print(f"{path}: {good} of {len(found.verdicts)} claim(s) hold; kept in {kept}")
+        codes.append(0 if good == len(found.verdicts) else EXIT_NOT_TRUE)
+    return max(codes)
+
+
+def _submissions(sources: Sequence[Path]) -> list[Path]:
+    found = []
+    for source in sources:
+        if source.is_file():
+            # Whatever it is called: reading says what is wrong with it.
+            found.append(source)
+        elif not source.exists():
+            raise SubmissionError(f"{source} does not exist")
+        elif not (inside := submission_files(source)):
+            raise SubmissionError(f"{source} has no submissions, files <name>{SUFFIX}")
+        else:
+            found += inside
+    return found
+
+
+def _show(submission: Submission, verification: Verification, precisions: Sequence[str]) -> None:
+    name = submission.card.name if submission.card else "a recording"
+    version = f"plab {submission.plab}"
+    if submission.plab != plab.__version__:
+        version += f", simulated by plab {plab.__version__}"
+    print(f"{name}: {submission.track}, {version}")
+    rows = []
+    for verdict in verification.verdicts:
+        entry, scores = verdict.entry, verdict.scores
+        numbers = [f"{scores[p]:.4f}" if p in scores else "" for p in precisions]
+        first = scores.get(precisions[0])
+        difference = "" if first is None else f"{first - entry.score:+.4f}"
+        claim = (entry.configuration.name, f"{entry.steps:,}", f"{entry.score:.4f}")
+        rows.append((*claim, *numbers, difference))
+    print_table(("configuration", "steps", "claimed", *precisions, "difference"), rows)
+
+
+@command_line
+def leaderboard(argv: Sequence[str]) -> None:
+    """Write one static page from a folder of submissions: tracks, equal budgets, a table for each protocol.
+
+    plab leaderboard submissions
+    plab leaderboard submissions --out public/leaderboard
+
+    Run plab verify on the folder before: what it has kept is shown. The page is index.html; it needs no
+    server.
+    """
+    parser = Parser("leaderboard", leaderboard.__doc__)
+    parser.add_argument("folder", type=folder, help="folder of submissions")
+    what = "settings of a leaderboard of your own, such as sim.grid_size=32"
+    parser.add_argument("overrides", nargs="*", help=what)
+    what = "folder to write to (default: reports/leaderboard)"
+    parser.add_argument("--out", type=folder, default=Path("reports/leaderboard"), help=what)
+    options = parser.parse_intermixed_args(argv)
+    made = board(options.folder, options.overrides)
+    html = render(
+        "leaderboard.html",
+        _PACKAGE,
+        style=asset("page.css") + asset("leaderboard.css", _PACKAGE),
+        script=asset("theme.js") + asset("leaderboard.js", _PACKAGE),
+        board=made,
+        budgets=[f"{count / 1e6:g}M" if count >= 1e6 else f"{count / 1e3:g}k" for count in BUDGETS],
+        tasks=suite_tasks(),
+        tolerance=TOLERANCE,
+        origin={
+            "command": shlex.join(["plab", "leaderboard", *argv]),
+            "plab": plab.__version__,
+            "physics": PHYSICS_VERSION,
+            "overrides": options.overrides,
+        },
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "index.html"
+    path.write_text(html, encoding="utf-8", newline="\n")
+    for line in made.left_out:
+        tell(f"left out: {line}")
+    print(f"{path}: {sum(len(section.lines) for section in made.sections)} lines")

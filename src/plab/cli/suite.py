@@ -1,0 +1,231 @@
+"""The commands ``plab demonstrations`` and ``plab targets``, about all tasks and variants of the suite."""
+
+from __future__ import annotations
+
+import time
+from argparse import Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from plab.cli.command import Parser, command_line, sources_and_words, task_list, to_write
+from plab.cli.tables import print_table, write_csv, write_markdown
+from plab.config import Config, ConfigError, build_scene, load_config
+from plab.config.compose import check_sources
+from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.words import IDLE, require_effect
+from plab.demonstrations import action_names, known_actions, save_actions
+from plab.files import cache_dir
+from plab.objective import Scores, mass_change, target_sdf
+from plab.problem import Problem, make_targets
+from plab.render.recording import stored
+from plab.results.table import Row, readable_rows
+from plab.sim import Simulator
+from plab.targets import EPISODE_STEPS
+from plab.targets.scripted import DECIMALS
+
+__all__ = ["ReplayedDemonstration", "demonstrations", "moments", "replay", "targets"]
+
+HEADING = """\
+# Demonstrations
+
+Look up what the best actions known score in each variant, in the hard contact model; made by
+`plab demonstrations --markdown docs/demonstrations.md`, which prints more.
+[suite.md](suite.md#demonstrations) explains.
+
+"""
+
+
+def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str) -> Namespace:
+    """Add what both commands share, parse, and refuse overrides that have no effect on ``what``."""
+    add = parser.add_argument
+    add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
+    add("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
+    options = parser.parse_intermixed_args(argv)
+    options.sources, options.overrides = sources_and_words(options.overrides, default=None)
+    if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
+        parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
+    require_effect(options.overrides, idle, what)
+    return options
+
+
+def _configs(task: str, overrides: Sequence[str]) -> list[Config]:
+    """Return the configurations of a task's variants, the first of them checked."""
+    cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
+    check_sources(cfgs[0])
+    return cfgs
+
+
+# -------------------------------------------------------------------------------------------- demonstrations
+
+
+@dataclass(frozen=True)
+class ReplayedDemonstration:
+    """A demonstration, actions of shape [T, A], what they reach in the hard contact model, and what doing
+    nothing reaches."""
+
+    cfg: Config
+    actions: np.ndarray
+    scores: Scores
+    idle: Scores
+
+
+@command_line
+def demonstrations(argv: Sequence[str]) -> None:
+    """Replay and record demonstrations.
+
+    plab demonstrations                          replay all and print a table
+    plab demonstrations --task Torus,Rope        only these
+    plab demonstrations results                  the best runs of some results where they score more
+    plab demonstrations --record                 record what is replayed and what it reaches
+
+    Overrides of the configuration, such as sim.device=cuda, may follow.
+    """
+    parser = Parser("demonstrations", demonstrations.__doc__)
+    parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
+    parser.add_argument("--record", action="store_true", help="record what is replayed")
+    options = _options(parser, argv, ("method", "seed", *IDLE), "demonstrations")
+    tasks = [_configs(task, options.overrides) for task in options.task]
+    runs = readable_rows(options.sources)[0] if options.sources else []
+    rows = []
+    for cfgs in tasks:
+        own = [f"task={cfgs[0].task.name}", f"variant={cfgs[0].variant}"]
+        if options.record and build_scene(cfgs[0]) != build_scene(load_config(own)):
+            why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
+            raise ConfigError(why)
+        replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
+        found = [_found(cfg, runs) for cfg in cfgs]
+        if any(actions is not None for actions in found):
+            pairs = zip(replays, replay(cfgs, found), strict=True)
+            replays = [max(pair, key=lambda item: item.scores.score) for pair in pairs]
+        for item in replays if options.record else ():
+            names = action_names(build_scene(item.cfg))
+            save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
+        rows += [_row(item) for item in replays]
+    print_table(list(rows[0]), [list(row.values()) for row in rows])
+    if options.markdown is not None:
+        by_task: dict[str, dict[str, str]] = {}
+        for row in rows:
+            line = by_task.setdefault(row["task"], {"task": row["task"], "target": row["target"]})
+            line[row["variant"]] = row["score"]
+        write_markdown(options.markdown, HEADING, ("task", "target", *SUITE_VARIANTS), by_task.values())
+
+
+def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch, and an episode without
+    motion, which takes the place of actions that are None."""
+    problem = Problem(cfgs)
+    problem.simulator.set_contact("hard")
+    still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
+    tried = np.stack([still if item is None else item for item in actions])
+    reached = problem.rollout(tried, gradient=False).scores
+    idle = problem.rollout(np.zeros_like(tried), gradient=False).scores
+    return [ReplayedDemonstration(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
+
+
+def _found(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
+    """Return the actions of the run with the highest score that has a configuration's scene and target,
+    rounded as they are recorded; None without one, or where a script's actions are the demonstration."""
+    if "seed" in cfg.task.target:
+        return None
+    names = cfg.task.name, cfg.variant
+    fitting = [row for row in runs if (row.values["task"], row.values["variant"]) == names]
+    for row in sorted(fitting, key=lambda row: np.nan_to_num(row.values["score_best"]), reverse=True):
+        own = row.config["targets"]["source"] is None and row.config["task"]["target"] == cfg.task.target
+        if own and row.values["status"] == "finished":
+            run, actions = stored(row.path)
+            if build_scene(run) == build_scene(cfg):
+                return np.round(actions, DECIMALS)
+    return None
+
+
+def _row(item: ReplayedDemonstration) -> dict[str, str]:
+    moving = np.flatnonzero(np.abs(item.actions).max(axis=1) > 0)
+    return {
+        "task": item.cfg.task.name,
+        "variant": item.cfg.variant,
+        "target": item.cfg.task.target["recipe"],
+        "steps": str(int(moving[-1]) + 1 if len(moving) else 0),
+        "IoU at start": f"{item.scores.iou_initial:.3f}",
+        "IoU of target": f"{item.scores.iou_target_self:.3f}",
+        "score": f"{item.scores.score:.3f}",
+        "score at rest": f"{item.idle.score:.3f}",
+    }
+
+
+# --------------------------------------------------------------------------------------------------- targets
+
+
+@command_line
+def targets(argv: Sequence[str]) -> None:
+    """Build, cache and describe the targets of the suite.
+
+    plab targets                       all fifty
+    plab targets --task Torus,Rope     only these
+    plab targets --rebuild             simulate even what is cached
+    plab targets --csv moments.csv     write what is printed to a file, too
+
+    Overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it describes the
+    targets of the original release.
+    """
+    parser = Parser("targets", targets.__doc__)
+    parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
+    parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
+    options = _options(parser, argv, ("method", "seed", "sim.memory_mb", *IDLE), "targets")
+    if options.rebuild and any(word.startswith("targets.source=") for word in options.overrides):
+        parser.error("--rebuild has no effect with targets.source: leave one of them out")
+    table = pd.concat([moments(task, options.overrides, options.rebuild) for task in options.task])
+    print_table(list(table.columns), table.itertuples(index=False, name=None), digits=4)
+    print(f"simulated targets are kept in {cache_dir() / 'targets'}")
+    if options.csv is not None:
+        kept = table.drop(columns="seconds")
+        write_csv(options.csv, [kept.columns, *kept.itertuples(index=False, name=None)], digits=6)
+
+
+def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> pd.DataFrame:
+    """Build the targets of a task and describe them.
+
+    Args:
+        task: Name of a task of the suite.
+        overrides: Of the configuration.
+        rebuild: Simulate even what is cached.
+
+    Returns:
+        A row per variant: total mass in particle masses, largest node mass in particle masses, centroid and
+        standard deviation along x, y, z [domain units], share of the mass that has to move from the start,
+        mean distance of the start's mass from the target [domain units], seconds that building took on
+        average.
+    """
+    cfgs = _configs(task, overrides)
+    for cfg in cfgs:
+        check_sources(cfg)
+    sim = cfgs[0].sim
+    scenes = [build_scene(cfg) for cfg in cfgs]
+    start = time.perf_counter()
+    simulator = Simulator(scenes, precision=sim.precision, device=sim.device)
+    masses = make_targets(cfgs, simulator, rebuild=rebuild)
+    seconds = (time.perf_counter() - start) / len(cfgs)
+    starts = simulator.mass_tensor()
+    rows = [
+        {"task": task, "variant": variant}
+        | _moments(mass / scene.particle_mass)
+        | {
+            "moved": 0.5 * float(np.abs(mass_change(first, mass)).sum()),
+            "distance": float((first / first.sum() * target_sdf(mass)).sum()),
+            "seconds": seconds,
+        }
+        for variant, mass, first, scene in zip(SUITE_VARIANTS, masses, starts, scenes, strict=True)
+    ]
+    return pd.DataFrame(rows)
+
+
+def _moments(mass: np.ndarray) -> dict[str, float]:
+    """Total, peak, centroid and standard deviation of a mass tensor, shape [n, n, n]."""
+    node = np.indices(mass.shape).reshape(3, -1) / mass.shape[0]
+    share = mass.reshape(-1) / mass.sum()
+    centroid = node @ share
+    spread = np.sqrt(((node - centroid[:, None]) ** 2) @ share)
+    named = zip(("x", "y", "z", "std_x", "std_y", "std_z"), (*centroid, *spread), strict=True)
+    return {"mass": float(mass.sum()), "peak": float(mass.max())} | {k: float(v) for k, v in named}
