@@ -28,12 +28,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.errors import COMPOSE_ERRORS, explain
 from plab.config.families import family, schemas
 from plab.config.run import Config
 from plab.config.suite import conf_folder
 from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
-from plab.config.words import parse, prepared, quoted
+from plab.config.words import COMPOSE_ERRORS, explain, parse, prepared, quoted
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3

@@ -9,28 +9,6 @@ from typing import Any, cast
 
 from plab.errors import ConfigError, pick
 
-__all__ = [
-    "COUNT",
-    "DECAYS",
-    "FINITE",
-    "FRACTION",
-    "NAME",
-    "NOT_NEGATIVE",
-    "POINT",
-    "POSITIVE",
-    "SHARE",
-    "THREADS",
-    "UNIT",
-    "WIDTHS",
-    "Section",
-    "at_least",
-    "folder_name",
-    "one_of",
-    "positive",
-    "vector",
-    "within",
-]
-
 
 def folder_name(path: str, value: str) -> None:
     """Raise :class:`ConfigError` unless a name can be that of a folder."""
@@ -58,19 +36,13 @@ def at_least(path: str, value: float, low: float, *, finite: bool = False) -> No
         raise ConfigError(f"{path} must be at least {limit}, not {value:g}")
 
 
-def _fraction(path: str, value: float) -> None:
-    if not 0 <= value < 1:
-        raise ConfigError(f"{path} must be in [0, 1), not {value:g}")
+def _interval(path: str, value: float, text: str, holds: Callable[[float], bool]) -> None:
+    if not holds(value):
+        raise ConfigError(f"{path} must be in {text}, not {value:g}")
 
 
-def _share(path: str, value: float) -> None:
-    if not 0 < value <= 1:
-        raise ConfigError(f"{path} must be in (0, 1], not {value:g}")
-
-
-def _unit(path: str, value: float) -> None:
-    if not 0 <= value <= 1:
-        raise ConfigError(f"{path} must be in [0, 1], not {value:g}")
+def _is_fraction(value: float) -> bool:
+    return 0 <= value < 1
 
 
 def vector(path: str, value: Sequence[float], length: int) -> None:
@@ -82,7 +54,7 @@ def vector(path: str, value: Sequence[float], length: int) -> None:
 def _decays(path: str, value: Sequence[float]) -> None:
     vector(path, value, 2)
     for decay in value:
-        _fraction(path, decay)
+        _interval(path, decay, "[0, 1)", _is_fraction)
 
 
 def _widths(path: str, value: Sequence[int]) -> None:
@@ -98,10 +70,12 @@ def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str
 POSITIVE = within(positive)
 COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
 FINITE = within(at_least, 0, finite=True)
-FRACTION, SHARE, UNIT = within(_fraction), within(_share), within(_unit)
+FRACTION = within(_interval, "[0, 1)", _is_fraction)
+SHARE = within(_interval, "(0, 1]", lambda value: 0 < value <= 1)
+UNIT = within(_interval, "[0, 1]", lambda value: 0 <= value <= 1)
 POINT, DECAYS = within(vector, 3), within(_decays)
 NAME, THREADS, WIDTHS = within(folder_name), COUNT, within(_widths)
-"""What fields have to be; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
+"""Metadata of fields; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
 
 
 class Section:

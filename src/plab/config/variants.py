@@ -15,9 +15,8 @@ import numpy as np
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.errors import explain
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
-from plab.config.words import parse
+from plab.config.words import explain, parse
 from plab.errors import ConfigError, pick
 from plab.scenes import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
