@@ -12,9 +12,10 @@ import numpy as np
 
 from plab.config import load_config
 from plab.config.families import family
+from plab.config.identity import member_name
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.objective import scores_from_iou
-from plab.results import RunResult, config_dict, config_hash, result_path, write
+from plab.results import RunResult, config_dict, config_hash, write
 from plab.results.provenance import now, provenance
 from plab.results.schema import COLUMNS, loss_columns
 
@@ -118,6 +119,6 @@ def write_runs(runs: int, rows: int, folder: Path) -> None:
         folder: Folder of results.
     """
     for config in _configs(runs, rows, folder):
-        path = result_path(config)
+        path = folder / member_name(config, config_hash(config))
         path.parent.mkdir(parents=True, exist_ok=True)
         write(synthetic_run(config, rows=rows), path, compress=False)

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from plab.config import Config
-from plab.results import RunResult, read, result_path
+from plab.results import RunResult, read
 from plab.results.run_file import RunFile
 from plab.runners.runner import SimulatorCache
 
@@ -35,7 +35,7 @@ def assert_same_numbers(got: RunResult, want: RunResult) -> None:
 
 def finished_as(cfg: Config, want: RunResult) -> RunResult:
     """Assert that a configuration's file is finished and the same as another run of it; return it."""
-    got = read(result_path(cfg))
+    got = read(cfg.path)
     assert got.status == "finished" and got.config_hash == want.config_hash
     assert_same_numbers(got, want)
     return got

@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from plab.results import RunResult, result_path, write
+from plab.config.identity import config_hash, member_name
+from plab.results import RunResult, write
 from synthetic_runs import synthetic_run, template
 
 ROWS = 4
@@ -46,7 +47,8 @@ def cut(result: RunResult, rows: int) -> RunResult:
 
 def save(result: RunResult) -> Path:
     """Write a result to its place and return that."""
-    path = result_path(result.config)
+    config = result.config
+    path = Path(config["results_dir"]) / member_name(config, config_hash(config))
     if result.status != "finished":
         path = path.with_suffix(".partial.h5")
     path.parent.mkdir(parents=True, exist_ok=True)

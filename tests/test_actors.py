@@ -15,7 +15,7 @@ import unseen
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
 from plab.problem import Trials
-from plab.results import RunResult, read, result_path
+from plab.results import RunResult, read
 from plab.runners import actors, run_config
 from plab.runners.actor_networks import ActorPolicy, ShacPolicy
 from plab.runners.actors import DEVIATION_MIN, training_scenes
@@ -66,7 +66,7 @@ def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
 
 def run(cfg: Config) -> RunResult:
     run_config(cfg, CACHE)
-    return read(result_path(cfg))
+    return read(cfg.path)
 
 
 @pytest.fixture(scope="module", params=METHODS)
@@ -124,7 +124,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunRe
     for written in (1, 2):
         with stopped_at(1):
             run_config(cfg, CACHE)
-        assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == written
+        assert len(read(cfg.path.with_suffix(".partial.h5")).iterations) == written
     run(cfg)
     again = finished_as(cfg, finished)
     assert policy_path(again.path).read_bytes() == policy_path(finished.path).read_bytes()

@@ -10,7 +10,7 @@ import pytest
 from cuda_scenes import ALL, assert_agreement, assert_same_bits, computed, results_of, simulator_of
 from plab.config import load_config
 from plab.problem import Problem
-from plab.results import read, result_path
+from plab.results import read
 from plab.runners import run_config
 
 DETERMINISTIC = ["task=Move", "sim.device=cuda", "sim.deterministic=true"]
@@ -40,7 +40,7 @@ def test_two_runs_of_adam_end_with_the_same_actions(tmp_path: Path) -> None:
     cfgs = [load_config([*words, f"results_dir={tmp_path / folder}"]) for folder in ("once", "again")]
     for cfg in cfgs:
         run_config(cfg)
-    once, again = (read(result_path(cfg)) for cfg in cfgs)
+    once, again = (read(cfg.path) for cfg in cfgs)
     assert once.best_actions.tobytes() == again.best_actions.tobytes()
     for column in ("loss", "score"):
         assert once.iterations[column].to_numpy().tobytes() == again.iterations[column].to_numpy().tobytes()

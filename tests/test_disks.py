@@ -18,7 +18,7 @@ from faults import DEATH, Death, Failing, contents, watched
 from plab.cli import status
 from plab.cli.run import main
 from plab.config import ConfigError
-from plab.results import SCHEMA_VERSION, RunFile, read, result_path
+from plab.results import SCHEMA_VERSION, RunFile, read
 from plab.results.locks import acquire, held, lock_path
 from plab.runners import run_batch
 from refusals import snapshot
@@ -68,7 +68,7 @@ def test_a_batch_is_completed_after_a_failure_at_any_event(monkeypatch, error: i
             if one.status == "refused":
                 assert os.strerror(error) in one.message and "results/Rope-v1/adam" in one.message
         for cfg in cfgs:
-            path, partial = result_path(cfg), result_path(cfg).with_suffix(".partial.h5")
+            path, partial = cfg.path, cfg.path.with_suffix(".partial.h5")
             if left := next((one for one in (path, partial) if one.exists()), None):
                 losses = read(left).iterations["loss"].tolist()
                 assert losses == toy_runner.expected(cfg)[: len(losses)]
@@ -84,9 +84,9 @@ def test_a_finished_sweep_on_a_disk_that_is_read_only_ends_well(capsys) -> None:
     """Also with leftovers of a process that was killed just after it had finished a run."""
     assert main(list(SWEEP)) == 0
     cfgs = configs()
-    lock_path(result_path(cfgs[0])).touch()
+    lock_path(cfgs[0].path).touch()
     for suffix in (".lock", ".partial.h5", ".replay", ".partial.h5.77.tmp"):
-        result_path(cfgs[1]).with_suffix(suffix).write_bytes(result_path(cfgs[1]).read_bytes())
+        cfgs[1].path.with_suffix(suffix).write_bytes(cfgs[1].path.read_bytes())
     before = snapshot(Path())
     with watched(Path(), Failing(0, errno.EROFS, lasting=True)):
         assert main(list(SWEEP)) == 0
@@ -104,7 +104,7 @@ def test_a_finished_sweep_on_a_disk_that_is_read_only_ends_well(capsys) -> None:
 
 def test_damaged_files_are_computed_again_and_newer_ones_left_alone(capsys, caplog) -> None:
     assert main(list(SWEEP)) == 0
-    cut, newer = (result_path(cfg) for cfg in configs()[:2])
+    cut, newer = (cfg.path for cfg in configs()[:2])
     cut.write_bytes(cut.read_bytes()[:1000])
     with h5py.File(newer, "r+") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION + 1
@@ -126,7 +126,7 @@ def test_files_of_a_refused_run_are_removed_unless_an_earlier_process_left_them(
     (old,) = configs("checkpoint_seconds=1000", seeds=(0,))
     with raising(ConfigError("method.thing=1"), 5, toy_runner, "advance"):
         assert [one.status for one in run_batch([old])] == ["refused"]
-    left = read(result_path(old).with_suffix(".partial.h5"))
+    left = read(old.path.with_suffix(".partial.h5"))
     assert (left.status, left.rows) == ("failed", 5)
 
     def refuse(jobs) -> None:
@@ -141,9 +141,9 @@ def test_files_of_a_refused_run_are_removed_unless_an_earlier_process_left_them(
         assert main([*COARSE, "seed=1"]) == main(["-m", *COARSE, "seed=2,3"]) == 2
         assert snapshot(Path()) == before and "method.thing" in capsys.readouterr().err
         assert [one.status for one in run_batch([old])] == ["refused"]
-        assert before.items() <= snapshot(Path()).items() and not held(result_path(old))
-    shutil.rmtree(result_path(old).with_suffix(".tensorboard"))
-    result_path(old).with_suffix(".replay").unlink()
+        assert before.items() <= snapshot(Path()).items() and not held(old.path)
+    shutil.rmtree(old.path.with_suffix(".tensorboard"))
+    old.path.with_suffix(".replay").unlink()
     run_batch([old])
     assert_complete([old])
 

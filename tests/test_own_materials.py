@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from plab.config import Config, build_scene, load_config
-from plab.results import config_dict, config_hash
+from plab.results import config_dict
 from plab.run import main
 from plab.submissions.submission import Digests
 from plab.sweep.plan import plan
@@ -76,7 +76,7 @@ def test_materials_are_recorded_and_told_apart():
     assert {key: bodies["cushion"][key] for key in RUBBER} == RUBBER
     assert not RUBBER.keys() & bodies["dough"].keys()
     changes = ((), ("variant=2",), ("task.bodies.dough.yield_stress=50",))
-    assert len({config_hash(example(*extra)) for extra in changes}) == 3
+    assert len({example(*extra).hash for extra in changes}) == 3
     text = json.dumps(build_scene(load_config(["task=Assembly"])).facts())
     assert all(text.count(f'"{key}"') == 1 for key in RUBBER)
     cfgs = [example(f"variant={variant}") for variant in "123"]

@@ -19,7 +19,7 @@ from plab.files import ShapeError
 from plab.objective import spread_mass, target_sdf
 from plab.render.graphics import RenderError
 from plab.render.recording import stored
-from plab.results import config_dict, config_hash, load
+from plab.results import config_dict, load
 from plab.scenes import Body, Scene, make_body, sample_particles
 from plab.scenes.mesh import load_mesh
 from plab.targets import TargetError, build_target
@@ -253,9 +253,9 @@ def test_a_changed_file_is_another_configuration_and_a_moved_one_is_not(tmp_path
     (tmp_path / "star.obj").unlink()
     moved = example(f"task.bodies.star.sha256={digest}")
     assert moved.task.bodies["star"].file == str(EXAMPLE / "star.obj")
-    assert config_hash(moved) == config_hash(first)
+    assert moved.hash == first.hash
     (tmp_path / "star.obj").write_text(obj(BOX))
-    assert config_hash(example()) != config_hash(first)
+    assert example().hash != first.hash
     for refusal, build in (
         (ConfigError, lambda: example("task.bodies.star.sha256=abc")),
         (ConfigError, lambda: build_scene(first)),

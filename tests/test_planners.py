@@ -16,7 +16,7 @@ import reference_mpm as reference
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
 from plab.objective import spread_mass
 from plab.problem import Problem
-from plab.results import BUDGETS, RunResult, checking, read, result_path
+from plab.results import BUDGETS, RunResult, checking, read
 from plab.results.checking import faults
 from plab.runners import RunError, run_batch, run_config, runner
 from plab.runners.planners import planner
@@ -262,7 +262,7 @@ def make_config(folder: Path, method: str, *overrides: str) -> Config:
 
 def run(cfg: Config) -> RunResult:
     run_config(cfg, CACHE)
-    return read(result_path(cfg))
+    return read(cfg.path)
 
 
 @pytest.fixture(scope="module")
@@ -319,7 +319,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(finished, tmp_path: Path, monke
         with monkeypatch.context() as patch, pytest.raises(OSError, match="gone"):
             stop_before(patch, count)
             run_config(cfg, CACHE)
-        assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == count
+        assert len(read(cfg.path.with_suffix(".partial.h5")).iterations) == count
     resumed = run(cfg)
     assert_same_numbers(resumed, finished[method])
     assert resumed.provenance["resumed"] == rows - 1
@@ -357,7 +357,7 @@ def test_a_batch_gives_each_run_what_it_gives_alone(finished, others, halved, tm
     assert plan(cfgs, 3) == [cfgs]
     assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 2
     for cfg, want in zip(cfgs, (finished[method], others[method]), strict=True):
-        got = read(result_path(cfg))
+        got = read(cfg.path)
         assert_same_numbers(got, want)
         assert (got.provenance["batch"], want.provenance["batch"]) == (2, 1)
 
@@ -371,8 +371,8 @@ def test_a_batch_goes_on_where_each_of_its_runs_stands(
         run_config(first, CACHE)
     # One is in its second stage, the other in its first.
     run_batch([first, other], cache=CACHE)
-    assert_same_numbers(read(result_path(first)), finished["solve"])
-    assert_same_numbers(read(result_path(other)), others["solve"])
+    assert_same_numbers(read(first.path), finished["solve"])
+    assert_same_numbers(read(other.path), others["solve"])
 
 
 def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, monkeypatch) -> None:
@@ -389,7 +389,7 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
         monkeypatch.setattr(module, "SOLVED", enough)
     cfgs = [make_config(tmp_path, "cem"), make_config(tmp_path, "cem", *OTHER)]
     run_batch(cfgs, cache=CACHE)
-    results = [read(result_path(cfg)) for cfg in cfgs]
+    results = [read(cfg.path) for cfg in cfgs]
     assert [result.iterations["score"].tolist() for result in results] == until(enough)
     assert [faults(result) for result in results] == [[], []]
     shorter = min(results, key=lambda result: len(result.iterations))

@@ -13,7 +13,7 @@ import pytest
 from plab.config import ConfigError, MethodConfig, load_config
 from plab.config.families import FAMILIES, Family
 from plab.plugins import load_object, passed_on, search_in
-from plab.results import check, read, result_path
+from plab.results import check, read
 from plab.runners import Runner, run_batch
 from plab.sweep.plan import plan
 
@@ -99,7 +99,7 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
         load_config([*words, "method.optimizer=adam"], folder)
     assert plan(cfgs) == [cfgs]
     assert [one.status for one in run_batch(cfgs)] == ["finished"] * 2
-    for result in (read(result_path(cfg)) for cfg in cfgs):
+    for result in (read(cfg.path) for cfg in cfgs):
         assert result.provenance["batch"] == 2 and np.ptp(result.iterations["loss"]) > 0
     assert [found for _, found in check(folder)] == [None, None]
 

@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 
 from plab.config import ConfigError, TaskConfig, build_scene, choices, conf_folder, load_config
 from plab.config.variants import FIRST_TARGET_SEED, draw_variant
-from plab.results import result_path
 
 SCENES = 12
 """Draws of each task, of which the least and the largest are more than half of a range apart."""
@@ -100,8 +99,8 @@ def test_a_random_variant_is_a_configuration_like_any_other():
     cfg = load_config(["variant=random", "seed_scene=7", "task.yield_stress=100"])
     assert (cfg.variant, cfg.seed_scene, cfg.task.yield_stress, cfg.task.random) == ("random7", 7, 100, {})
     assert build_scene(cfg).manipulators[2].position == tuple(draw(7).manipulators["pillar"].position)
-    assert result_path(cfg).parent.as_posix() == "results/Rope-vrandom7/adam"
-    assert result_path(cfg) != result_path(load_config(["variant=random", "seed_scene=7"]))
+    assert cfg.path.parent.as_posix() == "results/Rope-vrandom7/adam"
+    assert cfg.path != load_config(["variant=random", "seed_scene=7"]).path
 
 
 def test_ranges_can_be_overridden():

@@ -23,7 +23,7 @@ from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.objective import scores
-from plab.results import ResultsError, RunFile, RunResult, read, result_path
+from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, actors, run_batch, run_config, sb3
 from plab.runners.policy import Spaces, evaluation, first_policy, load_policy, policy_path, shared_batches
 from plab.runners.rl import Population, agents_of
@@ -92,7 +92,7 @@ def configs(folder: Path, method: str, *overrides: str) -> list[Config]:
 
 def run(cfg: Config) -> RunResult:
     score = run_config(cfg, CACHE)
-    result = read(result_path(cfg))
+    result = read(cfg.path)
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
 
@@ -107,7 +107,7 @@ def statuses(cfgs: list[Config]) -> list[str]:
 
 def partial(cfg: Config) -> RunResult:
     """An unfinished run's file."""
-    return read(result_path(cfg).with_suffix(".partial.h5"))
+    return read(cfg.path.with_suffix(".partial.h5"))
 
 
 def assert_same_run(cfg: Config, want: RunResult) -> RunResult:
@@ -295,13 +295,13 @@ def test_states_are_written_as_often_as_asked_for(tmp_path, lone, monkeypatch) -
     assert [len(partial(cfg).iterations) for cfg in cfgs] == [1] * 3
     carry(cfgs)
     for cfg, want in zip(cfgs, lone["td3"], strict=True):
-        pd.testing.assert_series_equal(read(result_path(cfg)).iterations["loss"], want.iterations["loss"])
+        pd.testing.assert_series_equal(read(cfg.path).iterations["loss"], want.iterations["loss"])
 
 
 def test_the_replay_buffer_of_an_algorithm_from_outside(tmp_path, lone) -> None:
     """Needed to go on with the training, not before the final evaluation."""
     cfg = make_config(tmp_path, "tqc")
-    lost = result_path(cfg).with_suffix(".replay")
+    lost = cfg.path.with_suffix(".replay")
     with stopped_at(20, *STEPS["tqc"]):
         run_config(cfg, CACHE)
     lost.unlink()
@@ -319,7 +319,7 @@ def test_a_lost_replay_buffer_ends_its_run_only(tmp_path, lone) -> None:
     cfgs = configs(tmp_path, "sac")
     with stopped_at(18, Population, "_step"):
         carry(cfgs)
-    lost = result_path(cfgs[1]).with_suffix(".replay")
+    lost = cfgs[1].path.with_suffix(".replay")
     lost.unlink()
     ended = carry(cfgs)
     assert [one.status for one in ended] == ["finished", "refused", "finished"]
@@ -406,7 +406,7 @@ def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method,
     monkeypatch.setattr(Population, "_advance", advance)
     assert statuses(cfgs) == ["finished"] * 3
     assert_same_run(cfgs[2], alone[2])
-    judged, taught, other = (read(result_path(cfg)) for cfg in cfgs)
+    judged, taught, other = (read(cfg.path) for cfg in cfgs)
     assert [one.provenance.get("broken_episodes") for one in (judged, taught, other)] == [None, 2, None]
     assert [one.provenance.get("broken_evaluations") for one in (judged, taught, other)] == [1, None, None]
     assert np.isfinite(taught.iterations[1:].to_numpy()).all()
@@ -446,7 +446,7 @@ def test_a_population_whose_replay_buffers_find_no_room_is_halved(tmp_path: Path
     """Until they fit ``sim.memory_mb``; one is always tried."""
     cfgs = [make_config(tmp_path, "sac", "method.buffer_size=1000", f"seed={seed}") for seed in (0, 1)]
     assert statuses(cfgs) == ["finished"] * 2
-    assert {read(result_path(cfg)).provenance["batch"] for cfg in cfgs} == {1}
+    assert {read(cfg.path).provenance["batch"] for cfg in cfgs} == {1}
 
 
 # ---------------------------------------------------------------- CUDA
@@ -462,7 +462,7 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
         break_steps(patch, {9})
         assert [one.status for one in run_batch(cfgs)] == ["finished"] * 3
     for k, cfg in enumerate(cfgs):
-        result = read(result_path(cfg))
+        result = read(cfg.path)
         assert result.provenance.get("broken_episodes", 0) == (2 if k == 1 else 0)
         assert (result.provenance["resumed"], result.provenance["batch"]) == (1, 3)
         assert np.isfinite(result.iterations[1:].to_numpy()).all()
@@ -470,7 +470,7 @@ def test_a_population_on_cuda_is_trained_resumed_and_kept(tmp_path, monkeypatch,
     # The simulator stays on the CPU.
     single = make_config(tmp_path / "single", method, "method.torch_device=cuda")
     run_config(single)
-    assert read(result_path(single)).status == "finished"
+    assert read(single.path).status == "finished"
 
 
 # ---------------------------------------------------------------- learning

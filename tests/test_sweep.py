@@ -16,7 +16,7 @@ import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.results import RunFile, config_hash, read, result_path
+from plab.results import RunFile, read
 from plab.results.locks import acquire
 from plab.runners.tracks import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
@@ -63,7 +63,7 @@ def test_jobs_of_a_glob_and_of_an_experiment(seen) -> None:
     assert len(seen) == len({cfg.task.name for cfg in seen}) == 2
     seen.clear()
     assert main(["+experiment=smoke"]) == 0
-    assert len(seen) == len({config_hash(cfg) for cfg in seen}) == 6
+    assert len(seen) == len({cfg.hash for cfg in seen}) == 6
     assert {cfg.method.name for cfg in seen} == {"adam", "gd", "adam_h"}
 
 
@@ -78,7 +78,7 @@ def test_failed_runs_do_not_stop_the_others(sweep) -> None:
     code, counts, lines = sweep("seed=0,13,1")
     assert (code, counts) == (1, {"runs": 3, "finished": 2, "failed": 1})
     assert lines == [f"plab: Rope-v1 adam seed 13: {WHY}"]
-    left = read(result_path(configs(seeds=(13,))[0]).with_suffix(".partial.h5"))
+    left = read(configs(seeds=(13,))[0].path.with_suffix(".partial.h5"))
     assert (left.status, left.message, left.rows) == ("failed", WHY, 3)
     # The same command again: only those that failed.
     code, counts, _ = sweep("seed=0,13,1")
@@ -97,7 +97,7 @@ def test_a_bug_in_one_batch_does_not_stop_the_others(sweep) -> None:
         code, counts, lines = sweep("method=gd,adam", "hydra.launcher.batch_size=1")
     assert (code, counts) == (1, {"runs": 2, "finished": 1, "failed": 1})
     assert lines[0].startswith("Traceback") and lines[-1] == "plab: Rope-v1 gd seed 0: KeyError: 'a bug'"
-    assert read(result_path(configs("method=gd")[0]).with_suffix(".partial.h5")).rows == 5
+    assert read(configs("method=gd")[0].path.with_suffix(".partial.h5")).rows == 5
 
 
 def test_runs_that_cannot_share_a_simulator_are_halved(sweep, monkeypatch) -> None:
@@ -119,7 +119,7 @@ def test_an_interrupted_batch_is_kept_and_resumed(sweep) -> None:
     with raising(KeyboardInterrupt(), 10, toy_runner, "advance"):
         code, _, lines = sweep("seed=0,1,2")
     assert code == 130 and len(lines) == 1
-    left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in configs()]
+    left = [read(cfg.path.with_suffix(".partial.h5")) for cfg in configs()]
     assert [(one.status, one.rows) for one in left] == [("stopped", 4), ("stopped", 3), ("stopped", 3)]
     assert sweep("seed=0,1,2")[:2] == (0, {"runs": 3, "finished": 3})
     assert_complete(configs())
@@ -130,9 +130,9 @@ def test_a_run_under_way_in_another_process_is_left_to_it(sweep, capsys) -> None
     other = RunFile(busy)
     code, counts, lines = sweep("seed=0,1")
     assert (code, counts) == (1, {"runs": 2, "finished": 1, "under way in another process": 1})
-    assert len(lines) == 1 and "Rope-v1 adam seed 1: " in lines[0] and str(result_path(busy)) in lines[0]
+    assert len(lines) == 1 and "Rope-v1 adam seed 1: " in lines[0] and str(busy.path) in lines[0]
     assert main([*COARSE, "seed=1"]) == 1
-    assert str(result_path(busy)) in capsys.readouterr().err
+    assert str(busy.path) in capsys.readouterr().err
     other.release()
     assert sweep("seed=0,1")[0] == 0
     assert_complete(configs(seeds=(0, 1)))
@@ -179,12 +179,12 @@ def test_the_end_of_a_run_is_told_by_its_files(sweep) -> None:
     run = RunFile(begun)
     run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(begun)}, keep=True)
     run.release()
-    lock = acquire(result_path(busy))
+    lock = acquire(busy.path)
     ends = [look_up(cfg) for cfg in (finished, failed, begun, absent, busy)]
     assert [one.status for one in ends] == ["finished", "failed", "lost", "lost", "elsewhere"]
-    assert ends[0].score == read(result_path(finished)).evaluation["score"]
+    assert ends[0].score == read(finished.path).evaluation["score"]
     assert ends[1].message == WHY and "1 iterations" in ends[2].message
-    assert str(result_path(busy)) in ends[4].message
+    assert str(busy.path) in ends[4].message
     lock.release()
 
 

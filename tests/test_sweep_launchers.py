@@ -19,7 +19,7 @@ from hydra.core.plugins import Plugins
 import toy_runner
 from plab.cli.run import main
 from plab.config import load_config
-from plab.results import read, result_path
+from plab.results import read
 from plab.results.locks import lock_path
 from plab.runners import run_batch
 from plab.sweep.gpus import _Worker, choose
@@ -125,9 +125,9 @@ def test_a_sweep_with_a_killed_job_is_completed_by_the_same_command(tmp_path, la
     assert sweep.wait() == 1
     subprocess.run(command, cwd=tmp_path, env=environment, check=True)
     cfgs = [load_config([*words, f"seed={seed}"]) for seed in range(6)]
-    paths = [tmp_path / result_path(cfg) for cfg in cfgs]
+    paths = [tmp_path / cfg.path for cfg in cfgs]
     assert {path for path in tmp_path.glob("results/*-v*/*/*") if path.is_file()} == set(paths)
     undisturbed = [replace(cfg, results_dir=str(tmp_path / "undisturbed")) for cfg in cfgs]
     run_batch(undisturbed)
     for path, cfg in zip(paths, undisturbed, strict=True):
-        assert_same_numbers(read(path), read(result_path(cfg)))
+        assert_same_numbers(read(path), read(cfg.path))

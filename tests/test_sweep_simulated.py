@@ -10,7 +10,7 @@ import pytest
 
 from plab.config import Config, load_config
 from plab.problem import Problem
-from plab.results import RunResult, read, result_path
+from plab.results import RunResult, read
 from plab.runners import run_batch, run_config
 from same_runs import KeepsAll, finished_as, stopped_at
 from toy_runner import COARSE
@@ -37,7 +37,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> list[RunResult]:
     cfgs = configs(tmp_path_factory.mktemp("alone"))
     for cfg in cfgs:
         run_config(cfg, CACHE)
-    return [read(result_path(cfg)) for cfg in cfgs]
+    return [read(cfg.path) for cfg in cfgs]
 
 
 def test_a_batch_gives_each_run_what_it_gives_alone(tmp_path: Path, alone, capsys) -> None:
@@ -79,7 +79,7 @@ def test_a_run_that_breaks_off_does_not_disturb_the_others(tmp_path: Path, alone
     assert [one.status for one in ended] == ["finished", "failed", "finished", "finished"]
     for k in (0, 2, 3):
         finished_as(cfgs[k], alone[k])
-    left = read(result_path(cfgs[1]).with_suffix(".partial.h5"))
+    left = read(cfgs[1].path.with_suffix(".partial.h5"))
     assert left.status == "failed" and left.message == ended[1].message
     assert left.message.startswith("iteration 2: environment step 1, substep 1: the state is not finite")
     assert left.iterations["loss"].tolist() == alone[1].iterations["loss"].tolist()[:2]
@@ -92,7 +92,7 @@ def test_runs_stopped_at_different_iterations_go_on_together(tmp_path: Path, alo
     cfgs = configs(tmp_path)
     with stopped_at(6):
         run_batch(cfgs, cache=CACHE)
-    left = [read(result_path(cfg).with_suffix(".partial.h5")) for cfg in cfgs]
+    left = [read(cfg.path.with_suffix(".partial.h5")) for cfg in cfgs]
     assert [(one.status, one.rows) for one in left] == [("stopped", 2)] * 2 + [("stopped", 1)] * 2
     assert [one.status for one in run_batch(cfgs, cache=CACHE)] == ["finished"] * 4
     for cfg, want in zip(cfgs, alone, strict=True):

@@ -19,7 +19,7 @@ from plab.autograd import policy_gradient
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
 from plab.objective import scores
 from plab.problem import Problem
-from plab.results import ResultsError, RunFile, RunResult, read, result_path
+from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, apg, run_config, trajectory
 from plab.runners.loggers import RunLog
 from plab.runners.policy import shared_batches
@@ -55,7 +55,7 @@ def make_config(folder: Path, *overrides: str) -> Config:
 
 def run(cfg: Config) -> RunResult:
     score = run_config(cfg, CACHE)
-    result = read(result_path(cfg))
+    result = read(cfg.path)
     assert result.status == "finished" and result.evaluation["score"] == score
     return result
 
@@ -237,12 +237,12 @@ def test_resumed_run_equals_an_uninterrupted_one(
     with monkeypatch.context() as patch, pytest.raises(error):
         break_rollout(patch, Problem, at, error("gone"))
         run_config(cfg, CACHE)
-    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    left = read(cfg.path.with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == (status, message, at)
     resumed = run(cfg)
     assert_same_numbers(resumed, finished)
     assert resumed.provenance["resumed"] == 1
-    assert not result_path(cfg).with_suffix(".partial.h5").exists()
+    assert not cfg.path.with_suffix(".partial.h5").exists()
 
 
 @pytest.mark.parametrize(("error", "raised"), [(SimulationError, RunError), (MemoryError, ConfigError)])
@@ -252,7 +252,7 @@ def test_a_rollout_that_fails_ends_the_run(tmp_path: Path, monkeypatch, error: t
     with pytest.raises(raised) as caught:
         run_config(cfg, CACHE)
     assert str(caught.value) == "iteration 2: environment 0, step 2: position is nan"
-    left = read(result_path(cfg).with_suffix(".partial.h5"))
+    left = read(cfg.path.with_suffix(".partial.h5"))
     assert (left.status, left.message, len(left.iterations)) == ("failed", str(caught.value), 2)
     assert left.best_actions is not None
 
@@ -293,7 +293,7 @@ def test_tensorboard_shows_the_rows_as_one_curve(finished, tmp_path: Path, monke
 def test_a_log_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     cfg = make_config(tmp_path, "logger=tensorboard")
-    folder = result_path(cfg).with_suffix(".tensorboard")
+    folder = cfg.path.with_suffix(".tensorboard")
     folder.parent.mkdir(parents=True)
     folder.write_text("no folder")
     with pytest.raises(ResultsError, match="logger=tensorboard fails: ") as caught:
@@ -315,14 +315,14 @@ def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatc
     monkeypatch.setitem(sys.modules, "wandb", fake)
     monkeypatch.delenv("WANDB_PROJECT", raising=False)
     cfg = make_config(tmp_path, "logger=wandb")
-    run = SimpleNamespace(path=result_path(cfg), result=SimpleNamespace(config={"seed": 0}))
+    run = SimpleNamespace(path=cfg.path, result=SimpleNamespace(config={"seed": 0}))
     given = RunLog(cfg, run)
     assert given.wanted and not began
     given.write({"loss": 1.5, "score": math.nan}, 8)
     given.write({"loss": 1.0}, 12)
     assert logged == [{"loss": 1.5, "steps": 8}, {"loss": 1.0, "steps": 12}]
     (options,) = began
-    name = f"Rope-v1-adam-{result_path(cfg).stem}"
+    name = f"Rope-v1-adam-{cfg.path.stem}"
     assert (options["project"], options["name"], options["id"]) == ("plab", name, name)
     assert (options["dir"], options["config"], options["resume"]) == (str(tmp_path), {"seed": 0}, "allow")
     monkeypatch.setenv("WANDB_PROJECT", "closed")
@@ -349,7 +349,7 @@ def test_wandb_gets_the_rows(tmp_path: Path, monkeypatch) -> None:
 
 def test_the_logger_is_no_part_of_the_hash(tmp_path: Path) -> None:
     cfgs = [make_config(tmp_path, f"logger={name}") for name in ("none", "tensorboard", "wandb")]
-    assert len(set(map(result_path, cfgs))) == 1
+    assert len({cfg.path for cfg in cfgs}) == 1
     with pytest.raises(ConfigError, match="logger 'mlflow'"):
         make_config(tmp_path, "logger=mlflow")
 
@@ -395,7 +395,7 @@ def test_apg_resumes_to_the_same_numbers(tmp_path: Path, trained: RunResult, mon
     cfg = make_config(tmp_path, *APG)
     with stopped_at(2, autograd, "policy_gradient"):
         run_config(cfg, CACHE)
-    assert len(read(result_path(cfg).with_suffix(".partial.h5")).iterations) == 2
+    assert len(read(cfg.path.with_suffix(".partial.h5")).iterations) == 2
     again = run(cfg)
     assert_same_numbers(again, trained)
     assert again.provenance["resumed"] == 1

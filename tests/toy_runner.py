@@ -16,7 +16,7 @@ import pytest
 
 from plab.config import Config, load_config
 from plab.config.families import FAMILIES
-from plab.results import config_hash, read, result_path
+from plab.results import read
 from plab.runners import Runner
 from plab.runners.tracks import RunError, Track
 
@@ -65,18 +65,18 @@ def computed() -> list[str]:
 def assert_complete(cfgs: Sequence[Config]) -> None:
     """Assert that each result is there and right, and no other file."""
     for cfg in cfgs:
-        result = read(result_path(cfg))
-        assert result.status == "finished" and result.config_hash == config_hash(cfg)
+        result = read(cfg.path)
+        assert result.status == "finished" and result.config_hash == cfg.hash
         assert result.iterations["iteration"].tolist() == list(range(ITERATIONS))
         assert result.iterations["loss"].tolist() == expected(cfg)
         assert result.evaluation["score"] == abs(expected(cfg)[-1]) % 1.0
     files = {path for path in Path("results").rglob("*") if path.is_file()}
-    assert files == {result_path(cfg) for cfg in cfgs} | {Path("results/log")}
+    assert files == {cfg.path for cfg in cfgs} | {Path("results/log")}
 
 
 def start(cfg: Config) -> np.ndarray:
     """Return the state before the first iteration."""
-    return np.frombuffer(hashlib.sha256(config_hash(cfg).encode()).digest(), np.uint32).astype(np.float64)
+    return np.frombuffer(hashlib.sha256(cfg.hash.encode()).digest(), np.uint32).astype(np.float64)
 
 
 def advance(state: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def run_toy(tracks: Sequence[Track]) -> None:
     """Carry out a batch, and append the name of each result to ``log`` in the results folder."""
     for track in tracks:
         with (Path(track.cfg.results_dir) / "log").open("a") as file:
-            file.write(f"{result_path(track.cfg).name}\n")
+            file.write(f"{track.cfg.path.name}\n")
     states = [
         start(track.cfg) if track.run.result.resume is None else track.run.result.resume["x"]
         for track in tracks

@@ -12,8 +12,9 @@ import numpy as np
 from plab.cli.command import Parser, command_line, folder, positive, require_writable, sources_and_words
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
+from plab.config.identity import IDLE
 from plab.config.selection import one_protocol, select
-from plab.config.words import IDLE, require_effect
+from plab.config.words import require_effect
 from plab.render.graphics import RenderError, require_graphics, require_packages
 
 if TYPE_CHECKING:

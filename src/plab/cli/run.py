@@ -63,9 +63,7 @@ def main(argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         raise KeyboardInterrupt("run the same command again to resume") from None
     if cfg.progress:
-        from plab.results import result_path
-
-        result, folder = shlex.quote(str(result_path(cfg))), shlex.quote(cfg.results_dir)
+        result, folder = shlex.quote(str(cfg.path)), shlex.quote(cfg.results_dir)
         print(f"a picture: plab render {result}; a page of all runs: plab report html {folder}")
     return 0
 

@@ -14,8 +14,9 @@ from plab.cli.command import Parser, command_line, sources_and_words, task_list,
 from plab.cli.tables import print_table, write_csv, write_markdown
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config.compose import check_sources
+from plab.config.identity import IDLE
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.config.words import IDLE, require_effect
+from plab.config.words import require_effect
 from plab.demonstrations import action_names, known_actions, save_actions
 from plab.files import cache_dir
 from plab.objective import Scores, mass_change, target_sdf
@@ -31,9 +32,9 @@ __all__ = ["ReplayedDemonstration", "demonstrations", "moments", "replay", "targ
 HEADING = """\
 # Demonstrations
 
-Look up what the best actions known score in each variant, in the hard contact model; made by
-`plab demonstrations --markdown docs/demonstrations.md`, which prints more.
-[suite.md](suite.md#demonstrations) explains.
+Look up the scores of the best known actions in each variant, in the hard contact model.
+`plab demonstrations --markdown docs/demonstrations.md` writes this table, and prints more.
+[The suite](suite.md#demonstrations) explains how the actions were found.
 
 """
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
 
 from plab.config import ranges
+from plab.config.identity import config_dict, config_hash, member_name
 from plab.config.method import MethodConfig
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
@@ -128,6 +130,16 @@ class Config:
     progress: bool
     logger: str
     checkpoint_seconds: float
+
+    @property
+    def hash(self) -> str:
+        """SHA-256, in hex, of everything that can change the result."""
+        return config_hash(self)
+
+    @property
+    def path(self) -> Path:
+        """Result file: ``results_dir/<task>-v<variant>/<method>/seed<k>-<hash8>.h5``."""
+        return Path(self.results_dir) / member_name(config_dict(self), self.hash)
 
     def check(self) -> None:
         """Raise :class:`ConfigError` for a value out of range."""

@@ -25,7 +25,6 @@ from plab.errors import ConfigError, pick
 
 __all__ = [
     "COMPOSE_ERRORS",
-    "IDLE",
     "combinations",
     "explain",
     "parse",
@@ -37,9 +36,6 @@ __all__ = [
 
 FOLDERS = ("results_dir", "targets.source")
 """Keys whose values are names of folders, with any letters."""
-
-IDLE = ("results_dir", "force", "progress", "logger", "checkpoint_seconds")
-"""Keys that only ``plab run`` uses."""
 
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
 """Infinity and NaN as YAML writes them."""

@@ -9,6 +9,7 @@ load like folders. This package imports neither torch nor taichi, so that readin
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from plab.config.identity import config_dict, config_hash
 from plab.config.selection import lookup
 from plab.results.run_file import RunFile, read, read_iterations, write
 from plab.results.schema import (
@@ -19,9 +20,6 @@ from plab.results.schema import (
     ResultsError,
     RunBusyError,
     RunResult,
-    config_dict,
-    config_hash,
-    result_path,
     row_count,
 )
 
@@ -59,7 +57,6 @@ __all__ = [
     "read",
     "read_curves",
     "read_iterations",
-    "result_path",
     "row_count",
     "rows",
     "unpack",

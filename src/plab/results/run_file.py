@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from plab.config.identity import config_dict, config_hash, member_name
 from plab.config.selection import lookup
 from plab.files import DAMAGE, LARGEST, UnreadableError, member_bytes, one_line, opened_zip, regular_file
 from plab.results.locks import NO_LOCKS, Lock, acquire, lock_path
@@ -36,9 +37,6 @@ from plab.results.schema import (
     ResultsError,
     RunBusyError,
     RunResult,
-    config_dict,
-    config_hash,
-    result_path,
     stored_config,
 )
 
@@ -447,11 +445,12 @@ class RunFile:
             ResultsError: If the folder cannot be written or has no room, before anything is computed.
         """
         config = config_dict(cfg)
-        self.path = result_path(config)
+        digest = config_hash(config)
+        self.path = Path(config["results_dir"]) / member_name(config, digest)
         self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
         # Rows not yet in the columns, the last one first: ``(row, (row before, ...))``. One object with
         # the result: an interrupt may arrive between any two assignments.
-        known = RunResult(config, config_hash(config), provenance=provenance(config))
+        known = RunResult(config, digest, provenance=provenance(config))
         self._state: tuple[RunResult, tuple[Any, ...]] = known, ()
         self._every, self._written = config["checkpoint_seconds"], -math.inf
         self._progress, self._reported = self.path.with_suffix(_PROGRESS_SUFFIX), time.monotonic()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -15,7 +14,6 @@ import numpy as np
 from plab.config.families import FAMILIES
 from plab.config.selection import lookup
 from plab.errors import PlabError
-from plab.scenes.bodies import MATERIAL_KEYS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,11 +23,10 @@ SCHEMA_VERSION = 2
 
 STATUSES = ("running", "finished", "failed", "stopped")
 
-SUFFIX = ".h5"
 PARTIAL_SUFFIX = ".partial.h5"
 REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"
-"""Ends of the names of result files, of those of runs under way, of their replay buffers, and of archives."""
+"""Ends of the names of files of runs under way, of their replay buffers, and of archives."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 
@@ -43,16 +40,6 @@ COLUMNS = ("iteration", "episodes", "steps", *BUDGETS, *_MEASURES, "seconds")
 
 EVALUATION = (*_MEASURES, "score_printed", "iou_initial", "iou_target_self")
 """Scalars of the final evaluation, beside those of :func:`loss_columns`."""
-
-_NO_EFFECT = {
-    "": ("results_dir", "progress", "force", "logger", "checkpoint_seconds"),
-    # Gradients are the same bits for any spacing of checkpoints.
-    "sim": ("memory_mb",),
-    # Name and score change no number, and the contact term is that of the method.
-    "protocol": ("name", "score", "contact"),
-    "task": ("release",),
-}
-"""Configuration keys by section that cannot change a result, hence are left out of the hash."""
 
 _NEEDED: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("task", "method", "sim", "protocol"), dict),
@@ -148,20 +135,6 @@ class RunResult:
         return self.evaluation["score"]
 
 
-def config_dict(cfg: Any) -> dict[str, Any]:
-    """Return a :class:`plab.config.Config`, or a mapping, as plain dictionaries and lists.
-
-    Optional keys of bodies that have no value, such as ``file``, are left out.
-    """
-    plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
-    bodies = lookup(plain, "task.bodies")
-    for body in bodies.values() if isinstance(bodies, dict) else ():
-        for key in ("file", "sha256", *MATERIAL_KEYS):
-            if isinstance(body, dict) and body.get(key, "") is None:
-                del body[key]
-    return plain
-
-
 def stored_config(text: str) -> dict[str, Any]:
     """Return the configuration that a result file holds as ``text``.
 
@@ -176,29 +149,6 @@ def stored_config(text: str) -> dict[str, Any]:
         if isinstance(value, str) and not _NAME.fullmatch(value):
             raise ValueError(f"{key} in config is no name: {value!r:.80}")
     return config
-
-
-def config_hash(cfg: Any) -> str:
-    """Return the SHA-256, in hex, of everything in a configuration that can change a result."""
-    plain = config_dict(cfg)
-    for section, keys in _NO_EFFECT.items():
-        part = plain[section] if section else plain
-        for key in keys:
-            part.pop(key, None)
-    _drop_places(plain["task"])
-    if isinstance(lookup(plain, "targets.source"), str):
-        # The target comes from a file, whatever the task's recipe is.
-        for task in (plain["task"], *plain["task"].get("variants", {}).values()):
-            task.pop("target", None)
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
-
-
-def _drop_places(node: Any) -> None:
-    """Remove the paths of files from a part of a configuration: their SHA-256 is what counts."""
-    for key, value in list(node.items()) if isinstance(node, dict) else ():
-        if key == "file" and not isinstance(value, dict):
-            del node[key]
-        _drop_places(value)
 
 
 def counts_last(config: Mapping[str, Any]) -> bool:
@@ -224,18 +174,6 @@ def row_count(method: Mapping[str, Any]) -> int | None:
     if "stages" in method:
         return sum(stage["iterations"] for stage in method["stages"].values())
     return method.get("iterations")
-
-
-def result_path(cfg: Any) -> Path:
-    """Return where a run's file goes: ``results_dir/<task>-v<variant>/<method>/seed<k>-<hash8>.h5``."""
-    config = config_dict(cfg)
-    return Path(config["results_dir"]) / member_name(config, config_hash(config))
-
-
-def member_name(config: Mapping[str, Any], digest: str) -> Path:
-    """Return a run's place inside a results folder or an archive, by its configuration and its hash."""
-    folder = Path(f"{config['task']['name']}-v{config['variant']}") / config["method"]["name"]
-    return folder / f"seed{config['seed']}-{digest[:8]}{SUFFIX}"
 
 
 def parse_member(path: Path) -> dict[str, str] | None:

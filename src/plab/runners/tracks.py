@@ -13,7 +13,7 @@ import numpy as np
 from plab.config import Config
 from plab.config.families import SOLVED, family
 from plab.errors import TRACEBACK, ConfigError, PlabError, tell, traceback_wanted
-from plab.results import BUDGETS, ResultsError, RunFile, result_path
+from plab.results import BUDGETS, ResultsError, RunFile
 from plab.results.schema import counts_last
 from plab.runners.loggers import RunLog
 from plab.scenes import SceneError
@@ -245,7 +245,7 @@ class Outcome:
     @classmethod
     def of(cls, cfg: Config, status: str, score: float = math.nan, message: str = "") -> Outcome:
         """Return the outcome of a configuration's run."""
-        return cls(title(cfg), str(result_path(cfg)), status, score, " ".join(message.split()))
+        return cls(title(cfg), str(cfg.path), status, score, " ".join(message.split()))
 
     @property
     def finished(self) -> bool:

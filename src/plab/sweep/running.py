@@ -22,7 +22,7 @@ from plab.config.compose import check_sources, choices, compose, finish, hydra_a
 from plab.config.words import combinations, parse
 from plab.errors import tell
 from plab.plugins import passed_on
-from plab.results import ResultsError, RunFile, read, result_path
+from plab.results import ResultsError, RunFile, read
 from plab.results.locks import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
 from plab.runners.runner import SimulatorCache
@@ -56,9 +56,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
     settings = _launcher_settings(master.hydra.launcher)
     jobs = jobs_of(words, master.hydra.sweeper.params or {}, config_dir)
     entries = compose_jobs(jobs, config_dir)
-    by_path = {
-        str(result_path(one)): job for one, job in zip(entries, jobs, strict=True) if isinstance(one, Config)
-    }
+    by_path = {str(one.path): job for one, job in zip(entries, jobs, strict=True) if isinstance(one, Config)}
     cfgs = [one for one in entries if isinstance(one, Config)]
     ended = [one for one in entries if isinstance(one, Outcome)]
     if not cfgs and len({one.message for one in ended}) == 1:
@@ -171,7 +169,7 @@ def run_batches(
         sharing: How many of these use one device.
     """
     # The same run given twice is one run.
-    wanted = {str(result_path(cfg)): cfg for cfg in cfgs}
+    wanted = {str(cfg.path): cfg for cfg in cfgs}
     ended: dict[str, Outcome] = {}
     for path, cfg in wanted.items():
         if not cfg.force and (done := _finished_before(cfg)) is not None:
@@ -221,7 +219,7 @@ class _Elsewhere:
             )
             with passed_on():
                 # A job composes the configuration of its first run and then computes the whole batch.
-                returns = launcher.launch([self._jobs[str(result_path(batch[0]))] for batch in batches], 0)
+                returns = launcher.launch([self._jobs[str(batch[0].path)] for batch in batches], 0)
             yield from [one for job in returns for one in job.return_value]
         except Exception as error:
             # A job's process was killed, or the queue refused the jobs: the files know how far they came.
@@ -251,7 +249,7 @@ def _processes(inner: DictConfig) -> int:
 
 def look_up(cfg: Config) -> Outcome:
     """Say from its files how a run ended whose process cannot say it any more."""
-    path = result_path(cfg)
+    path = cfg.path
     if (done := _finished_before(cfg)) is not None:
         return Outcome.of(cfg, "finished", done.score)
     if held(path):
@@ -267,7 +265,7 @@ def look_up(cfg: Config) -> Outcome:
 
 def _finished_before(cfg: Config) -> Outcome | None:
     """Return the outcome of a run whose result is there."""
-    path = result_path(cfg)
+    path = cfg.path
     try:
         # Where there is something left of a process that was killed, RunFile clears it up.
         left = path.exists() and any(
