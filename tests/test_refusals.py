@@ -250,7 +250,6 @@ CALLS: dict[str, tuple[Callable[[], object], str]] = {
     "overrides that are no texts": (lambda: load_config(["seed=1", 4.5]), "4.5"),
     "no overrides": (lambda: gymnasium.make("plab/Rope-v1", overrides=None), "None"),
     "half an environment": (lambda: make_sb3("plab/Rope-v1", num_envs=1.5), "num_envs"),
-    "many environments": (lambda: gymnasium.make_vec("plab/Rope-v1", num_envs=10**9), "num_envs=1000000000"),
     "no configuration": (lambda: Problem([]), "configuration"),
     "a text of a configuration": (lambda: Problem(["task=Move"]), "'task=Move'"),
     "a scene": (lambda: Simulator(scene(("Sphere",))), "Simulator([scene])"),

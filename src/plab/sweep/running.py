@@ -53,6 +53,10 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
     Raises:
         ConfigError: If the overrides give no runs, or all of them are refused for the same reason.
     """
+    if not master.hydra.sweeper["_target_"].endswith(".BasicSweeper"):
+        raise ConfigError(
+            "hydra/sweeper: plab runs all combinations; search by plab.runners.run_config in Python"
+        )
     settings = _launcher_settings(master.hydra.launcher)
     jobs = jobs_of(words, master.hydra.sweeper.params or {}, config_dir)
     entries = compose_jobs(jobs, config_dir)
