@@ -24,11 +24,12 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override, OverrideType
+from hydra.errors import MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.families import family, schemas
+from plab.config.families import family, schema
 from plab.config.run import Config
 from plab.config.suite import conf_folder
 from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
@@ -70,9 +71,6 @@ class _Composed(Config):
 
 
 ConfigStore.instance().store(name="plab_schema", node=_Composed)
-# A group of its own, so that `method=` offers real methods only.
-for _name, _schema in schemas():
-    ConfigStore.instance().store(group="schema/method", name=_name, node=_schema)
 
 
 TABLES = {
@@ -186,8 +184,21 @@ def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = Non
             from_shell=False,
             with_log_configuration=False,
         )
+    except MissingConfigException as error:
+        # Types of methods are imported when a file asks for them: all of them take half a second.
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        node = schema(name) if group == "schema/method" else None
+        if node is None or name in _SCHEMAS:
+            raise ConfigError(explain(error)) from None
+        _SCHEMAS.add(name)
+        ConfigStore.instance().store(group=group, name=name, node=node)
+        return compose_with_hydra(words, config_dir)
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
+
+
+_SCHEMAS: set[str] = set()
+"""Types of methods that Hydra knows; a group of their own, so that ``method=`` offers real methods only."""
 
 
 def hydra_app() -> Hydra:

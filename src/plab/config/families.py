@@ -169,6 +169,11 @@ def known_family(name: str) -> Family | None:
     return None
 
 
+def schema(name: str) -> type | None:
+    """Return the type that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``, if there is one."""
+    return next((type_ for other, type_ in schemas() if other == name), None)
+
+
 def schemas() -> Iterator[tuple[str, type]]:
     """Yield names and types that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``."""
     for name, record in FAMILIES.items():

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from plab.config.families import SOLVED, known_family
-from plab.config.identity import config_hash
+from plab.config.identity import SUFFIX, config_hash
 from plab.objective import scores_from_iou
 from plab.results.run_file import opened_archive, read
 from plab.results.schema import (
@@ -20,7 +20,6 @@ from plab.results.schema import (
     EVALUATION,
     PARTIAL_SUFFIX,
     STATUSES,
-    SUFFIX,
     ResultsError,
     RunResult,
     loss_columns,

@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
+from plab.config.identity import SUFFIX
 from plab.config.selection import lookup
 from plab.files import cache_dir
 from plab.results.run_file import (
@@ -40,7 +41,6 @@ from plab.results.schema import (
     ARCHIVE_SUFFIX,
     PARTIAL_SUFFIX,
     SCHEMA_VERSION,
-    SUFFIX,
     ResultsError,
     counts_last,
     last_score,
