@@ -81,7 +81,7 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         own = [one for one in cfgs for _ in range(method.num_envs)]
         training = TensorEnv(EpisodeBatch(own, contact=method.contact))
         evaluation = TensorEnv(EpisodeBatch(cfgs))
-        population = Population(cfgs, range(agents), training, evaluation, [None] * agents)
+        population = Population(cfgs, training, evaluation, [None] * agents)
         population.evaluate()
         population.train(2 * method.num_envs)
         more = batches * method.num_envs

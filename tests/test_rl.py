@@ -275,7 +275,7 @@ def test_a_resumed_population_equals_an_uninterrupted_one(tmp_path, lone, method
         assert assert_same_run(cfg, want).provenance["resumed"] == 1
 
 
-def test_runs_that_stand_at_different_evaluations_become_abreast(tmp_path, lone) -> None:
+def test_runs_that_stand_at_different_evaluations_go_on_to_the_same_numbers(tmp_path, lone) -> None:
     cfgs = configs(tmp_path, "sac")
     with stopped_at(4):
         carry(cfgs)

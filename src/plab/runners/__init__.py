@@ -105,13 +105,15 @@ def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> Non
                 if not issubclass(kind, Runner):
                     name = party[0].cfg.method.family
                     raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
-                if len(party) > 1 and not own.batching:
-                    parties[:0] = [[track] for track in party]
-                else:
+                groups = _groups(party, own)
+                if len(groups) == 1:
                     kind(party, note, cache).run()
+                else:
+                    parties[:0] = groups
             except TogetherError:
-                half = len(party) // 2
-                parties[:0] = [party[:half], party[half:]]
+                left = [track for track in party if track.open]
+                half = len(left) if len(left) < len(party) else len(left) // 2
+                parties[:0] = [part for part in (left[:half], left[half:]) if part]
             except BrokenPipeError:
                 raise
             except Exception as error:
@@ -129,3 +131,13 @@ def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> Non
     finally:
         for track in tracks:
             track.run.release()
+
+
+def _groups(tracks: Sequence[Track], own: Family) -> list[Sequence[Track]]:
+    """Return the runs that can be carried out together, by group: alone, or those at the same iteration."""
+    if not own.batching:
+        return [[track] for track in tracks]
+    if not own.in_step:
+        return [tracks]
+    stand = sorted({track.iteration for track in tracks})
+    return [[track for track in tracks if track.iteration == iteration] for iteration in stand]

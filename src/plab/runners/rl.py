@@ -36,7 +36,7 @@ from plab.runners.replay import Sizes, require_file
 from plab.runners.runner import LAST, Step, Track, episode_columns
 from plab.runners.sac import SacAgents, SacConfig
 from plab.runners.td3 import Td3Agents, Td3Config
-from plab.runners.tracks import RunError
+from plab.runners.tracks import RunError, TogetherError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,7 +63,7 @@ def population_settings(method: RlConfig) -> AbstractContextManager[None]:
 
 
 class Population:
-    """Agents that stand at the same step, with environments that may be more than theirs.
+    """Agents that stand at the same step, and their environments.
 
     On CUDA the agents' parameters are stacked. On the CPU each agent is a stack of its own: there libraries
     choose their kernels by shape, and an agent would not have the bits that it has alone.
@@ -76,20 +76,16 @@ class Population:
     def __init__(
         self,
         cfgs: Sequence[Config],
-        numbers: Sequence[int],
         training: TensorEnv,
         evaluation: TensorEnv,
         states: Sequence[Mapping[str, Any] | None],
     ) -> None:
-        """Build the agents, of configurations alike in ``method``, new or from one of :meth:`states` each;
-        those with a replay buffer have to read it afterwards. Their ``numbers`` are among those for whom
-        there are environments: of the training N each, of the evaluation one."""
+        """Build the agents, of configurations alike in ``method``, new or all from one of :meth:`states`
+        each; those with a replay buffer have to read it afterwards. Each has N environments of the training
+        and one of the evaluation."""
         method = cfgs[0].method_as(RlConfig)
         self._training, self._evaluation = training, evaluation
         self._device = torch.device(method.torch_device)
-        self._numbers = torch.tensor(numbers, device=self._device)
-        # Whether there are no environments but theirs.
-        self._alone = len(cfgs) == evaluation.batch.size
         self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
         kind, batch = agents_of(method), training.batch
         self._cycle = kind.cycle_steps(method, self._horizon)
@@ -151,17 +147,15 @@ class Population:
         rows = torch.stack([sums[name] for name in columns]).cpu().numpy()
         ran = torch.stack(actions, dim=1).squeeze(2)
         self._lost |= ~ran.isfinite().all(2).all(1)
-        evaluations = []
-        for own, k in zip(ran.cpu().numpy(), self._numbers.tolist(), strict=True):
-            measures = dict(zip(columns, rows[:, k].tolist(), strict=True))
-            evaluations.append(Evaluation(measures, own, failures.get(k, "")))
-        return evaluations
+        measures = [dict(zip(columns, own.tolist(), strict=True)) for own in rows.T]
+        each = enumerate(zip(measures, ran.cpu().numpy(), strict=True))
+        return [Evaluation(*own, failures.get(k, "")) for k, own in each]
 
     def take_statistics(self) -> list[dict[str, float]]:
         """Return each agent's means over the episodes that ended since the last call, NaN if none has."""
         names = ("train_reward", "train_score")
         if not self._ended:
-            return [dict.fromkeys(names, np.nan) for _ in range(len(self._numbers))]
+            return [dict.fromkeys(names, np.nan) for _ in self._lost]
         # By episode, measure, agent and environment; summed agent by agent, for the same bits in any company.
         ended = torch.stack(self._ended).cpu().numpy()
         self._ended = []
@@ -174,8 +168,7 @@ class Population:
 
     def lost(self) -> dict[int, str]:
         """Return why agents cannot go on, by their numbers: their networks are not finite."""
-        numbers = self._numbers.tolist()
-        return {numbers[place]: NOT_FINITE for place in torch.nonzero(self._lost).flatten().tolist()}
+        return dict.fromkeys(torch.nonzero(self._lost).flatten().tolist(), NOT_FINITE)
 
     def take_broken(self) -> tuple[dict[int, list[str]], int]:
         """Return when and why episodes of training broke off that ended since the last call, by the agents'
@@ -236,17 +229,11 @@ class Population:
         return done
 
     def _advance(self, env: TensorEnv, actions: Tensor) -> Transition:
-        """Advance environments; those of agents that are not here rest."""
-        everyone = actions.double().nan_to_num()
-        if not self._alone:
-            own, size = everyone, env.batch.size // actions.shape[1]
-            everyone = own.new_zeros((size, *own.shape[1:])).index_copy_(0, self._numbers, own)
-        return env.step(everyone.flatten(0, 1), strict=False)
+        return env.step(actions.double().nan_to_num().flatten(0, 1), strict=False)
 
     def _own(self, table: Tensor, envs: int) -> Tensor:
-        """Return the agents' rows of a table of all environments, shape [agent, env, entry or 1]."""
-        rows = table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
-        return rows if self._alone else rows.index_select(0, self._numbers)
+        """Return a table of all environments by agent, shape [agent, env, entry or 1]."""
+        return table.to(self._device).reshape(table.shape[0] // envs, envs, -1)
 
     def _split(self, table: Tensor) -> list[Tensor]:
         return list(table.split([stack.count for stack in self.stacks]))
@@ -255,12 +242,11 @@ class Population:
 class RlRunner(PolicyRunner):
     """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
 
-    Runs that stand at different evaluations are trained one group after the other, until all are abreast.
+    The runs stand at the same evaluation; once one has failed, the others begin again without it.
     """
 
     kind = RlConfig
     _population: Population | None = None
-    _members: Sequence[Track] = ()
     _shown = ""
 
     def context(self) -> AbstractContextManager[Any]:
@@ -302,32 +288,31 @@ class RlRunner(PolicyRunner):
         return state is None or int(state["steps"]) < self._total
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
-        """Train the runs that have come least far until their next evaluation is due, and evaluate them."""
+        """Train until the next evaluation is due, except before the first, and evaluate all."""
+        if len(tracks) < len(self.tracks):
+            raise TogetherError("a run has failed")
         start = time.perf_counter()
-        least = min(track.iteration for track in tracks)
-        members = [track for track in tracks if track.iteration == least]
-        population = self._population_of(members)
+        self._population = population = self._population or self._begin()
         before = population.steps
 
         def report() -> None:
-            pace = (population.steps - before) * len(members) / (time.perf_counter() - start)
-            others = self._least([track for track in tracks if track not in members], population.episodes)
-            self.report(min(population.episodes, others), f"{pace:.0f} steps/s {self._shown}")
+            pace = (population.steps - before) * len(tracks) / (time.perf_counter() - start)
+            self.report(population.episodes, f"{pace:.0f} steps/s {self._shown}")
 
         # The first episode, of the untrained policies, compiles the kernels.
-        if least > 0:
-            self.enter("optimise", members)
-            columns = members[0].run.result.columns
+        if tracks[0].iteration > 0:
+            self.enter("optimise")
+            columns = tracks[0].run.result.columns
             population.train(int(columns["episodes"][-1]) + self.method.evaluate_every, report)
-            self.enter("evaluate", members)
+            self.enter("evaluate")
         evaluations, trained = population.evaluate(), population.take_statistics()
         losses, states = population.take_losses(), population.states()
         lost, (broken, ended) = population.lost(), population.take_broken()
-        share = (time.perf_counter() - start) / len(members)
-        for place, (track, done) in enumerate(zip(members, evaluations, strict=True)):
+        share = (time.perf_counter() - start) / len(tracks)
+        for place, (track, done) in enumerate(zip(tracks, evaluations, strict=True)):
             start = time.perf_counter()
-            unusable = self.unusable(track, broken.get(track.number, ()), ended, done.failure)
-            if why := lost.get(track.number) or unusable:
+            unusable = self.unusable(track, broken.get(place, ()), ended, done.failure)
+            if why := lost.get(place) or unusable:
                 track.fail(why)
                 continue
             try:
@@ -352,15 +337,15 @@ class RlRunner(PolicyRunner):
 
     def extent(self) -> tuple[int, int, int]:
         """Return how many episodes of training there are, and after how many there is an evaluation."""
-        total = self._total // self._sizes.horizon
-        return self._least(self.tracks), total, self.method.evaluate_every
+        done = self._episodes(self.tracks[0].run.result.resume)
+        return done, self._total // self._sizes.horizon, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
         """Note how the agents that were evaluated do on average; the training reports the pace, too."""
         reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
         mean = "" if len(rows) == 1 else "mean "
         self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
-        self.report(self._least(tracks), self._shown)
+        self.report(self._episodes(tracks[0].run.result.resume), self._shown)
 
     def close(self) -> None:
         """Let go of networks and replay buffers."""
@@ -376,28 +361,23 @@ class RlRunner(PolicyRunner):
         save_policy(track.run.path, self.method, policy, moments)
         _replay_path(track).unlink(missing_ok=True)
 
-    def _population_of(self, members: Sequence[Track]) -> Population:
-        """Return the population of some runs, a new one if it is of others."""
-        numbers = [track.number for track in members]
-        if self._population is None or numbers != [track.number for track in self._members]:
-            # Let go of the old one first: there may be no room for two.
-            self._population = None
-            cfgs, states = [t.cfg for t in members], [t.run.result.resume for t in members]
-            try:
-                self._population = Population(cfgs, numbers, self._training, self._evaluation, states)
-            except (LookupError, ValueError, TypeError) as error:
-                files = ", ".join(str(track.run.partial_path) for track in members)
-                raise ResultsError(
-                    f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
-                ) from error
-            self._members = members
-            paths = [_replay_path(track) for track in members]
-            for stack in self._population.stacks:
-                stack.watched = any(track.log.wanted for track in members)
-                own, paths = paths[: stack.count], paths[stack.count :]
-                if isinstance(stack, OffPolicyAgents) and stack.steps:
-                    stack.replay.read(own, stack.steps // stack.sizes.envs)
-        return self._population
+    def _begin(self) -> Population:
+        """Return the population of all runs, where their files stand."""
+        cfgs, states = [t.cfg for t in self.tracks], [t.run.result.resume for t in self.tracks]
+        try:
+            population = Population(cfgs, self._training, self._evaluation, states)
+        except (LookupError, ValueError, TypeError) as error:
+            files = ", ".join(str(track.run.partial_path) for track in self.tracks)
+            raise ResultsError(
+                f"one of {files} cannot be gone on from: {error}; start afresh with force=true"
+            ) from error
+        paths = [_replay_path(track) for track in self.tracks]
+        for stack in population.stacks:
+            stack.watched = any(track.log.wanted for track in self.tracks)
+            own, paths = paths[: stack.count], paths[stack.count :]
+            if isinstance(stack, OffPolicyAgents) and stack.steps:
+                stack.replay.read(own, stack.steps // stack.sizes.envs)
+        return population
 
     def _require_memory(self) -> None:
         """Raise RunError if there is no room for all replay buffers; on the CPU there always is for one."""
@@ -415,10 +395,6 @@ class RlRunner(PolicyRunner):
                 f"no room for {len(self.tracks)} replay buffers of {each / 1e9:.1f} GB: "
                 f"{room / 1e9:.1f} GB are free; set a smaller method.buffer_size or method.torch_device=cpu"
             )
-
-    def _least(self, tracks: Sequence[Track], default: int = 0) -> int:
-        states = [track.run.result.resume for track in tracks if track.error is None]
-        return min(map(self._episodes, states), default=default)
 
     def _episodes(self, state: Mapping[str, Any] | None) -> int:
         return 0 if state is None else int(state["steps"]) // self._sizes.horizon

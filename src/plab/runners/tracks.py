@@ -32,7 +32,8 @@ class RunError(PlabError, RuntimeError):
 
 
 class TogetherError(RuntimeError):
-    """Runs that cannot be simulated together, for the reason that is the cause of this error."""
+    """Runs that cannot be simulated together: for the reason that is the cause of this error, or as one of
+    them has failed and the others have to begin again without it."""
 
 
 @dataclass(frozen=True)
