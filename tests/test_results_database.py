@@ -8,6 +8,7 @@ from argparse import Namespace
 from contextlib import closing
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +18,7 @@ from plab.cli.results import main
 from plab.cli.rollouts import render, settle
 from plab.config.selection import Selection
 from plab.report.collect import collect
+from plab.report.series import load_series
 from plab.results import ResultsError, connect, load, pack, read, read_curves, rows, table, write
 from plab.status import survey
 
@@ -127,6 +129,22 @@ def test_unreadable_files_are_named_each_time(folder: Path) -> None:
             assert ask(folder, "SELECT count(*) FROM runs") == [(3,)]
     with pytest.raises(ResultsError, match="nowhere"):
         connect([folder, folder / "nowhere"])
+
+
+def test_a_run_with_damaged_iterations_is_named_and_left_out_everywhere(folder: Path) -> None:
+    path = synthetic.save(synthetic.run(folder, seed=9))
+    with h5py.File(path) as file:
+        place = file["iterations/reward"].id.get_chunk_info(0).byte_offset
+    image = bytearray(path.read_bytes())
+    image[place + 2] ^= 0xFF
+    path.write_bytes(image)
+    with pytest.warns(UserWarning, match=rf"left out 1 unreadable .*{path.name}"):
+        assert len(load(folder)) == 3
+    with pytest.warns(UserWarning, match=path.name):
+        assert ask(folder, "SELECT count(DISTINCT run) FROM iterations") == [(3,)]
+    found, packed = collect(folder, Selection()), pack(folder, folder.parent / "all.plab.zip.xz")
+    assert len(load_series(found)) == 3 and path.name in found.left_out()[-1]
+    assert packed.runs == 3 and path.name in str(packed.unreadable)
 
 
 def test_a_damaged_index_is_rebuilt_silently(folder: Path, recwarn) -> None:

@@ -357,7 +357,9 @@ def _indexed(root: Path, files: Sequence[File]) -> list[Entries | None]:
     """Return the rows of each file below a folder, from the index where the file has not changed."""
     place = _index_place(root)
     known = _stored(place)
-    now, found, kept, changed = time.time(), [], {}, False
+    now, changed = time.time(), False
+    found: list[Entries | None] = []
+    kept: Index = {}
     for path, status in files:
         name, identity = os.path.relpath(path, root), _identity(status)
         entry = known.get(name)
