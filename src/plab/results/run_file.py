@@ -347,9 +347,7 @@ def summary_of(file: h5py.File) -> dict[str, Any]:
 def columns_of(file: h5py.File) -> dict[str, np.ndarray]:
     """Return the columns of the iterations of an open run, shape [iteration] each; ValueError if one holds no
     numbers or is of another length than the others."""
-    names = summary_of(file)["columns"]
-    group = _member(file, "iterations") if names else file
-    found = {name: _numbers(group, name) for name in names}
+    found = {name: _numbers(file, f"iterations/{name}") for name in summary_of(file)["columns"]}
     if len({values.shape for values in found.values()}) > 1 or any(v.ndim != 1 for v in found.values()):
         raise ValueError("the columns of iterations differ in length")
     return found
@@ -375,47 +373,52 @@ def _text(file: h5py.File, name: str) -> str:
     return value
 
 
-def _member(file: h5py.Group, path: str) -> h5py.Group | h5py.Dataset:
-    """Return a group or dataset of this very file: no link leads to another file."""
-    place: Any = file
-    for part in path.split("/"):
+def _member(file: h5py.Group, path: str) -> Any:
+    """Return the low-level group or dataset of a path in this very file: no link leads to another file."""
+    place: Any = file.id
+    for part in path.encode().split(b"/"):
         # KeyError if there is none.
-        if not isinstance(place.get(part, getlink=True), h5py.HardLink):
+        if place.links.get_info(part).type != h5py.h5l.TYPE_HARD:
             raise ValueError(f"{path} is a link to another place")
-        place = place[part]
+        place = h5py.h5o.open(place, part)
     return place
 
 
 def _numbers(file: h5py.Group, path: str) -> np.ndarray:
+    # Several times as fast as h5py's datasets, of which a file has twenty.
     found = _member(file, path)
-    layout = found.id.get_create_plist()
+    layout = found.get_create_plist()
     elsewhere = layout.get_layout() == h5py.h5d.VIRTUAL or layout.get_external_count()
     if found.dtype.kind not in "biufc" or elsewhere:
         raise ValueError(f"{path} holds no numbers, or has them in another file")
-    if found.nbytes > min(LARGEST, _SMALL + _RATIO * found.id.get_storage_size()):
-        raise ValueError(f"{path} claims {found.nbytes} bytes, which the file does not hold")
-    return np.asarray(found[()])
+    size = math.prod(found.shape) * found.dtype.itemsize
+    if size > min(LARGEST, _SMALL + _RATIO * found.get_storage_size()):
+        raise ValueError(f"{path} claims {size} bytes, which the file does not hold")
+    values = np.empty(found.shape, found.dtype)
+    if size:
+        found.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    return values
 
 
 def _tree(file: h5py.Group, path: str) -> dict[str, Any]:
     """Return the content of a group: nested dictionaries of arrays of numbers and of texts."""
     found: dict[str, Any] = {}
-    for name in _member(file, path):
+    for name in map(bytes.decode, _member(file, path)):
         place = f"{path}/{name}"
         member = _member(file, place)
-        if isinstance(member, h5py.Group):
+        if isinstance(member, h5py.h5g.GroupID):
             found[name] = _tree(file, place)
         elif h5py.check_string_dtype(member.dtype) is None:
             found[name] = _numbers(file, place)
         else:
-            found[name] = member.asstr()[()]
+            found[name] = h5py.Dataset(member).asstr()[()]
     return found
 
 
 def _sparse(file: h5py.File, path: str) -> np.ndarray:
     """Return a mass tensor, shape [n, n, n]."""
     index, values = _numbers(file, f"{path}/index"), _numbers(file, f"{path}/value")
-    shape = [int(length) for length in _member(file, path).attrs["shape"]]
+    shape = [int(length) for length in h5py.Group(_member(file, path)).attrs["shape"]]
     if (size := math.prod(shape)) * values.itemsize > LARGEST:
         raise ValueError(f"{path} claims {size} entries")
     flat = np.zeros(size, dtype=values.dtype)
