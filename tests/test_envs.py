@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import warnings
@@ -200,6 +201,22 @@ def test_batch_is_what_single_environments_are(singles: list[gymnasium.Env], vec
     for actions in random_actions(2 * HORIZON + 1):
         assert data_equivalence(tested.step(actions), others.step(actions), exact=True)
         assert data_equivalence(tested.reset_infos, others.reset_infos, exact=True)
+
+
+def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVectorEnv) -> None:
+    for one in (env, vector):
+        one.reset(seed=3)
+        actions = [one.action_space.sample() for _ in range(4)]
+        for action in actions[:2]:
+            one.step(action)
+        state, copied = one.get_state(), pickle.loads(pickle.dumps(one))
+        wanted = [one.step(action) for action in actions[2:]]
+        again = one.set_state(state)
+        assert data_equivalence(again, copied.set_state(copied.get_state()), exact=True)
+        assert copied.np_random.random() == one.np_random.random()
+        assert data_equivalence(wanted, [one.step(action) for action in actions[2:]], exact=True)
+        assert data_equivalence(wanted, [copied.step(action) for action in actions[2:]], exact=True)
+        copied.close()
 
 
 def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:

@@ -21,7 +21,7 @@ from plab.envs.observations import Observer, Sensors, mapped, spaces
 from plab.errors import ArgumentError
 from plab.problem import Problem, build_scenes, kinds_of
 from plab.scenes import CONTACTS, Camera
-from plab.sim import SimulationError, Simulator
+from plab.sim import SimulationError, Simulator, State
 from plab.sim.tensors import Constants, on_device
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ __all__ = [
     "METADATA",
     "PICTURE_SIZE",
     "EpisodeBatch",
+    "EpisodeState",
+    "Restorable",
     "Transition",
     "check_render_mode",
     "compose_configs",
@@ -128,6 +130,23 @@ class Transition:
     truncated: bool
     info: dict[str, Array]
     failures: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EpisodeState:
+    """State of a batch between two steps, see :meth:`EpisodeBatch.get_state`.
+
+    Attributes:
+        step: Steps taken in the episodes; None before the first :meth:`EpisodeBatch.reset`.
+        simulation: Particles and manipulators, shape [batch, ...] each.
+        failures: Environments that have broken off.
+        last: Observations, loss terms and IoU of the last step that was not ``strict``.
+    """
+
+    step: int | None
+    simulation: State
+    failures: Mapping[int, str]
+    last: tuple[Any, ...]
 
 
 class EpisodeBatch:
@@ -298,6 +317,29 @@ class EpisodeBatch:
         failures = dict(self._failures)
         return Transition(observation, reward, self._step == self.horizon, info, failures)
 
+    def get_state(self) -> EpisodeState:
+        """Return a copy of the state, from which :meth:`set_state` continues: on the CPU with the same bits.
+
+        Raises:
+            RuntimeError: If the environment is closed or its simulator's memory is gone.
+        """
+        return EpisodeState(self._step, self._simulator.state(), dict(self._failures), _copies(self._last))
+
+    def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
+        """Replace the state by one that :meth:`get_state` of a batch of the same kind has returned.
+
+        Returns:
+            Observations and ``info`` of the state, as :meth:`reset` returns them.
+
+        Raises:
+            ValueError: If a shape is wrong.
+            RuntimeError: If the environment is closed or its simulator's memory is gone.
+        """
+        self._simulator.set_state(state.simulation)
+        self._step, self._failures, self._last = state.step, dict(state.failures), _copies(state.last)
+        observation, terms, iou = self._seen()
+        return observation, self._info(terms, iou)
+
     def closed_loop(
         self,
         steps: int,
@@ -373,6 +415,7 @@ class EpisodeBatch:
         """Release the simulator and the renderers; closing twice is allowed."""
         self._close_renderers()
         self._problem = None
+        self._sensors.release()
 
     def _close_renderers(self) -> None:
         for renderer in self._renderers:
@@ -401,6 +444,35 @@ class EpisodeBatch:
             "score": score,
             "score_printed": printed,
         }
+
+
+class Restorable:
+    """Copies and pickles of an environment: its arguments and its state.
+
+    Attributes:
+        batch: The episodes.
+    """
+
+    batch: EpisodeBatch
+    _arguments: dict[str, Any]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return arguments, state and random numbers."""
+        return {
+            "arguments": self._arguments,
+            "state": self.batch.get_state(),
+            "random": (getattr(self, "_np_random", None), getattr(self, "_np_random_seed", None)),
+        }
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        """Build the environment anew, and put it into the state."""
+        self.__init__(**kept["arguments"])  # type: ignore[misc]
+        self.batch.set_state(kept["state"])
+        self._np_random, self._np_random_seed = kept["random"]
+
+    def get_state(self) -> EpisodeState:
+        """Return a copy of the state of the episodes; see :meth:`EpisodeBatch.get_state`."""
+        return self.batch.get_state()
 
 
 def _require_alike(cfgs: Sequence[Config]) -> None:

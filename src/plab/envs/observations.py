@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from gymnasium.spaces import Box, Dict, Space
@@ -101,7 +101,7 @@ class Sensors:
         }
         if not self.names or (self._pictures and not self.cameras):
             raise ArgumentError("nothing is observed: name observations, and cameras for pictures")
-        self._simulator = simulator
+        self._simulator: Simulator | None = simulator
         self._cameras = {name: CameraSensor(simulator, camera) for name, camera in self.cameras.items()}
         spaces: dict[str, Space[Any]] = {"state": state_space} if "state" in self.names else {}
         if "particles" in self.names:
@@ -117,6 +117,10 @@ class Sensors:
         self._alone = isinstance(observe, str) and len(spaces) == 1
         self.space = next(iter(spaces.values())) if self._alone else Dict(spaces)
 
+    def release(self) -> None:
+        """Let go of the simulator and its memory."""
+        self._simulator, self._cameras = None, {}
+
     def refresh(self) -> None:
         """Follow a change of the simulator's scenes."""
         for sensor in self._cameras.values():
@@ -127,7 +131,7 @@ class Sensors:
         if ``like`` is one."""
         out = {"state": state()} if "state" in self.names else {}
         if "particles" in self.names:
-            x = self._simulator.observe(1, like)[..., :3]
+            x = cast(Simulator, self._simulator).observe(1, like)[..., :3]
             out["particles"] = x.float() if on_device(x) else x.astype(np.float32)
         for name, sensor in self._cameras.items():
             for picture, values in sensor.capture(*self._pictures, like=like).items():

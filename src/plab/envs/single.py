@@ -14,6 +14,8 @@ from plab.envs.core import (
     METADATA,
     PICTURE_SIZE,
     EpisodeBatch,
+    EpisodeState,
+    Restorable,
     check_render_mode,
     compose_configs,
     refuse_options,
@@ -24,7 +26,7 @@ from plab.scenes import Camera
 __all__ = ["PlabEnv"]
 
 
-class PlabEnv(gymnasium.Env[Any, np.ndarray]):
+class PlabEnv(Restorable, gymnasium.Env[Any, np.ndarray]):
     """A task as a Gymnasium environment.
 
     The start is always the same, so that the seed of :meth:`reset` only seeds ``np_random``. An episode is
@@ -68,6 +70,7 @@ class PlabEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
         """
+        self._arguments = {name: value for name, value in locals().items() if name != "self"}
         self.render_mode = check_render_mode(render_mode)
         cfgs = compose_configs(task, variant, overrides=overrides, config_dir=config_dir)
         self.batch = EpisodeBatch(cfgs, contact=contact, observe=observe, cameras=cameras)
@@ -112,6 +115,11 @@ class PlabEnv(gymnasium.Env[Any, np.ndarray]):
         result = self.batch.step(np.asarray(action)[None])
         observation, reward = _first(result.observation), float(result.reward[0])
         return observation, reward, False, result.truncated, _only(result.info)
+
+    def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, float]]:
+        """Replace the state by one of :meth:`get_state`; returns its observation and ``info``."""
+        observation, info = self.batch.set_state(state)
+        return _first(observation), _only(info)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, shape [height, width, 3], uint8; None unless ``render_mode`` is ``rgb_array``."""

@@ -17,6 +17,8 @@ from plab.envs.core import (
     METADATA,
     PICTURE_SIZE,
     EpisodeBatch,
+    EpisodeState,
+    Restorable,
     check_render_mode,
     compose_configs,
     refuse_options,
@@ -28,7 +30,7 @@ from plab.scenes import Camera
 __all__ = ["PlabVectorEnv"]
 
 
-class PlabVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
+class PlabVectorEnv(Restorable, VectorEnv[Any, np.ndarray, np.ndarray]):
     """Sub-environments that one simulator advances together.
 
     All have the same horizon, hence their episodes end together. They are reset in the step that ends them
@@ -79,6 +81,7 @@ class PlabVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         Raises:
             ValueError: If an argument does not fit; see also :class:`plab.envs.core.EpisodeBatch`.
         """
+        self._arguments = {name: value for name, value in locals().items() if name != "self"}
         self.render_mode = check_render_mode(render_mode)
         cfgs = compose_configs(
             task,
@@ -142,6 +145,11 @@ class PlabVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             info = ended | self._masked(first)
         truncated = np.full(self.num_envs, result.truncated)
         return observation, result.reward, np.zeros_like(truncated), truncated, info
+
+    def set_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
+        """Replace the state by one of :meth:`get_state`; returns its observations and ``info``."""
+        observation, info = self.batch.set_state(state)
+        return observation, self._masked(info)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one picture per sub-environment, shape [height, width, 3], uint8; None unless
