@@ -233,8 +233,8 @@ def test_points_and_masses_that_do_not_do():
         ("points", rng.random((100, 3)) * 0.9, "half of the points"),
         ("points", rng.random((9999, 3)) * 0.2 - 0.1, "domain"),
         ("mass", np.ones((64, 64)), r"\[64, 64\]"),
-        ("mass", np.zeros(cube), "mass of 0"),
-        ("mass", -np.ones(cube), "-1"),
+        ("mass", np.zeros(cube), "not all 0"),
+        ("mass", -np.ones(cube), "not negative"),
     ):
         np.save("it.npy", array)
         with pytest.raises(TargetError, match=named):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,9 +22,6 @@ __all__ = [
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that shows bugs with their tracebacks."""
 
-LONG = re.compile(r"(?P<word>\S{400})\S+|(?P<quoted>(?<![^\s(])'[^']{400})[^']+(?=')")
-"""Overlong parts of a message: a word, or text in quotation marks."""
-
 
 class PlabError(Exception):
     """A mistake that the user can put right; the message is one line with the remedy.
@@ -37,8 +33,9 @@ class PlabError(Exception):
     exit_code = 2
 
     def __str__(self) -> str:
-        """Return the message, long values cut short."""
-        return LONG.sub(lambda found: f"{(found['word'] or found['quoted'])[:200]}...", super().__str__())
+        """Return the message, shortened if it quotes something very long."""
+        text = super().__str__()
+        return text if len(text) < 1900 else f"{text[:950]} ... {text[-900:]}"
 
 
 class ArgumentError(PlabError, ValueError):

@@ -33,7 +33,6 @@ __all__ = [
     "TargetError",
     "TensorRecipe",
     "read_points",
-    "read_tensor",
 ]
 
 TARGET_SEED = 1
@@ -247,7 +246,7 @@ class MassTarget(TensorRecipe):
     def mass(self, scene: Scene) -> np.ndarray:
         """See :meth:`TensorRecipe.mass`."""
         try:
-            mass = read_tensor(*pinned(self.file, self.sha256))
+            mass = _read_tensor(*pinned(self.file, self.sha256))
         except ShapeError as error:
             raise TargetError(f"target: {error}") from None
         n = scene.grid_size
@@ -258,11 +257,7 @@ class MassTarget(TensorRecipe):
 
 @lru_cache(maxsize=8)
 def read_points(file: str, _sha256: str = "") -> np.ndarray:
-    """Read a point cloud, once for each content.
-
-    Args:
-        file: NumPy array of shape [point, 3], PLY file, of which the vertices count, or XYZ file, a text of
-            which the first three columns count.
+    """Read a point cloud from a NumPy, PLY or XYZ file, once for each content.
 
     Returns:
         Positions, shape [point, 3], float64, finite.
@@ -272,7 +267,7 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
     """
     kind = Path(file).suffix.lower()
     if kind == ".ply":
-        points = np.asarray(read_mesh(file).vertices)
+        points = np.asarray(read_mesh(file).vertices, np.float64)
     elif kind == ".xyz":
         try:
             points = np.loadtxt(file, usecols=(0, 1, 2), ndmin=2, encoding="utf-8")
@@ -280,35 +275,18 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
             raise ShapeError(f"{file} cannot be read: {one_line(error)}") from error
     else:
         points = _numbers(file, "a point cloud: give .npy, .ply, .xyz")
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ShapeError(f"{file} holds an array of shape {list(points.shape)}, not points [point, 3]")
-    if not np.isfinite(points).all():
-        raise ShapeError(f"{file} has points that are not finite numbers")
-    return points.astype(np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
+        shape = list(points.shape)
+        raise ShapeError(f"{file} holds an array of shape {shape}, not finite points [point, 3]")
+    return points
 
 
 @lru_cache(maxsize=8)
-def read_tensor(file: str, _sha256: str = "") -> np.ndarray:
-    """Read a mass tensor, once for each content.
-
-    Args:
-        file: NumPy array of shape [n, n, n].
-
-    Returns:
-        The tensor, float64, finite, not negative, not empty.
-
-    Raises:
-        plab.files.ShapeError: If the file cannot be read, or holds no mass.
-    """
+def _read_tensor(file: str, _sha256: str) -> np.ndarray:
+    """Read a mass tensor, float64, once for each content."""
     mass = _numbers(file, "a mass tensor: give .npy")
-    if mass.ndim != 3:
-        raise ShapeError(f"{file} holds an array of shape {list(mass.shape)}, not masses [n, n, n]")
-    if not np.isfinite(mass).all():
-        raise ShapeError(f"{file} has masses that are not finite numbers")
-    if mass.size and mass.min() < 0:
-        raise ShapeError(f"{file} has negative masses: the least is {mass.min():.3g}")
-    if not mass.any():
-        raise ShapeError(f"{file} holds a total mass of 0")
+    if not (np.isfinite(mass) & (mass >= 0)).all() or not mass.any():
+        raise ShapeError(f"{file} must hold masses that are finite, not negative and not all 0")
     return mass
 
 
