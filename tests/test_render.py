@@ -235,7 +235,7 @@ def test_plasticine_is_seen_through_manipulators_and_ghosts_through_plasticine()
     assert pressed[0] > pressed[2] + 30
 
     unit = np.random.default_rng(1).random((800, 3)) - 0.5
-    inside = spread_mass(CUBE.center + 0.08 * unit, 32, 1e-4)
+    inside = spread_mass(CUBE.center + 0.05 * unit, 32, 1e-4)
     plain, ghost = (pixel(scene(), CUBE.center, View(30.0, 30.0), mass) for mass in (None, inside))
     assert is_clay(plain)
     assert ghost[0] < plain[0] - 15 and ghost[2] > plain[2] + 15
