@@ -175,7 +175,7 @@ if run is not None and run.best_actions is not None:
         picture = Path(folder) / "strip.png"
         try:
             require_graphics()
-            from plab.render.replays import draw_strip
+            from plab.render.pictures import draw_strip
 
             draw_strip(run.path, picture)
             display(Image(picture.read_bytes(), width=1000, alt="start, target and end"))

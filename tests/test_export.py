@@ -10,7 +10,7 @@ import pytest
 
 from plab.cli.rollouts import export as main
 from plab.config import load_config
-from plab.render.recording import RecordedRollout, record_with_motion
+from plab.render.rollouts import RecordedRollout, record_with_motion
 
 pv = pytest.importorskip("pyvista")
 files = pytest.importorskip("plab.export.files")
@@ -78,7 +78,7 @@ def test_what_particles_have_is_what_their_deformation_gradient_says(recording):
 
 
 def test_the_command_line_writes_a_folder_named_like_the_task(told, capsys, monkeypatch, recording):
-    monkeypatch.setattr("plab.render.recording.record_with_motion", lambda cfg, actions: recording)
+    monkeypatch.setattr("plab.render.rollouts.record_with_motion", lambda cfg, actions: recording)
     words = ["task=Assembly", *COARSE]
     assert main([*words, "--every", "3"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "Assembly-v1-vtk"

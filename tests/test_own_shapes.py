@@ -18,7 +18,7 @@ from plab.config import Config, ConfigError, build_scene, load_config
 from plab.files import ShapeError
 from plab.objective import spread_mass, target_sdf
 from plab.render.graphics import RenderError
-from plab.render.recording import stored
+from plab.render.rollouts import stored
 from plab.results import config_dict, load
 from plab.scenes import Body, Scene, make_body, sample_particles
 from plab.scenes.mesh import load_mesh

@@ -16,7 +16,7 @@ from plab.config import ConfigError, build_scene, choices, load_config
 from plab.losses import make_terms
 from plab.objective import spread_mass
 from plab.problem import Problem
-from plab.render.recording import record, result
+from plab.render.rollouts import record, result
 from plab.results import check, config_hash, load, pack, read, rows
 from plab.runners import run_config
 from plab.scenes import Body, Scene, SceneError, sample_particles

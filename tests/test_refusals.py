@@ -179,6 +179,7 @@ TOOLS = [
     (render, "task=Rope targets.source=nowhere", "nowhere"),
     (render, "task=Rope --contact-sheet a.png", "task=Rope"),
     (view, "nowhere.h5", "nowhere.h5"),
+    (view, "--gallery task=Rope", "task=Rope"),
     (view, "task=Rope --output a.htm", "a.htm"),
     (export, "task=Rope --format usd", "usd"),
     (targets, "--task Nope", "Nope"),

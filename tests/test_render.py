@@ -19,7 +19,7 @@ from plab.config import build_scene, choices, load_config
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
-from plab.render.recording import record
+from plab.render.rollouts import record
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, target_field
@@ -39,8 +39,8 @@ if missing is None:
     from PIL import Image
 
     from plab.render import Renderer
-    from plab.render.actors import surface_mesh
     from plab.render.pictures import save
+    from plab.render.renderer import surface_mesh
 
 
 @pytest.fixture(autouse=True)
@@ -333,7 +333,7 @@ def replayed(monkeypatch, recording) -> list:
         asked.append((cfg, actions))
         return recording
 
-    monkeypatch.setattr("plab.render.recording.record", stand_in)
+    monkeypatch.setattr("plab.render.rollouts.record", stand_in)
     return asked
 
 

@@ -169,7 +169,7 @@ def test_page_in_a_browser(browser, results: Path, tmp_path: Path) -> None:
 def test_pictures_are_drawn_once_and_replaced_by_better_ones(tmp_path: Path, monkeypatch) -> None:
     results, out = tmp_path / "results", tmp_path / "page"
     seen: list[bool] = []
-    replays = import_module("plab.render.replays")
+    replays = import_module("plab.render.pictures")
     save = replays.save_set
 
     def looking(*arguments):

@@ -22,10 +22,11 @@ from browsing import BROWSER, DRIVER, browsing
 from plab import results
 from plab.cli.rollouts import view as main
 from plab.config import build_scene, load_config
+from plab.config.suite import suite_tasks
 from plab.demonstrations import known_actions
 from plab.objective import spread_mass
 from plab.render import graphics
-from plab.render.recording import RecordedRollout
+from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.scenes import sample_particles
 from plab.view import Viewer, show
@@ -138,7 +139,7 @@ def simulated(monkeypatch, recording) -> list:
         asked.append((cfg, actions))
         return recording
 
-    monkeypatch.setattr("plab.render.recording.record_with_motion", stand_in)
+    monkeypatch.setattr("plab.render.rollouts.record_with_motion", stand_in)
     return asked
 
 
@@ -159,6 +160,15 @@ def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, 
         assert shown.read_text(encoding="utf-8") == page
     for replay, given in simulated:
         assert np.array_equal(given, ACTIONS) and replay.variant == "2"
+
+
+def test_the_gallery_has_a_page_of_every_task(monkeypatch, simulated, page, capsys):
+    monkeypatch.setattr("plab.view.page.page", lambda *_: page)
+    assert main(["--gallery"]) == 0 and capsys.readouterr().out.endswith("gallery/index.html\n")
+    index = Path("gallery/index.html").read_text(encoding="utf-8")
+    names = [f"{task}-v1.html" for task in suite_tasks()]
+    assert re.findall('href="([^"]*)"', index) == names and len(simulated) == 10
+    assert all(Path("gallery", name).read_text(encoding="utf-8") == page for name in names)
 
 
 def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulated, recording, page):

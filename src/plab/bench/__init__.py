@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Sequence
 
 from plab.cli.command import command_line
@@ -15,9 +14,9 @@ BENCHMARKS = ("speed", "accuracy", "stability")
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Run the benchmark that the first argument names; return its exit code."""
-    name, *rest = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    name, *rest = list(argv) or ["--help"]
     if name in ("-h", "--help"):
         print(f"plab bench NAME ...: {', '.join(BENCHMARKS)}; each has a --help of its own")
         return 0

@@ -92,7 +92,7 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
         try:
             require_graphics()
             # Imported here: all else needs neither PyVista nor Taichi.
-            from plab.render.replays import draw_runs
+            from plab.render.pictures import draw_runs
 
             draw_runs(wanted, lambda: page.write(drawing=True))
         except RenderError as error:

@@ -70,7 +70,7 @@ def render(argv: Sequence[str]) -> None:
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
     from plab.render import pictures
-    from plab.render.recording import demonstration, record, starts
+    from plab.render.rollouts import demonstration, record, starts
 
     if options.contact_sheet:
         rows = {task: starts(cfgs) for task, cfgs in _of_all_tasks(options, variants=True)}
@@ -90,6 +90,7 @@ def view(argv: Sequence[str]) -> None:
 
     plab view RESULT_FILE [--output FILE.html]
     plab view KEY=VALUE ... [--output FILE.html]
+    plab view --gallery [KEY=VALUE ...] [--output FOLDER]     a page of every task, and index.html
 
     It plays in any browser: particles, manipulators, and the target as a ghost.
 
@@ -98,21 +99,39 @@ def view(argv: Sequence[str]) -> None:
       plab view task=Torus variant=2 --output torus.html
     """
     parser = _parser("view", view.__doc__, "the page")
-    what = "by default a .html named like the result or the task"
+    what = "by default a .html named like the result or the task; of --gallery a folder, gallery by default"
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
+    parser.add_argument("--gallery", action="store_true", help="the best actions known for every task")
     options = parser.parse_intermixed_args(argv)
-    output = settle(options, ".html")
+    if options.gallery:
+        if unwanted := [word for word in options.what if "=" not in word or word.startswith("task=")]:
+            parser.error(f"a gallery of all tasks: leave out '{unwanted[0]}'")
+        output = (options.output or Path("gallery")) / "index.html"
+    else:
+        output = settle(options, ".html")
     if output.suffix.lower() != ".html":
         raise RenderError(f"cannot write {output}: its suffix must be .html")
     require_writable(output)
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
-    from plab.render.recording import record_with_motion
-    from plab.view.page import page
+    from plab.render.rollouts import demonstration, record_with_motion
+    from plab.view.page import gallery, page
 
-    text = page(record_with_motion(*rollout(options)), options.every)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(text, encoding="utf-8")
+    if options.gallery:
+        pages = []
+        for task, (cfg,) in _of_all_tasks(options, variants=False):
+            recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
+            _write(output.with_name(file), page(recording, options.every))
+            pages.append((task, file, recording.score))
+        _write(output, gallery(pages))
+    else:
+        _write(output, page(record_with_motion(*rollout(options)), options.every))
     print(output)
+
+
+def _write(path: Path, text: str) -> None:
+    from plab.results.run_file import replace_file
+
+    replace_file(path, text.encode(), sync=False, folders=True)
 
 
 @command_line
@@ -142,7 +161,7 @@ def export(argv: Sequence[str]) -> None:
         raise RenderError(f"{output} is not empty: remove it, or choose another folder with --output")
     require_packages("exports need", {"pyvista": "PyVista"}, "render")
     from plab.export.files import write_ply, write_vtk
-    from plab.render.recording import record_with_motion
+    from plab.render.rollouts import record_with_motion
 
     recording = record_with_motion(*rollout(options))
     output.mkdir(parents=True, exist_ok=True)
@@ -229,11 +248,11 @@ def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
 
 def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
     """Return configuration and actions, shape [T, A], of the rollout that :func:`settle` found."""
-    from plab.render import recording
+    from plab.render import rollouts
 
     if options.result:
-        return recording.result(options.result)
-    return options.config, recording.demonstration(options.config)
+        return rollouts.result(options.result)
+    return options.config, rollouts.demonstration(options.config)
 
 
 # ------------------------------------------------------------------------------------- pictures of all tasks

@@ -21,7 +21,7 @@ from plab.demonstrations import action_names, known_actions, save_actions
 from plab.files import cache_dir
 from plab.objective import Scores, mass_change, target_sdf
 from plab.problem import Problem, make_targets
-from plab.render.recording import stored
+from plab.render.rollouts import stored
 from plab.results.table import Row, readable_rows
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS

@@ -13,9 +13,15 @@ import numpy as np
 import pyvista as pv
 
 from plab.progress import show_progress
-from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, surface_mesh, target_mesh
-from plab.render.recording import RecordedRollout
-from plab.render.renderer import BODY_COLORS
+from plab.render.renderer import (
+    BODY_COLORS,
+    MANIPULATOR_COLOR,
+    TARGET_COLOR,
+    part_mesh,
+    surface_mesh,
+    target_mesh,
+)
+from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
 

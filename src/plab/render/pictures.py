@@ -1,30 +1,29 @@
-"""Files: a strip of start, target and end, a film of the rollout, and the contact sheet of all tasks."""
+"""Picture files: strips of start, target and end, films, and sets of both for the page of results."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import json
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from plab.config import Config, ConfigError
+from plab.progress import show_progress
 from plab.render.camera import scene_camera
-from plab.render.graphics import RenderError
-from plab.render.recording import RecordedRollout
+from plab.render.graphics import RenderError, require_graphics
 from plab.render.renderer import INK, PAPER, Renderer
-from plab.scenes import Camera
-
-__all__ = [
-    "STEPS_PER_SECOND",
-    "SUFFIXES",
-    "check_output",
-    "save",
-    "save_contact_sheet",
-    "save_film_strip",
-    "save_set",
-]
+from plab.render.rollouts import RecordedRollout, record, record_all, result
+from plab.scenes import Camera, SceneError
+from plab.sim import DeviceError, SimulationError
+from plab.targets import TargetError
 
 STEPS_PER_SECOND = 20
 """Environment steps that a film shows in a second, whatever the number of its frames."""
@@ -34,11 +33,20 @@ SUFFIXES = (".png", ".gif", ".mp4")
 
 _HOLD = 1.0  # how long a film shows its last frame [s]
 _FILM_COLORS = 96  # of a GIF
-_SET_EVERY = 2  # environment steps from one frame to the next, of a set
 _SHEET_COLORS = 256
 _STRIP_FRAMES = 4  # of a task in the film strip
 _STRIP_COLUMNS = 2  # of tasks
 _STRIP_QUALITY = 88  # of JPEG
+_SET_EVERY = 2  # environment steps from one frame to the next, of a set
+
+
+_PAGE_SIZE = (480, 360)
+_UNFINISHED = ".unfinished-"
+_TROUBLE = (RenderError, ConfigError, SceneError, TargetError, DeviceError, SimulationError)
+
+
+Wanted = Mapping[Path, Mapping[str, tuple[Path, bool]]]
+"""Result files and whether each is to have a film, by the name of its pictures, by folder."""
 
 
 def check_output(path: Path) -> None:
@@ -67,14 +75,14 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
         RenderError: If the file cannot be written.
     """
     scene, target_mass, camera = recording.scene, recording.target_mass, _camera(recording, size)
-    with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path):
-        _WRITERS[path.suffix.lower()](recording, renderer, every, path)
+    with closing(Renderer(scene, target_mass, size, camera)) as renderer, _writing(path) as fresh:
+        _WRITERS[path.suffix.lower()](recording, renderer, every, fresh)
 
 
 def save_set(
     recordings: Mapping[str, RecordedRollout], folder: Path, size: tuple[int, int], filmed: Collection[str]
 ) -> None:
-    """Write what several rollouts of one configuration look like, all seen by the same camera.
+    """Write pictures of several rollouts of one configuration, all seen by the same camera.
 
     Writes ``start.webp`` and ``target.webp``, for each rollout its last state as ``<name>.webp``, and of
     some, where imageio-ffmpeg is installed, a film ``<name>.mp4``.
@@ -134,8 +142,8 @@ def save_contact_sheet(
             sheet.paste(_start_and_target(recording, (width, height)), (at, top))
             _write(sheet, recording.variant, (at + width, top + height + text // 2), text)
     image = _with_palette(sheet, _palette([np.asarray(sheet)], _SHEET_COLORS))
-    with _writing(path):
-        image.save(path, optimize=True)
+    with _writing(path) as fresh:
+        image.save(fresh, optimize=True)
 
 
 def _start_and_target(recording: RecordedRollout, size: tuple[int, int]) -> Image.Image:
@@ -170,8 +178,8 @@ def save_film_strip(recordings: Sequence[RecordedRollout], path: Path, size: tup
                 sheet.paste(Image.fromarray(frame), (left + column * width, top + 2 * text))
         caption = f"{recording.task}, variant {recording.variant}: score {recording.score:.2f}"
         _write(sheet, caption, (left + _STRIP_FRAMES * width // 2, top + text), text)
-    with _writing(path):
-        sheet.save(path, quality=_STRIP_QUALITY, optimize=True)
+    with _writing(path) as fresh:
+        sheet.save(fresh, quality=_STRIP_QUALITY, optimize=True)
 
 
 def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
@@ -181,12 +189,16 @@ def _camera(recording: RecordedRollout, size: tuple[int, int]) -> Camera:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Make a file's folder, and turn what goes wrong with the file into a RenderError."""
+def _writing(path: Path) -> Iterator[Path]:
+    """Make a file's folder; give a file beside it, which takes its place only if nothing goes wrong."""
+    fresh = path.with_name(f"{_UNFINISHED}{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield
+        yield fresh
+        if fresh.exists():
+            fresh.replace(path)
     except OSError as error:
+        fresh.unlink(missing_ok=True)
         raise RenderError(f"cannot write {path}: {error.strerror or error}") from error
 
 
@@ -204,10 +216,10 @@ def _save_png(recording: RecordedRollout, renderer: Renderer, _every: int, path:
     width, height = renderer.size
     text = max(12, height // 22)
     sheet = Image.new("RGB", (len(panels) * (width + text) - text, height + 2 * text), PAPER)
-    for number, (picture, caption) in enumerate(panels):
+    for number, (picture, text_below) in enumerate(panels):
         left = number * (width + text)
         sheet.paste(Image.fromarray(picture), (left, 0))
-        _write(sheet, caption, (left + width // 2, height + text), text)
+        _write(sheet, text_below, (left + width // 2, height + text), text)
     sheet.save(path, optimize=True)
 
 
@@ -259,3 +271,102 @@ def _with_palette(picture: Image.Image, palette: Image.Image) -> Image.Image:
 def _write(sheet: Image.Image, text: str, center: tuple[int, int], size: int) -> None:
     """Write a line of some height [pixels] around a point."""
     ImageDraw.Draw(sheet).text(center, text, fill=INK, font=ImageFont.load_default(size), anchor="mm")
+
+
+# ------------------------------------------------------------------------------------------------------ runs
+
+
+def draw_runs(wanted: Wanted, drawn: Callable[[], None]) -> None:
+    """Draw runs of many configurations, see :func:`save_set`.
+
+    Args:
+        wanted: For each configuration the folder of its pictures, which must not be there yet and appears
+            when it is complete; and what is to be drawn.
+        drawn: Is called when a folder is complete.
+
+    Raises:
+        RenderError: If this computer cannot draw, a file cannot be written, or runs cannot be replayed; the
+            pictures of the others are there.
+    """
+    require_graphics()
+    troubles: list[str] = []
+    for place in {folder.parent for folder in wanted}:
+        # What a process that was killed has left of pictures.
+        for folder in place.glob(f"{_UNFINISHED}*"):
+            shutil.rmtree(folder, ignore_errors=True)
+    with show_progress("pictures", 0, len(wanted), plain_every=1) as report:
+        done = 0
+        for folders in _by_task(wanted).values():
+            try:
+                made = _replayed({folder: wanted[folder] for folder in folders})
+            except _TROUBLE as error:
+                troubles.append(f"{folders[0].name} and others of its task cannot be replayed: {error}")
+                continue
+            for folder in folders:
+                with _complete_or_not(folder) as fresh:
+                    films = {name for name, (_, film) in wanted[folder].items() if film}
+                    save_set({name: made[folder, name] for name in wanted[folder]}, fresh, _PAGE_SIZE, films)
+                done += 1
+                report(done, folder.name)
+                drawn()
+    if troubles:
+        raise RenderError("; ".join(troubles))
+
+
+def draw_strip(path: Path, picture: Path) -> None:
+    """Replay a run and draw start, target and end side by side.
+
+    Args:
+        path: The result file.
+        picture: PNG file to write.
+
+    Raises:
+        RenderError: If this computer cannot draw, or the run cannot be replayed.
+    """
+    require_graphics()
+    try:
+        save(record(*result(path)), picture, _PAGE_SIZE)
+    except _TROUBLE as error:
+        raise RenderError(str(error)) from error
+
+
+def _by_task(wanted: Wanted) -> dict[str, list[Path]]:
+    """Return the folders by task, those with films first: configurations of one task share a simulator, and
+    its compilation."""
+    groups: dict[str, list[Path]] = defaultdict(list)
+    for folder in sorted(wanted, key=lambda folder: -sum(film for _, film in wanted[folder].values())):
+        groups[folder.name.rpartition("-v")[0]].append(folder)
+    return groups
+
+
+def _replayed(group: Wanted) -> dict[tuple[Path, str], RecordedRollout]:
+    """Replay all runs of one task; those of the same settings share a simulator."""
+    alike: dict[str, list[tuple[tuple[Path, str], Config, np.ndarray]]] = defaultdict(list)
+    for folder, files in group.items():
+        for name, (path, _) in files.items():
+            cfg, actions = result(path)
+            sections = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]
+            kind = json.dumps([*sections, actions.shape])
+            alike[kind].append(((folder, name), cfg, actions))
+    made: dict[tuple[Path, str], RecordedRollout] = {}
+    for cases in alike.values():
+        names = [name for name, _, _ in cases]
+        actions = np.stack([actions for _, _, actions in cases])
+        made |= zip(names, record_all([c for _, c, _ in cases], actions, scored=False), strict=True)
+    return made
+
+
+@contextmanager
+def _complete_or_not(folder: Path) -> Iterator[Path]:
+    """Give a folder to write to, which takes its place only if nothing goes wrong."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=_UNFINISHED, dir=folder.parent))
+    except OSError as error:
+        raise RenderError(f"cannot write {folder}: {error.strerror or error}") from error
+    try:
+        yield fresh
+        fresh.chmod(0o755)
+        fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)

@@ -9,13 +9,12 @@ import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkRenderer
 
 from plab.errors import ArgumentError
-from plab.render.actors import Clay, Floor, Rigid, Target, surface_mesh
+from plab.objective import TARGET_MASS
 from plab.render.camera import scene_camera
-from plab.render.shadows import AmbientLight, Cloud, floor_light
-from plab.render.surface import body_slices, body_surfaces
-from plab.scenes import Camera, Scene, sample_particles
-
-__all__ = ["BODY_COLORS", "INK", "PAPER", "Renderer"]
+from plab.render.shadows import FLOOR_EDGE, FLOOR_LOW, AmbientLight, Cloud, floor_light, hidden_share
+from plab.render.shapes import Part, manipulator_parts, pose_matrix, transform
+from plab.render.surface import Field, body_slices, body_surfaces, target_field
+from plab.scenes import Camera, Manipulator, Scene, sample_particles
 
 PAPER = "#f3f0ea"
 """Colour of floor and background."""
@@ -31,6 +30,22 @@ _LIGHTS = (
     ((-0.35, 1.0, 0.25), 0.74, "#fff6ea"),
     ((0.4, 0.4, 1.0), 0.48, "#eef2ff"),
 )
+
+MANIPULATOR_COLOR = "#5a6470"
+TARGET_COLOR = "#2b8c9b"
+
+_CLAY = {"ambient": 0.26, "diffuse": 0.86, "specular": 0.05, "specular_power": 10}
+_METAL = {"ambient": 0.2, "diffuse": 0.9, "specular": 0.35, "specular_power": 25, "smooth_shading": True}
+_GLASS = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.1, "specular_power": 20, "culling": "back"}
+_SAMPLE_AREA = 2e-5  # of the points that stand for manipulators in shadows
+_SMOOTHING = (20, 0.1)  # iterations and pass band of Taubin's filter
+_TARGET_SMOOTHING = (60, 0.02)  # targets come from random samples whose start is not known
+_NEAR = 0.01  # distance from the plasticine's surface at which the ghost vanishes [domain units]
+_CLEAREST = 0.45  # opacity of a manipulator that hides what it does
+_HIDES = (0.5, 0.8)  # share of itself with which it hides plasticine: it begins to be translucent, and is
+_SHADOW = 0.6  # strength of the shadows on the floor
+_LINE = 1.3  # width of the floor's lines [pixels]
+_LINE_OPACITY = 0.16
 
 
 class Renderer:
@@ -203,3 +218,188 @@ def _add_lights(plotter: pv.Plotter, camera: Camera) -> np.ndarray:
         light.positional = False
         plotter.add_light(light)
     return _LIGHTS[0][0] @ axes
+
+
+class Clay:
+    """A surface of plasticine, darker in its corners.
+
+    Attributes:
+        actors: What stands for it in the window: one actor.
+    """
+
+    def __init__(self, plotter: pv.Plotter, mesh: pv.PolyData, color: str) -> None:
+        """Add it to a window, in the shape of a mesh."""
+        self._color = _rgb(color)
+        mesh["color"] = np.zeros((mesh.n_points, 3), np.uint8)
+        self.actors = [plotter.add_mesh(mesh, scalars="color", rgb=True, smooth_shading=True, **_CLAY)]
+
+    def mould(self, mesh: pv.PolyData, ambient: AmbientLight) -> None:
+        """Give it another shape, in the light that there is."""
+        if mesh.n_points:
+            light = ambient.at(mesh.points, mesh.point_normals)[:, None]
+            # Light that goes back and forth between walls of clay takes on more of their colour.
+            mesh["color"] = (255 * light * (self._color / 255) ** (1.5 - 0.5 * light)).astype(np.uint8)
+            mesh.set_active_scalars("color")
+        self.actors[0].mapper.SetInputData(mesh)
+
+
+class Rigid:
+    """A manipulator.
+
+    Attributes:
+        actors: What stands for its parts in the window.
+        cloud: What stands for it in shadows, at the last pose.
+        moves: Whether actions move it.
+    """
+
+    def __init__(self, plotter: pv.Plotter, manipulator: Manipulator) -> None:
+        """Add it to a window."""
+        self.moves = manipulator.action_dim > 0
+        self._parts = manipulator_parts(manipulator)
+        self._samples = [part.scatter(_SAMPLE_AREA) for part in self._parts]
+        self.actors: list[pv.Actor] = []
+        for part in self._parts:
+            self.actors.append(
+                plotter.add_mesh(part_mesh(part), color=MANIPULATOR_COLOR, culling="back", **_METAL)
+            )
+
+    def place(self, pose: np.ndarray) -> None:
+        """Put it at a pose, shape [8]; it is opaque there."""
+        matrices = [pose_matrix(pose, part.side) for part in self._parts]
+        for actor, matrix in zip(self.actors, matrices, strict=True):
+            actor.user_matrix = matrix
+            actor.prop.opacity = 1.0
+        samples = [transform(m, points) for m, points in zip(matrices, self._samples, strict=True)]
+        self.cloud = Cloud(np.concatenate(samples), _SAMPLE_AREA)
+
+    def reveal(self, x: np.ndarray, camera: Camera) -> None:
+        """Let it be seen through where it hides plasticine that it is at work on: particles at positions
+        [domain units], shape [particle, 3]."""
+        low, high = _HIDES
+        share = np.clip((hidden_share(self.cloud.points, x, camera) - low) / (high - low), 0.0, 1.0)
+        for actor in self.actors:
+            actor.prop.opacity = 1.0 - (1.0 - _CLEAREST) * share
+
+
+class Target:
+    """The target, as a ghost and as a solid.
+
+    Attributes:
+        actors: What stands for both in the window.
+        mesh: Its surface.
+        cloud: What stands for the solid in shadows.
+        ghost: What stands for the ghost: where it is outside plasticine, and inside.
+        solid: The solid.
+    """
+
+    def __init__(
+        self, plotter: pv.Plotter, inside: vtkRenderer, scene: Scene, mass: np.ndarray, camera: Camera
+    ) -> None:
+        """Add the target with a mass tensor, shape [n, n, n], to a window; ``inside`` is its layer for what
+        is seen inside plasticine."""
+        self.mesh = target_mesh(scene, mass)
+        self.cloud = Cloud(np.argwhere(mass > TARGET_MASS) * scene.dx, scene.dx**2)
+        self.solid = Clay(plotter, self.mesh.copy(), TARGET_COLOR)
+        toward = camera.position - self.mesh.points
+        facing = np.abs(np.sum(toward * self.mesh.point_normals, axis=1)) / np.linalg.norm(toward, axis=1)
+        # Like a bubble: clear where it faces the camera, dense at the rim.
+        self._alpha = 255 * (0.2 + 0.6 * (1.0 - facing) ** 1.5)
+        self._bubbles = [self.mesh.copy() for _ in range(2)]
+        for bubble in self._bubbles:
+            bubble["color"] = np.tile([*_rgb(TARGET_COLOR), 0], (self.mesh.n_points, 1)).astype(np.uint8)
+        self.ghost = [
+            plotter.add_mesh(bubble, scalars="color", rgba=True, smooth_shading=True, **_GLASS)
+            for bubble in self._bubbles
+        ]
+        plotter.renderer.RemoveActor(self.ghost[1])
+        inside.AddActor(self.ghost[1])
+        self.actors = [*self.ghost, *self.solid.actors]
+
+    def fade(self, bodies: Sequence[Field]) -> None:
+        """Hide the ghost where it runs along the plasticine's surface, not where it crosses it."""
+
+        def density(points: np.ndarray) -> np.ndarray:
+            return np.sum([field.at(points) for field in bodies], axis=0)
+
+        points, normals = self.mesh.points, self.mesh.point_normals
+        here, ahead, behind = (density(points + way * _NEAR * normals) for way in (0.0, 1.0, -1.0))
+        outside = np.clip((0.12 - np.maximum(here, behind)) / 0.1, 0.0, 1.0)
+        inside = np.clip((np.minimum(here, ahead) - 0.92) / 0.07, 0.0, 1.0)
+        steps = 0.5 * _NEAR * np.eye(3)
+        slope = np.stack([density(points + step) - density(points - step) for step in steps], axis=1)
+        length = np.linalg.norm(slope, axis=1)
+        cosine = np.abs(np.sum(slope * normals, axis=1)) / np.maximum(length, 1e-6)
+        # The plasticine in front hides what of these is inside.
+        crossing = np.where(here < 0.9, np.clip((0.9 - cosine) / 0.2, 0.0, 1.0), 0.0)
+        for bubble, share in zip(self._bubbles, (np.maximum(outside, crossing), inside), strict=True):
+            bubble["color"][:, 3] = self._alpha * share
+            bubble.Modified()
+
+
+class Floor:
+    """Paper with lines, ten to the domain unit, on which shadows fall."""
+
+    def __init__(self, plotter: pv.Plotter, paper: str, ink: str, pixel: float) -> None:
+        """Add it to a window; its lines, of the colour of complete darkness too, are fitted to the size of a
+        pixel [domain units]."""
+        self._paper, self._ink = _rgb(paper), _rgb(ink)
+        low, high = FLOOR_LOW, FLOOR_LOW + FLOOR_EDGE
+        corners = np.array([[low, 0, low], [low, 0, high], [high, 0, high], [high, 0, low]])
+        floor = pv.PolyData(corners, faces=_quads(np.arange(4)[None]))
+        floor.active_texture_coordinates = np.array([[0, 0], [0, 1], [1, 1], [1, 0]], np.float32)
+        self._texture = pv.Texture(np.zeros((2, 2, 3), np.uint8))
+        self._texture.interpolate = True
+        plotter.add_mesh(floor, texture=self._texture, lighting=False)
+        plotter.add_mesh(self._lines(0.5 * _LINE * pixel), color=ink, opacity=_LINE_OPACITY, lighting=False)
+
+    def shade(self, light: np.ndarray) -> None:
+        """Let light fall on it, shape [z, x], as :func:`plab.render.shadows.floor_light` returns it."""
+        dark = _SHADOW * (1.0 - light)[..., None]
+        colors = self._paper + dark * (self._ink - self._paper)
+        image = pv.ImageData(dimensions=(*light.shape[::-1], 1))
+        image["color"] = colors.reshape(-1, 3).astype(np.uint8)
+        self._texture.SetInputData(image)
+
+    def _lines(self, half: float) -> pv.PolyData:
+        """Return the lines, which are narrow rectangles of some half width."""
+        line = np.array([[-half, -half], [-half, 1 + half], [half, 1 + half], [half, -half]])
+        along = np.concatenate([line + np.array([at, 0.0]) for at in np.linspace(0.0, 1.0, 11)])
+        both = np.concatenate([along, along[:, ::-1]])
+        corners = np.arange(len(both)).reshape(-1, 4)
+        # Just above the floor, which would hide them otherwise.
+        return pv.PolyData(np.insert(both, 1, 4e-4, axis=1), faces=_quads(corners))
+
+
+def surface_mesh(field: Field, smoothing: tuple[int, float] = _SMOOTHING) -> pv.PolyData:
+    """Return the surface of a field with normals, smoothed by iterations and pass band of Taubin's filter."""
+    image = pv.ImageData(dimensions=field.values.shape, spacing=(field.spacing,) * 3, origin=field.origin)
+    image["density"] = field.values.ravel(order="F")
+    mesh = image.contour(
+        [field.level], "density", method="flying_edges", compute_normals=False, compute_scalars=False
+    )
+    if not mesh.n_points:
+        return mesh
+    iterations, pass_band = smoothing
+    mesh = mesh.smooth_taubin(n_iter=iterations, pass_band=pass_band)
+    return mesh.compute_normals(split_vertices=False, consistent_normals=False, auto_orient_normals=False)
+
+
+def part_mesh(part: Part) -> pv.PolyData:
+    """Return a part of a manipulator in its own frame, with normals, its edges sharp."""
+    mesh = pv.PolyData(part.vertices, faces=_quads(part.faces)).clean()
+    return mesh.compute_normals(feature_angle=40.0, split_vertices=True, auto_orient_normals=False)
+
+
+def target_mesh(scene: Scene, mass: np.ndarray) -> pv.PolyData:
+    """Return the surface of a target with a mass tensor, shape [n, n, n]."""
+    return surface_mesh(target_field(scene, mass), _TARGET_SMOOTHING)
+
+
+def _quads(corners: np.ndarray) -> np.ndarray:
+    """Return faces of four corners, shape [face, 4], as VTK has them."""
+    return np.insert(corners, 0, 4, axis=1).ravel()
+
+
+def _rgb(color: str) -> np.ndarray:
+    """Return a colour in [0, 255], shape [3]."""
+    return np.array(pv.Color(color).int_rgb, np.float64)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from plab.config import load_config
 from plab.config.selection import Selection
-from plab.render import RenderError, recording
+from plab.render import RenderError, rollouts
 from plab.report.series import load_rows
 from plab.results import Row
 from plab.results.table import readable_rows
@@ -64,7 +64,7 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
 def _of_run(row: Row) -> Entry:
     """Return the best actions of a run."""
     try:
-        cfg, actions = recording.stored(row.path)
+        cfg, actions = rollouts.stored(row.path)
     except RenderError as error:
         raise SubmissionError(str(error)) from None
     return Entry(

@@ -68,20 +68,20 @@ def show(
     """
     require_packages("the viewer needs", {"k3d": "K3D-jupyter", "pyvista": "PyVista"}, "view")
     # Imported here: they load the simulator, for which no mistake above should have to wait.
-    from plab.render import recording
+    from plab.render import rollouts
     from plab.sim.runtime import in_use
     from plab.view.page import page
 
     if isinstance(what, str | PathLike):
         if actions is not None:
             raise RenderError("a result file has its own actions: give actions with a configuration only")
-        cfg, actions = recording.result(Path(what))
+        cfg, actions = rollouts.result(Path(what))
     else:
         cfg = what
         if actions is None:
-            actions = recording.demonstration(cfg)
+            actions = rollouts.demonstration(cfg)
     if runtime := in_use():
         sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
         cfg = dataclasses.replace(cfg, sim=sim)
-    rollout = recording.record_with_motion(cfg, actions)
-    return Viewer(page(rollout, every), rollout.score, height)
+    shown = rollouts.record_with_motion(cfg, actions)
+    return Viewer(page(shown, every), shown.score, height)

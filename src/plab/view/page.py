@@ -1,4 +1,4 @@
-"""The page: particles, manipulators and target as K3D-jupyter's objects, and a bar to play them with."""
+"""Pages in 3-D: particles, manipulators and target as K3D-jupyter's objects, and a bar to play them with."""
 
 from __future__ import annotations
 
@@ -13,16 +13,21 @@ from typing import Any
 import k3d
 import numpy as np
 import pyvista as pv
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 
-from plab.render.actors import MANIPULATOR_COLOR, TARGET_COLOR, part_mesh, target_mesh
 from plab.render.camera import scene_camera
-from plab.render.recording import RecordedRollout
-from plab.render.renderer import BODY_COLORS, INK, PAPER
+from plab.render.renderer import (
+    BODY_COLORS,
+    INK,
+    MANIPULATOR_COLOR,
+    PAPER,
+    TARGET_COLOR,
+    part_mesh,
+    target_mesh,
+)
+from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices
-
-__all__ = ["page"]
 
 _FRAMES = 60
 _POSITIONS = 600_000  # of particles in all frames together: some 6 MB of the page
@@ -80,6 +85,11 @@ def page(recording: RecordedRollout, every: int | None = None) -> str:
     # The page sets the camera itself, when it knows how wide its window is.
     seen = [*camera.position, *camera.target, 0.0, 1.0, 0.0]
     return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
+
+
+def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
+    """Return a page of links to pages, given by name, file and score; the first is open."""
+    return _template("gallery.html").render(pages=pages)
 
 
 def _bodies(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
@@ -156,10 +166,7 @@ def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float]
         "aspect": _ASPECT,
     }
     title = f"{recording.task}, variant {recording.variant}"
-    template = Environment(autoescape=True, undefined=StrictUndefined).from_string(
-        (files("plab.view") / "web" / "bar.html").read_text(encoding="utf-8")
-    )
-    bar = template.render(
+    bar = _template("bar.html").render(
         title=title,
         # The only sign with which text could leave the script that it is in.
         content=json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
@@ -172,6 +179,11 @@ def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float]
     found = sorted(path for path in installed_files("k3d") or [] if path.name in _LICENCES)
     licences = "\n\n".join(path.read_text(encoding="utf-8").replace("--", "- -") for path in found)
     return snapshot.replace("<head>", f"<head>\n<!--\n{licences}\n-->", 1)
+
+
+def _template(name: str) -> Template:
+    text = (files("plab.view") / "web" / name).read_text(encoding="utf-8")
+    return Environment(autoescape=True, undefined=StrictUndefined).from_string(text)
 
 
 def _number(color: str) -> int:
