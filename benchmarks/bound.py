@@ -156,7 +156,7 @@ def rows(cfg: Config, batches: Sequence[int], speeds: tuple[float, ...]) -> Iter
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Measure the speed of copies, and calls beside their bounds."""
     parser = Parser("bound", __doc__ or "")
     parser.prog = "python benchmarks/bound.py"

@@ -172,7 +172,7 @@ def _rows(configurations: Sequence[Start], exact: Sequence, rounded: Iterator) -
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Compare float32 with float64, print, write the files asked for."""
     parser = Parser("precision", __doc__)
     parser.prog = "python benchmarks/precision.py"

@@ -62,7 +62,7 @@ def rows(overrides: Sequence[str], grid: int, particles: int, repeats: int) -> I
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Measure all sizes, print, write a CSV file if asked to."""
     parser = Parser("scaling", __doc__ or "")
     parser.prog = "python benchmarks/scaling.py"

@@ -351,7 +351,7 @@ def write_norms(rows: Sequence[Mapping[str, object]], path: Path) -> None:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Simulate the cases, print, write the files asked for; return the exit code."""
     parser = Parser("stress", __doc__)
     parser.prog = "python benchmarks/stress.py"

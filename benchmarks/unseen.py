@@ -83,7 +83,7 @@ def rows(
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Try policies in scenes that they have not seen, print, write a CSV file if asked to."""
     parser = Parser("unseen", __doc__ or "")
     parser.prog = "python benchmarks/unseen.py"

@@ -292,7 +292,7 @@ def rows(tasks: Sequence[str], plan: Plan) -> Iterator[dict[str, object]]:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> None:
+def main(argv: Sequence[str]) -> None:
     """Compare settings with references, print, write the table and the diagrams."""
     import pandas as pd
 
@@ -312,7 +312,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(output / f"{drawing.name}.png", output / f"{drawing.name}.pdf", sep="\n")
 
 
-def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+def _options(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser("plab.bench.accuracy", __doc__)
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
     text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"

@@ -130,7 +130,7 @@ def paper_row(overrides: Sequence[str], batch: int, steps: int, repeats: int) ->
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Time environment steps, print, write the files asked for; return 1 if a row needs too much memory."""
     options = _options(argv)
     quick, batches = options.quick, options.batch
@@ -156,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if len(table) == len(cells) * len(kinds) else 1
 
 
-def _options(argv: Sequence[str] | None) -> argparse.Namespace:
+def _options(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser("plab.bench.speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")

@@ -227,13 +227,13 @@ def summarise(rows: Sequence[Mapping[str, object]]) -> int:
 
 
 @command_line
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Simulate the cases, print, write the file asked for; return the exit code."""
     options = options_of(Parser("plab.bench.stability", __doc__), argv)
     return summarise(measure(options, stress_cases))
 
 
-def options_of(parser: Parser, argv: Sequence[str] | None) -> argparse.Namespace:
+def options_of(parser: Parser, argv: Sequence[str]) -> argparse.Namespace:
     """Read the options of a command line that runs cases, with those that the parser already has."""
     parser.add_argument("--quick", action="store_true", help="one variant of each task, fewer particles")
     parser.add_argument("--precision", choices=PRECISIONS, nargs="+", default=list(PRECISIONS))
