@@ -211,6 +211,8 @@ def free_with(owner: object) -> None:
     finalize = builder.finalize
     builder.finalize = lambda **words: trees.append(finalize(**words))
     impl.get_runtime().materialize()
+    # A builder without fields is not finalized and serves the next owner.
+    del builder.finalize
     for tree in trees:
         weakref.finalize(owner, _free_tree, tree)
 
