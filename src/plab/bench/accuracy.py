@@ -313,7 +313,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _options(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("plab.bench.accuracy", __doc__)
+    parser = Parser("plab bench accuracy", __doc__)
     parser.add_argument("--quick", action="store_true", help="coarser, fewer settings, 20 steps")
     text = f"tasks, with commas between (all; {','.join(QUICK_TASKS)} with --quick)"
     parser.add_argument("--task", type=task_list, help=text)

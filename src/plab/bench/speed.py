@@ -157,7 +157,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _options(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("plab.bench.speed", __doc__)
+    parser = Parser("plab bench speed", __doc__)
     parser.add_argument("overrides", nargs="*", help="configuration overrides: task=Move sim.device=cuda")
     parser.add_argument("--task", type=task_list, help="tasks, such as Move,Rope; with --paper all ten")
     parser.add_argument("--precision", nargs="+", help="precisions, one after the other")

@@ -229,7 +229,7 @@ def summarise(rows: Sequence[Mapping[str, object]]) -> int:
 @command_line
 def main(argv: Sequence[str]) -> int:
     """Simulate the cases, print, write the file asked for; return the exit code."""
-    options = options_of(Parser("plab.bench.stability", __doc__), argv)
+    options = options_of(Parser("plab bench stability", __doc__), argv)
     return summarise(measure(options, stress_cases))
 
 

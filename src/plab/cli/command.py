@@ -18,7 +18,6 @@ from typing import Any, NoReturn
 
 from plab.config.suite import suite_tasks
 from plab.errors import TRACEBACK, ArgumentError, PlabError, out_of_memory, pick, tell, traceback_wanted
-from plab.results.examples import EXAMPLES, resolve
 
 EXIT_BUG = 70
 """As sysexits.h has it, so that no refusal is taken for a bug, and no bug for a refusal."""
@@ -97,8 +96,6 @@ def _bug(error: Exception) -> str:
 
 # -------------------------------------------------------------------------------------------------- arguments
 
-SOURCE = f"folder, file or archive of results, or one of {', '.join(EXAMPLES)}"
-
 
 class Parser(ArgumentParser):
     """The parser of a command: a docstring is its help, a mistake an ArgumentError."""
@@ -108,7 +105,7 @@ class Parser(ArgumentParser):
         helps, such as examples."""
         purpose, _, more = inspect.cleandoc(text or "").partition("\n\n")
         formed = RawDescriptionHelpFormatter
-        super().__init__(f"plab {name}", description=purpose, epilog=more, formatter_class=formed, **options)
+        super().__init__(name, description=purpose, epilog=more, formatter_class=formed, **options)
 
     def error(self, message: str) -> NoReturn:
         """Raise the mistake in one line, with the flags that there are where one is unknown."""
@@ -121,8 +118,11 @@ class Parser(ArgumentParser):
 
 def add_sources(parser: ArgumentParser, words: str = "") -> None:
     """Add the argument ``sources``: results, and words that choose among their runs, in any order."""
-    more = f"; {words}" if words else ""
-    what = f"{SOURCE} (default: results), by its name or as results=NAME{more}"
+    # Imported here, as below: h5py takes a fifth of a second.
+    from plab.results.examples import EXAMPLES
+
+    what = f"folder, file or archive of results, or one of {', '.join(EXAMPLES)} (default: results)"
+    what += f", by its name or as results=NAME{f'; {words}' if words else ''}"
     shown = "RESULTS | KEY=VALUE" if words else "RESULTS"
     parser.add_argument("sources", nargs="*", metavar=shown, help=what)
 
@@ -191,6 +191,8 @@ def folder(text: str) -> Path:
 
 def results_source(text: str) -> Path:
     """Read a folder, file or archive of results, or a word that stands for real runs."""
+    from plab.results.examples import EXAMPLES, resolve
+
     # As a path ./example would be the word.
     return resolve(text) if text in EXAMPLES else folder(text)
 

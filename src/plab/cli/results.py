@@ -49,13 +49,13 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parse(argv: Sequence[str]) -> argparse.Namespace:
-    parser = Parser("results", __doc__)
+    parser = Parser("plab results", __doc__)
     parser.add_argument("command", choices=_COMMANDS, help="what to do; it has a --help of its own")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
     run, add_arguments = _COMMANDS[first.command]
     # Not by subparsers: they cannot have words on both sides of an option.
-    command = Parser(f"results {first.command}", add_arguments.__doc__ or "")
+    command = Parser(f"plab results {first.command}", add_arguments.__doc__ or "")
     add_arguments(command)
     command.set_defaults(run=run)
     return command.parse_intermixed_args(first.arguments)

@@ -52,7 +52,7 @@ def render(argv: Sequence[str]) -> None:
       plab render example task=Rope method=adam --output rope.gif
       plab render task=Torus variant=2 --output torus.gif
     """
-    parser = _parser("render", render.__doc__, "a film")
+    parser = _parser("plab render", render.__doc__, "a film")
     add = parser.add_argument
     add("--output", type=folder, metavar="FILE", help="by default a .png named like the result or the task")
     add("--contact-sheet", type=folder, metavar="FILE", help="a .png")
@@ -98,7 +98,7 @@ def view(argv: Sequence[str]) -> None:
       plab view results/Rope-v1/adam/seed0-12ab34cd.h5
       plab view task=Torus variant=2 --output torus.html
     """
-    parser = _parser("view", view.__doc__, "the page")
+    parser = _parser("plab view", view.__doc__, "the page")
     what = "by default a .html named like the result or the task; of --gallery a folder, gallery by default"
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
     parser.add_argument("--gallery", action="store_true", help="the best actions known for every task")
@@ -150,7 +150,7 @@ def export(argv: Sequence[str]) -> None:
       plab export results/Rope-v1/adam/seed0-12ab34cd.h5
       plab export task=Torus variant=2 --format ply --output torus
     """
-    parser = _parser("export", export.__doc__, "the series")
+    parser = _parser("plab export", export.__doc__, "the series")
     parser.add_argument("--format", choices=("vtk", "ply"), default="vtk", help="vtk unless given")
     what = "by default named like the result or the task"
     parser.add_argument("--output", type=folder, metavar="FOLDER", help=what)

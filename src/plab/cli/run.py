@@ -93,7 +93,7 @@ def _print_configuration(options: Namespace, words: Sequence[str]) -> None:
 
 def parser() -> Parser:
     """Return the parser of the arguments."""
-    made = Parser("run", "", add_help=False)
+    made = Parser("plab run", "", add_help=False)
     add = made.add_argument
     add("overrides", nargs="*")
     add("-h", "--help", action="store_true")

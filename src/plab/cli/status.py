@@ -21,7 +21,7 @@ __all__ = ["main"]
 @command_line
 def main(argv: Sequence[str]) -> None:
     """Run the command line."""
-    parser = Parser("status", __doc__)
+    parser = Parser("plab status", __doc__)
     add_sources(parser, "runs: task=Rope,Move variant=1 seed=0,1,2")
     what = "ask for the suite's tasks and variants, of the methods and seeds that there are"
     parser.add_argument("--missing", action="store_true", help=what)

@@ -52,7 +52,7 @@ def submit(argv: Sequence[str]) -> None:
     Recordings are written by plab.submissions.record; words such as method=adam choose among results. A
     policy is run here, to see what it reaches; overrides such as sim.device=cuda may follow.
     """
-    parser = Parser("submit", submit.__doc__)
+    parser = Parser("plab submit", submit.__doc__)
     add = parser.add_argument
     what = "folders of recordings or results, archives; words that choose runs; with --policy, overrides"
     add("sources", nargs="*", metavar="RESULTS | KEY=VALUE", help=what)
@@ -111,7 +111,7 @@ def verify(argv: Sequence[str]) -> int:
     found is kept beside each file, for plab leaderboard. Plans are data; policies are programs of other
     people, and run only if --run-policies is given.
     """
-    parser = Parser("verify", verify.__doc__)
+    parser = Parser("plab verify", verify.__doc__)
     what = f"files <name>{SUFFIX}, or folders of them; overrides, such as sim.device=cuda"
     parser.add_argument("arguments", nargs="+", help=what)
     what = "run the policies in the files: programs of other people, so do it where they can do no harm"
@@ -187,7 +187,7 @@ def leaderboard(argv: Sequence[str]) -> None:
     Run plab verify on the folder before: what it has kept is shown. The page is index.html; it needs no
     server.
     """
-    parser = Parser("leaderboard", leaderboard.__doc__)
+    parser = Parser("plab leaderboard", leaderboard.__doc__)
     parser.add_argument("folder", type=folder, help="folder of submissions")
     what = "settings of a leaderboard of your own, such as sim.grid_size=32"
     parser.add_argument("overrides", nargs="*", help=what)

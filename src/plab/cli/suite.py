@@ -84,7 +84,7 @@ def demonstrations(argv: Sequence[str]) -> None:
 
     Overrides of the configuration, such as sim.device=cuda, may follow.
     """
-    parser = Parser("demonstrations", demonstrations.__doc__)
+    parser = Parser("plab demonstrations", demonstrations.__doc__)
     parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
     parser.add_argument("--record", action="store_true", help="record what is replayed")
     options = _options(parser, argv, ("method", "seed", *IDLE), "demonstrations")
@@ -171,7 +171,7 @@ def targets(argv: Sequence[str]) -> None:
     Overrides of the configuration, such as sim.device=cuda, may follow. With targets.source it describes the
     targets of the original release.
     """
-    parser = Parser("targets", targets.__doc__)
+    parser = Parser("plab targets", targets.__doc__)
     parser.add_argument("--rebuild", action="store_true", help="simulate even what is cached")
     parser.add_argument("--csv", type=to_write, help="write the table to this file, too")
     options = _options(parser, argv, ("method", "seed", "sim.memory_mb", *IDLE), "targets")
