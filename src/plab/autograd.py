@@ -252,68 +252,43 @@ def policy_gradient(
         plab.sim.SimulationError: If a state, loss or gradient stops being finite.
         MemoryError: If the gradient does not fit the memory budget.
     """
-    walk = _Walk(batch, policy, steps, discount, value)
-    like = walk.like if walk.like.is_cuda else None
-    terms = batch.closed_loop(steps, walk.choose, walk.react, discount=discount, like=like)
-    loss = batch.problem.loss_of(terms)
-    shown = [torch.as_tensor(array).to(walk.like).transpose(0, 1) for array in (terms, loss)]
-    return Stretch(torch.stack(walk.seen).detach(), torch.stack(walk.done).detach(), *shown)
+    parameters = [one for one in policy.parameters() if one.requires_grad]
+    like = parameters[0].detach()
+    seen: list[torch.Tensor] = []
+    done: list[torch.Tensor] = []
 
+    def given(tensor: torch.Tensor) -> Any:
+        return tensor.detach() if like.is_cuda else tensor.detach().double().numpy()
 
-class _Walk:
-    """A policy in a stretch of episodes, forward and backward.
-
-    Attributes:
-        like: The policy's first parameter, whose type and device all tensors have.
-        seen: Observations before each step and after the last.
-        done: Actions.
-    """
-
-    def __init__(
-        self,
-        batch: EpisodeBatch,
-        policy: torch.nn.Module,
-        steps: int,
-        discount: float,
-        value: Callable[[torch.Tensor], torch.Tensor] | None,
-    ) -> None:
-        self._batch, self._policy, self._steps, self._discount = batch, policy, steps, discount
-        self._value = value
-        self._parameters = [one for one in policy.parameters() if one.requires_grad]
-        self.like = self._parameters[0].detach()
-        self.seen: list[torch.Tensor] = []
-        self.done: list[torch.Tensor] = []
-
-    def choose(self, t: int, observation: Any) -> Any:
-        """Observe, and act unless the stretch is over; keep the action as a function of the observation."""
-        self.seen.append(torch.as_tensor(observation).to(self.like).requires_grad_())
-        if t == self._steps:
+    def choose(t: int, observation: Any) -> Any:
+        seen.append(torch.as_tensor(observation).to(like).requires_grad_())
+        if t == steps:
             return None
         with torch.enable_grad():
-            self.done.append(self._policy(self.seen[t]))
-        return self._given(self.done[t])
+            done.append(policy(seen[t]))
+        return given(done[t])
 
-    def react(self, t: int, actions_bar: Any) -> Any:
+    def react(t: int, actions_bar: Any) -> Any:
         """Add to the parameters' gradients; return the derivative by the observation."""
-        if t == self._steps:
-            return self._look_ahead()
-        bar = torch.as_tensor(actions_bar).to(self.like)
-        wanted = [self.seen[t], *self._parameters]
-        seen_bar, *by_parameter = torch.autograd.grad(self.done[t], wanted, bar, allow_unused=True)
-        for parameter, part in zip(self._parameters, by_parameter, strict=True):
+        if t == steps:
+            return react_to_value()
+        bar = torch.as_tensor(actions_bar).to(like)
+        seen_bar, *by_parameter = torch.autograd.grad(done[t], [seen[t], *parameters], bar, allow_unused=True)
+        for parameter, part in zip(parameters, by_parameter, strict=True):
             if part is not None:
-                part = part / self._batch.size
+                part = part / batch.size
                 parameter.grad = part if parameter.grad is None else parameter.grad + part
-        return None if seen_bar is None else self._given(seen_bar)
+        return None if seen_bar is None else given(seen_bar)
 
-    def _look_ahead(self) -> Any:
-        """Return the derivative of the last observation's value, as a loss."""
-        if self._value is None:
+    def react_to_value() -> Any:
+        if value is None:
             return None
         with torch.enable_grad():
-            worth = self._value(self.seen[-1]).sum()
-        (seen_bar,) = torch.autograd.grad(-(self._discount**self._steps) * worth, self.seen[-1])
-        return self._given(seen_bar)
+            worth = value(seen[-1]).sum()
+        (seen_bar,) = torch.autograd.grad(-(discount**steps) * worth, seen[-1])
+        return given(seen_bar)
 
-    def _given(self, tensor: torch.Tensor) -> Any:
-        return tensor.detach() if self.like.is_cuda else tensor.detach().double().numpy()
+    terms = batch.closed_loop(steps, choose, react, discount=discount, like=like if like.is_cuda else None)
+    loss = batch.problem.loss_of(terms)
+    shown = [torch.as_tensor(array).to(like).transpose(0, 1) for array in (terms, loss)]
+    return Stretch(torch.stack(seen).detach(), torch.stack(done).detach(), *shown)
