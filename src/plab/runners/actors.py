@@ -92,11 +92,11 @@ class ActorTraining(ABC):
         seed = cfg.seed
         self._cfg, self._method, self._batch = cfg, method, batch
         self._device = torch.device(method.torch_device)
-        self._spaces = Spaces(batch.observation_space, batch.action_space)
+        self._spaces = Spaces.of(batch)
         self.policy: Any = first_policy(method, self._spaces, seed).to(self._device)
         self._optimizer = torch.optim.Adam(self.policy.parameters(), lr=method.lr)
         self._generator = torch.Generator(self._device).manual_seed(seed)
-        self.statistics = RunningMeanStd(shape=batch.observation_space.shape)
+        self.statistics = RunningMeanStd(shape=self._spaces.observation_space.shape)
         self.episodes = 0
         whole = self.round_episodes[0] * batch.size
         self.total_episodes = math.ceil(method.episodes / whole) * whole

@@ -166,8 +166,7 @@ class Agents:
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
         first = [first_policy(cfg.method_as(RlConfig), spaces, cfg.seed) for cfg in cfgs]
-        (observed,), (actions,) = (space.shape for space in spaces)
-        self.sizes = Sizes(self.method.num_envs, horizon, observed, actions)
+        self.sizes = Sizes(self.method.num_envs, horizon, *spaces.sizes)
         self.total_steps = self.training_steps(self.method, horizon)
         self.steps = self.updates = 0
         self.draws = Draws([cfg.seed for cfg in cfgs], device)

@@ -18,6 +18,7 @@ from plab.config.families import GRADIENT, Appearance, Family
 from plab.runners.libraries import torch
 from plab.runners.policy import (
     PolicyRunner,
+    Spaces,
     module_arrays,
     optimizer_arrays,
     restore_module,
@@ -58,9 +59,9 @@ class ApgRunner(PolicyRunner):
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make the network, or take that of the file."""
-        (entries,), (size,) = self._episode.observation_space.shape, self._episode.action_space.shape
         device = torch.device(track.cfg.sim.device)
-        self._training = PolicyTraining(self.method, entries, size, track.cfg.seed, device)
+        sizes = Spaces.of(self._episode).sizes
+        self._training = PolicyTraining(self.method, *sizes, track.cfg.seed, device)
         if state is not None:
             self._training.restore(state)
 

@@ -108,6 +108,16 @@ class Spaces(NamedTuple):
     observation_space: Box
     action_space: Box
 
+    @classmethod
+    def of(cls, batch: EpisodeBatch) -> Spaces:
+        """Return the spaces of a batch whose observations are vectors."""
+        return cls(cast("Box", batch.observation_space), batch.action_space)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Entries of an observation and components of an action."""
+        return self.observation_space.shape[0], self.action_space.shape[0]
+
 
 # ------------------------------------------------------------------------------------- runners, episodes
 
@@ -378,7 +388,8 @@ def _policy(path: Path) -> Policy:
     own = [name for name in arrays if name.startswith(_PARAMETER)]
     parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}
     # Before networks of that size are made.
-    widths = [spaces[0].shape[0], *getattr(method, "hidden", ()), spaces[1].shape[0]]
+    observed, actions = spaces.sizes
+    widths = [observed, *getattr(method, "hidden", ()), actions]
     needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
     there = sum(values.size for values in parameters.values())
     if needed > there:

@@ -87,11 +87,11 @@ class Population:
         self._training, self._evaluation = training, evaluation
         self._device = torch.device(method.torch_device)
         self._envs, self._horizon = method.num_envs, cfgs[0].sim.horizon
-        kind, batch = agents_of(method), training.batch
+        kind = agents_of(method)
         self._cycle = kind.cycle_steps(method, self._horizon)
         self._total = kind.training_steps(method, self._horizon)
         size = len(cfgs) if self._device.type == "cuda" else 1
-        spaces = Spaces(batch.observation_space, batch.action_space)
+        spaces = Spaces.of(training.batch)
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
         self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
         self._lost = torch.zeros(len(cfgs), dtype=torch.bool, device=self._device)
@@ -262,8 +262,7 @@ class RlRunner(PolicyRunner):
         self.require_torch_device()
         cfgs, method = [track.cfg for track in self.tracks], self.method
         self._spaces = Spaces(*spaces(cfgs[0], build_scenes(cfgs)))
-        (observed,), (actions,) = (space.shape for space in self._spaces)
-        self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, observed, actions)
+        self._sizes = Sizes(method.num_envs, cfgs[0].sim.horizon, *self._spaces.sizes)
         self._total = agents_of(method).training_steps(method, self._sizes.horizon)
         self._require_memory()
         own = [cfg for cfg in cfgs for _ in range(method.num_envs)]

@@ -219,7 +219,7 @@ class Runner:
     def _heading(self) -> str:
         return self._note + batch_title([track.cfg for track in self.tracks])
 
-    def _waiting(self, what: str) -> AbstractContextManager[None]:
+    def _waiting(self, what: str) -> AbstractContextManager[Report]:
         from plab.sim.taichi_internals import watch_compiling
 
         enabled = self.tracks[0].cfg.progress

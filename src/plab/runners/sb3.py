@@ -12,6 +12,7 @@ import math
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -95,17 +96,17 @@ class Sb3Training:
     """
 
     round_episodes = 1, 0
+    replay_path: Path
     report: Callable[[str], None]
 
     def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
         """Make the environments and an untrained model."""
-        self._method: Any = cfg.method
-        self._kind: ModelKind = family(cfg.method.family).rules[self._method.algorithm].what
-        method, horizon, rollout = self._method, batch.horizon, self._kind.rollout_steps
+        method: Any = cfg.method
+        self._kind: ModelKind = family(method.family).rules[method.algorithm].what
+        horizon, rollout = batch.horizon, self._kind.rollout_steps
         self._cycle = method.num_envs * (horizon if rollout is None else rollout(method))
         self._total = math.ceil(method.episodes * horizon / self._cycle) * self._cycle
-        spaces = batch.observation_space, batch.action_space
-        self._sizes = Sizes(method.num_envs, horizon, *(space.shape[0] for space in spaces))
+        self._sizes = Sizes(method.num_envs, horizon, *Spaces.of(batch).sizes)
         envs = PlabVecEnv(batch)
         envs.strict = False
         self._env = VecMonitor(envs)
@@ -113,7 +114,7 @@ class Sb3Training:
         if isinstance(method, OffPolicyConfig):
             kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(method, self._total)}
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
-        device = method.torch_device
+        self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
         self.broken: list[str] = []
         self.episode_actions: list[np.ndarray] = []
@@ -198,8 +199,7 @@ class Sb3Training:
             self._env.step(actions)
             self.episode_actions.append(actions)
         written = io.BytesIO(state["model"].tobytes())
-        device = self._method.torch_device
-        self.model = self._kind.model.load(written, self._env, device, force_reset=False)
+        self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])
