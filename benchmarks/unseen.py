@@ -92,12 +92,12 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--together", type=positive, default=25, metavar="N", help="simulated at a time")
     parser.add_argument("--csv", type=to_write, help="file to write the rows to")
     options = parser.parse_intermixed_args(argv)
-    paths, words = sources_and_words(options.what)
+    paths, words = sources_and_words(options.what, default=None)
     if not paths:
         parser.error("name the result file of a run that has trained a policy")
     if options.scenes < 2:
         parser.error("--scenes has to be at least 2: one score has no interval")
-    widths = {"policy": max(map(len, paths)), "trained_on": 17}
+    widths = {"policy": max(len(str(path)) for path in paths), "trained_on": 17}
     measure_table(COLUMNS, rows(paths, options.scenes, options.together, words), options.csv, widths)
 
 
