@@ -29,7 +29,7 @@ from plab.sim.state import (
     rest_state,
 )
 from plab.sim.taichi_internals import free_with
-from plab.sim.tape import ClosedLoop, Recording, StateRecorder, Tape
+from plab.sim.tape import ClosedLoop, Recording, Tape
 from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
 
@@ -453,8 +453,8 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         array, steps, poses, plan = self._started(actions, gradient)
-        recorder = StateRecorder(self._particles, actions, every_step, mass, steps)
-        self._tape.forward(array, poses, None, steps, plan, after=recorder.note)
+        recording = Recording(self._particles, actions, every_step, mass, steps)
+        self._tape.forward(array, poses, None, steps, plan, after=recording.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         self._engine.place(poses, steps, self._pose, 0)
         shown = numbers_of(poses, (steps + 1, self.batch, self.manipulator_count, 8), actions)
@@ -464,15 +464,13 @@ class Simulator:
             before = self.steps_before_contact(steps)
             with self._kept_weights():
                 self._engine.write(self._engine.term_weights, np.zeros(self._engine.term_weights.shape))
-                bars = self._tape.backward(array, poses, terms, steps, before, add=recorder.add)
+                bars = self._tape.backward(array, poses, terms, steps, before, add=recording.add)
             bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
             require_none(broken_gradients(bar))
             return bar
 
         version = self._version
-        return recorder.recording(
-            shown[1:].swapaxes(0, 1), back, lambda: gradient and self._version == version
-        )
+        return recording.finish(shown[1:].swapaxes(0, 1), back, lambda: gradient and self._version == version)
 
     def closed_loop(
         self,
@@ -521,7 +519,7 @@ class Simulator:
         observe = functools.partial(self._observe, stride=stride, like=like)
         loop = ClosedLoop(self._particles, poses, steps, choose, react, observe, stride, discount, like)
         loop.look(0, self._particles.current, 0)
-        self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.after)
+        self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         before = self.steps_before_contact(steps)
         with self._kept_weights() as loop.weights:

@@ -238,12 +238,47 @@ class Recording:
         mass: Mass tensors, shape [batch, T, n, n, n]; None if they were not asked for.
     """
 
-    def __init__(
-        self, x: Any, v: Any, poses: Any, mass: Any, back: Callable[..., Any], current: Callable[[], bool]
-    ) -> None:
-        """Made by :meth:`plab.sim.Simulator.record`."""
-        self.x, self.v, self.poses, self.mass = x, v, poses, mass
-        self._back, self._current = back, current
+    x: Any
+    v: Any
+    poses: Any
+    mass: Any
+
+    def __init__(self, particles: Particles, like: Any, every_step: bool, mass: bool, steps: int) -> None:
+        """Made by :meth:`plab.sim.Simulator.record`, without a state of the rollout's T ``steps`` yet; states
+        are tensors if ``like``, the actions, are a CUDA tensor."""
+        self._particles, self._engine = particles, particles.engine
+        self._like = like if on_device(like) else None
+        self._first = 0 if every_step else steps - 1
+        self._rows: list[Any] = []
+        self._masses: list[Any] | None = [] if mass else None
+        # Where particles change places: their numbers at each state.
+        self._numbers: list[ti.Ndarray] = []
+        self._bars: dict[str, Any] = {}
+
+    def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
+        """Take the state that step t has led to from the device."""
+        if t < self._first:
+            return
+        engine, numbers = self._engine, self._particles.order.noted()
+        self._numbers.append(numbers)
+        size = engine.batch * engine.particles * 6
+        self._rows.append(self._taken(size, lambda out: engine.observe(state, slot, numbers, 1, out)))
+        if self._masses is not None:
+            terms = ti.ndarray(ti.f64, shape=engine.batch * engine.measures)
+            self._particles.losses(terms, 0, state, slot)
+            self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
+
+    def finish(self, poses: Any, back: Callable[[], Any], is_current: Callable[[], bool]) -> Recording:
+        """Offer what was noted, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the way back
+        while it ``is_current``."""
+        e = self._engine
+        rows = self._stacked(self._rows).reshape(e.batch, -1, e.particles, 6)
+        self.x, self.v, self.poses, self.mass = rows[..., :3], rows[..., 3:], poses[:, self._first :], None
+        if self._masses is not None:
+            self.mass = self._stacked(self._masses).reshape(e.batch, -1, e.n, e.n, e.n)
+        self._rows, self._masses = [], None
+        self._back, self._is_current = back, is_current
+        return self
 
     def pullback(self, *, x: Any = None, v: Any = None, poses: Any = None, mass: Any = None) -> Any:
         """Return the gradient with respect to the actions of a function whose derivatives by the states are
@@ -273,56 +308,13 @@ class Recording:
             shape = np.shape(getattr(self, name)) if getattr(self, name) is not None else None
             if bar is not None and np.shape(bar) != shape:
                 raise ArgumentError(f"derivatives by {name} have shape {np.shape(bar)}, not {shape}")
-        if not self._current():
+        if not self._is_current():
             raise RuntimeError(
                 "the way back is gone: record with gradient=True, and pull back before the simulator runs "
                 "again"
             )
-        return self._back({name: bar for name, bar in given.items() if bar is not None})
-
-
-class StateRecorder:
-    """Takes states from the device while a rollout runs, and puts derivatives by them to the states'
-    adjoints."""
-
-    def __init__(self, particles: Particles, like: Any, every_step: bool, mass: bool, steps: int) -> None:
-        """Start without a state of the rollout's T ``steps``; states are tensors if ``like``, the actions,
-        are a CUDA tensor."""
-        self._particles, self._engine = particles, particles.engine
-        self._like = like if on_device(like) else None
-        self._first = 0 if every_step else steps - 1
-        self._mass = mass
-        self._rows: list[Any] = []
-        self._masses: list[Any] = []
-        # Where particles change places: their numbers at each state.
-        self._numbers: list[ti.Ndarray] = []
-        self._bars: dict[str, Any] = {}
-
-    def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
-        """Take the state that step t has led to."""
-        if t < self._first:
-            return
-        engine, numbers = self._engine, self._particles.order.noted()
-        self._numbers.append(numbers)
-        size = engine.batch * engine.particles * 6
-        self._rows.append(self._taken(size, lambda out: engine.observe(state, slot, numbers, 1, out)))
-        if self._mass:
-            terms = ti.ndarray(ti.f64, shape=engine.batch * engine.measures)
-            self._particles.losses(terms, 0, state, slot)
-            self._masses.append(self._taken(engine.batch * engine.n**3, engine.export_mass))
-
-    def recording(self, poses: Any, back: Callable[[], Any], current: Callable[[], bool]) -> Recording:
-        """Return what was noted, with poses of shape [batch, T, manipulator, 8]; ``back`` runs the way back
-        if it is still ``current``."""
-        e = self._engine
-        rows = self._stacked(self._rows).reshape(e.batch, -1, e.particles, 6)
-        mass = self._stacked(self._masses).reshape(e.batch, -1, e.n, e.n, e.n) if self._mass else None
-
-        def pulled(bars: dict[str, Any]) -> Any:
-            self._bars = {name: self._by_step(bar) for name, bar in bars.items()}
-            return back()
-
-        return Recording(rows[..., :3], rows[..., 3:], poses[:, self._first :], mass, pulled, current)
+        self._bars = {name: self._by_step(bar) for name, bar in given.items() if bar is not None}
+        return self._back()
 
     def add(self, t: int, state: ti.Ndarray, slot: int, bar: ti.Ndarray) -> None:
         """Add the derivatives by the state that step t has led to, in ``slot`` of an array, to its
@@ -330,9 +322,8 @@ class StateRecorder:
         k = t - self._first
         if k < 0:
             return
-        for name in ("x", "v"):
+        for name, first in (("x", 0), ("v", AT_V)):
             if name in self._bars:
-                first = 0 if name == "x" else AT_V
                 self._engine.add_cotangents(bar, self._numbers[k], self._bars[name][k], first)
         if "mass" in self._bars:
             self._engine.add_mass_cotangents(state, slot, bar, self._bars["mass"][k])
@@ -346,26 +337,18 @@ class StateRecorder:
             out = np.zeros(size, np.float64 if double else np.float32)
             fill(out)
             return out
-
-        def cleared(out: torch.Tensor) -> None:
-            fill(out.zero_())
-
-        return output_for(cleared, size, double, self._like)
+        return output_for(lambda out: fill(out.zero_()), size, double, self._like)
 
     def _stacked(self, parts: list[Any]) -> Any:
         """States of all steps, each of [batch * number] numbers, as [batch, T, number]."""
         rows = [part.reshape(self._engine.batch, -1) for part in parts]
-        if self._like is None:
-            return np.stack(rows, axis=1)
         # Whoever gave a tensor has imported PyTorch.
-        return sys.modules["torch"].stack(rows, dim=1)
+        return np.stack(rows, axis=1) if self._like is None else sys.modules["torch"].stack(rows, dim=1)
 
     def _by_step(self, bar: Any) -> list[Any]:
         """Derivatives by the states of each step as numbers one after the other that a kernel takes."""
-        count = bar.shape[1]
-        if on_device(bar):
-            return [bar[:, k].detach().reshape(-1).contiguous() for k in range(count)]
-        return [np.ascontiguousarray(np.asarray(bar)[:, k]).reshape(-1) for k in range(count)]
+        steps = bar.detach() if on_device(bar) else np.asarray(bar)
+        return [_flat(steps[:, k]) for k in range(steps.shape[1])]
 
 
 class ClosedLoop:
@@ -416,7 +399,7 @@ class ClosedLoop:
             row = step_actions(chosen, engine.batch, engine.actions_per_step, device)
             copy_numbers(self.actions, t * self._row, row, self._row, 1)
 
-    def after(self, t: int, state: ti.Ndarray, slot: int) -> None:
+    def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Look at the state that step t has led to."""
         self.look(t + 1, state, slot)
 

@@ -93,7 +93,7 @@ def step_actions(
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
-    numbers = _numbers(_of_shape(actions, (batch, components), "(batch, components)"))
+    numbers = _numbers(actions, (batch, components))
     if on_device(numbers) and device == "cuda" and numbers.shape[0]:
         # Another stream may use their memory again before the kernels have read it.
         return numbers if _in_default_stream() else _array_of(numbers, device)
@@ -111,35 +111,30 @@ def action_array(
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
-    shape = tuple(actions.shape) if on_device(actions) else _array(actions).shape
-    expected = (batch, shape[1] if len(shape) == 3 else "T", components)
-    actions = _of_shape(actions, expected, "(batch, steps, components)")
-    if not actions.shape[1]:
-        raise ArgumentError("actions have no steps: give one at least, shape (batch, steps, components)")
-    return _array_of(_numbers(actions.swapaxes(0, 1)), device)
+    return _array_of(_numbers(actions, (batch, None, components)), device)
 
 
-def _of_shape(
-    actions: "np.ndarray | torch.Tensor", expected: tuple[object, ...], named: str
+def _numbers(
+    actions: "np.ndarray | torch.Tensor", expected: tuple[int | None, ...]
 ) -> "np.ndarray | torch.Tensor":
-    """Actions as a CUDA tensor if they are one, else as an array of float64; refused with another shape."""
-    actions = actions if on_device(actions) else _array(actions)
-    if tuple(actions.shape) != expected:
-        raise ArgumentError(f"actions have shape {tuple(actions.shape)}, not {expected} {named}")
-    return actions
-
-
-def _array(actions: ArrayLike) -> np.ndarray:
+    """Actions one after the other, step by step where ``expected`` leaves the number of steps open (None), in
+    float64; a CUDA tensor is complete when this returns. ArgumentError unless they have the shape and are
+    finite."""
     try:
-        return np.asarray(actions, np.float64)
+        actions = actions.detach() if on_device(actions) else np.asarray(actions, np.float64)
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"actions have to be numbers, of one shape: {error}") from None
-
-
-def _numbers(actions: "np.ndarray | torch.Tensor") -> "np.ndarray | torch.Tensor":
-    """Actions one after the other, float64, all finite; a CUDA tensor is complete when this returns."""
+    shape = tuple(actions.shape)
+    if len(shape) != len(expected) or any(n not in (None, m) for n, m in zip(expected, shape, strict=True)):
+        named = "(batch, components)" if None not in expected else "(batch, steps, components)"
+        wanted = ", ".join("T" if n is None else str(n) for n in expected)
+        raise ArgumentError(f"actions have shape {shape}, not ({wanted}) {named}")
+    if None in expected:
+        if not shape[1]:
+            raise ArgumentError("actions have no steps: give one at least, shape (batch, steps, components)")
+        actions = actions.swapaxes(0, 1)
     if on_device(actions):
-        flat = actions.detach().reshape(-1).double().contiguous()
+        flat = actions.reshape(-1).double().contiguous()
         finite = bool(flat.isfinite().all())
     else:
         flat = np.ascontiguousarray(actions).reshape(-1)
