@@ -6,6 +6,7 @@ All distances are exact, so the normal, their gradient, has length 1, and the br
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import taichi as ti
 
@@ -29,7 +30,7 @@ class Surface:
 
     distance: Callable
     hessian_product: Callable
-    gap_slope: Callable | None = None
+    gap_slope: Any = None
     round: bool = False
 
 

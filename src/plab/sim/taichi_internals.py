@@ -7,15 +7,10 @@ before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runt
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import functools
-import inspect
-import linecache
 import os
 import sys
-import textwrap
-import types
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,67 +56,20 @@ _tell_classes_quickly()
 
 
 def hasten_tracing() -> None:
-    """Let Taichi find a function's source and an AST node's place quickly: patches
-    ``kernel_impl.getsourcelines`` and ``textwrap``, and ``ASTTransformerContext.get_pos_info``.
+    """Look up the place of an AST node only once there is an error to report: patches
+    ``ASTTransformerContext.get_pos_info``.
 
-    Both only serve messages. Taichi looks the source up, among all modules of the process, and lays it out at
-    each inlining, and wraps an excerpt of it for each node: half of what compiling from a warm cache takes.
+    Taichi wraps an excerpt of the source for each node: half of what compiling from a warm cache takes.
     """
-    find = kernel_impl.getsourcelines
+    find = ASTTransformerContext.get_pos_info
     if hasattr(find, "__wrapped__"):
         return
-    kernel_impl.getsourcelines = _quick_sources(find)
-    fill, dedent = functools.cache(textwrap.fill), functools.cache(textwrap.dedent)
-    kernel_impl.textwrap = types.SimpleNamespace(fill=fill, dedent=dedent)
-    ASTTransformerContext.get_pos_info = _position
-
-
-def _quick_sources(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Read the source of functions of files where the code says that it is, and of others as before."""
-
-    @functools.cache
-    def block(file: str, first: int) -> list[str]:
-        lines = linecache.getlines(file)[first - 1 :]
-        last = _last_lines(file).get(first)
-        return inspect.getblock(lines) if last is None else lines[: last - first + 1]
 
     @functools.wraps(find)
-    def quick(function: Any) -> Any:
-        code = function.__code__
-        lines = block(code.co_filename, code.co_firstlineno)
-        return (list(lines), code.co_firstlineno) if lines else find(function)
+    def position(context: Any, node: Any) -> str:
+        return str(find(context, node)) if context.raised else ""
 
-    return quick
-
-
-@functools.cache
-def _last_lines(file: str) -> dict[int, int]:
-    """Return the last line of each function and method of a file by its first one, decorators included.
-
-    Parsing the file is faster than reading each function's tokens, as ``inspect`` does. Functions within
-    functions are left out.
-    """
-    found = {}
-    with contextlib.suppress(SyntaxError):
-        outer = ast.parse("".join(linecache.getlines(file))).body
-        inner = [node for kind in outer if isinstance(kind, ast.ClassDef) for node in kind.body]
-        for node in (*outer, *inner):
-            if isinstance(node, ast.FunctionDef) and node.end_lineno is not None:
-                first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
-                found[first] = node.end_lineno
-    return found
-
-
-def _position(context: Any, node: Any) -> str:
-    """Return place and first line of an AST node, marked, for a message; nothing before there is one."""
-    if not context.raised:
-        return ""
-    line = context.src[node.lineno - 1]
-    begins = context.indent + node.col_offset
-    ends = context.indent + node.end_col_offset if node.end_lineno == node.lineno else len(line.rstrip())
-    number, name = node.lineno + context.lineno_offset, context.func.func.__name__
-    mark = " " * begins + "^" * (ends - begins)
-    return f'File "{context.file}", line {number}, in {name}:\n{line}\n{mark}\n'
+    ASTTransformerContext.get_pos_info = position
 
 
 @contextlib.contextmanager
