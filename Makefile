@@ -80,7 +80,7 @@ build: $(VENV)/.dev.stamp
 	$(BIN)/python -m build
 	PYTHON=$(BIN)/python tools/check_wheel.sh
 
-# What sim/cuda_bitcode.py and sim/cpu_tiles.py call.
+# What sim/cuda_sums.py and sim/cpu_tiles.py call.
 bitcode: $(VENV)/.dev.stamp
 	$(BIN)/python tools/bitcode.py
 

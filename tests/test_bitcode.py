@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from plab.sim.cuda_bitcode import add
+from plab.sim.cuda_sums import add
 from plab.sim.runtime import start_runtime
 from plab.sim.taichi_internals import BITCODE, Bitcode
 

@@ -12,8 +12,7 @@ from typing import Any
 
 import taichi as ti
 
-from plab.sim.cuda_bitcode import gather_sums, look, particle, particle_adjoint
-from plab.sim.cuda_sums import LARGEST_MOMENTUM
+from plab.sim.cuda_sums import LARGEST_MOMENTUM, gather_sums, look, particle, particle_adjoint
 from plab.sim.cuda_warp import (
     ALL_LANES,
     BLOCK_WARPS,
