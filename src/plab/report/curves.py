@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ def rewards(runs: Runs, series: Series) -> list[Drawing]:
         "Small print: methods that lack runs.",
         *settings_note(runs),
     ]
-    per_task = _per_task(runs, series, "episodes", "reward", _EPISODES, "reward")
+    per_task = _mean_curves(runs, series, "episodes", "reward", _EPISODES)
     tasks, absent = _tasks_with_runs(runs)
     figure, axes = grid(len(tasks), len(runs.variants), width=1.6, height=1.25)
     for line, task in zip(axes, tasks, strict=True):
@@ -109,7 +109,7 @@ def score_curves(runs: Runs, series: Series) -> list[Drawing]:
         "Wall time of the rows, compilation in the first one included; of runs in one batch each one's share."
     ]
     return [
-        Drawing(name, _per_task(runs, series, axis, "score", label, "score"), [*more, *notes])
+        Drawing(name, _mean_curves(runs, series, axis, "score", label), [*more, *notes])
         for name, axis, label, more in (
             ("score_against_time", "seconds", "wall time [s]", time),
             ("score_against_substeps", "substeps", "simulated substeps", []),
@@ -119,12 +119,8 @@ def score_curves(runs: Runs, series: Series) -> list[Drawing]:
 
 def budget_curves(runs: Runs, series: Series) -> Drawing:
     """Return the score of the best actions so far against simulated environment steps, per task."""
-    tasks, absent = _tasks_with_runs(runs)
-    figure, panels = _panels(len(tasks))
-    for place, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
-        panel.set_title(task)
-        if place % 5 == 0:
-            panel.set_ylabel("score of best actions")
+
+    def draw(panel: Axes, task: str) -> None:
         for name, strata in sorted(
             strata_of(series, task).items(), key=lambda one: runs.methods.index(one[0])
         ):
@@ -139,19 +135,36 @@ def budget_curves(runs: Runs, series: Series) -> Drawing:
             )
         panel.set_ylim(0.0, 1.05)
         log_axis(panel, "environment steps")
-    _finish(figure, absent)
+
+    figure = _per_task(runs, draw, "score of best actions")
     return Drawing("score_at_budget", figure, [*BUDGET_NOTES, *settings_note(runs)])
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with so many panels, five in a row; a few have room to be larger."""
-    columns = min(count, 5)
-    few = {"width": 4.2 / columns, "height": 2.4} if count < 3 else {}
-    figure, axes = grid(-(-count // columns), columns, **few)
-    panels = list(axes.ravel())
-    for panel in panels[count:]:
+def _mean_curves(runs: Runs, series: Series, axis: str, column: str, label: str) -> Figure:
+    expected = len(runs.variants) * len(runs.seeds)
+
+    def draw(panel: Axes, task: str) -> None:
+        if _panel(panel, runs, _pick(series, task=task), axis, column, expected):
+            log_axis(panel, label)
+
+    return _per_task(runs, draw, column)
+
+
+def _per_task(runs: Runs, draw: Callable[[Axes, str], None], label: str) -> Figure:
+    """Return a figure with a panel per task, five in a row; a few have room to be larger."""
+    tasks, absent = _tasks_with_runs(runs)
+    columns = min(len(tasks), 5)
+    few = {"width": 4.2 / columns, "height": 2.4} if len(tasks) < 3 else {}
+    figure, axes = grid(-(-len(tasks) // columns), columns, **few)
+    for panel in axes.flat[len(tasks) :]:
         panel.set_visible(False)
-    return figure, panels[:count]
+    for place, (panel, task) in enumerate(zip(axes.flat, tasks, strict=False)):
+        panel.set_title(task)
+        draw(panel, task)
+        if place % 5 == 0:
+            panel.set_ylabel(label)
+    _finish(figure, absent)
+    return figure
 
 
 def _tasks_with_runs(runs: Runs) -> tuple[list[str], list[str]]:
@@ -166,20 +179,6 @@ def _finish(figure: Figure, absent: Sequence[str]) -> None:
     if absent:
         text = textwrap.fill(f"no runs: {', '.join(absent)}", int(figure.get_figwidth() * 20))
         figure.supxlabel(text, fontsize=6, color="#666666")
-
-
-def _per_task(runs: Runs, series: Series, axis: str, column: str, label: str, title: str) -> Figure:
-    tasks, absent = _tasks_with_runs(runs)
-    figure, panels = _panels(len(tasks))
-    for place, (panel, task) in enumerate(zip(panels, tasks, strict=True)):
-        expected = len(runs.variants) * len(runs.seeds)
-        panel.set_title(task)
-        if _panel(panel, runs, _pick(series, task=task), axis, column, expected):
-            log_axis(panel, label)
-        if place % 5 == 0:
-            panel.set_ylabel(title)
-    _finish(figure, absent)
-    return figure
 
 
 # ------------------------------------------------------------------------------------------------- RL scores

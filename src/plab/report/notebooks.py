@@ -58,14 +58,16 @@ def execute(
         plab.results.ResultsError: If a notebook breaks off.
     """
     require_packages()
+    import nbformat
+
     out.mkdir(parents=True, exist_ok=True)
     pages = []
     for number, name in enumerate(names, start=1):
         notebook = _executed(name, parameters)
-        (out / f"{name}.ipynb").write_text(_text(notebook), encoding="utf-8", newline="\n")
-        page = out / f"{name}.html"
-        page.write_text(_page(notebook, name, names), encoding="utf-8", newline="\n")
-        pages.append(page)
+        files = {"ipynb": nbformat.writes(notebook), "html": _page(notebook, name, names)}
+        for suffix, text in files.items():
+            (out / f"{name}.{suffix}").write_text(text, encoding="utf-8", newline="\n")
+        pages.append(out / f"{name}.html")
         report(number, name)
     return pages
 
@@ -98,12 +100,6 @@ def _executed(name: str, parameters: Mapping[str, Any]) -> Any:
             # Everything that is to be seen is displayed; what is printed is libraries' talk.
             cell.outputs = [output for output in cell.outputs if output.output_type != "stream"]
     return notebook
-
-
-def _text(notebook: Any) -> str:
-    import nbformat
-
-    return nbformat.writes(notebook)
 
 
 def _page(notebook: Any, name: str, names: Sequence[str]) -> str:

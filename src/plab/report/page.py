@@ -22,7 +22,7 @@ import pandas as pd
 from plab.report.collect import Runs, changed_settings
 from plab.report.media import Shown, best_of_tasks, best_runs, present
 from plab.report.methods import Method, method
-from plab.report.series import AXES, Band, band, rows_on_axes
+from plab.report.series import AXES, Band, Series, band, load_series
 from plab.report.statistics import (
     Interval,
     Summary,
@@ -33,7 +33,6 @@ from plab.report.statistics import (
 )
 from plab.report.tables import Cells, difference, ordered_tasks, settings_note
 from plab.report.templates import asset, render
-from plab.results import read_iterations
 from plab.results.run_file import replace_file
 
 _COLUMNS = {"reward": 0.0, "score": 0.0, "iou": 0.0, "loss": None}
@@ -118,8 +117,9 @@ class Page:
         # Left by a process that was killed.
         for path in [*self._out.glob("*.tmp"), *folder.glob("*.tmp")]:
             path.unlink()
+        series = load_series(runs)
         for one in self.shown:
-            text = json.dumps(_details(one, runs), separators=(",", ":"), allow_nan=False)
+            text = json.dumps(_details(one, runs, series), separators=(",", ":"), allow_nan=False)
             _write(folder / f"{one.name}.js", f"plab.receive({json.dumps(one.name)},{text});\n")
         for path in folder.glob("*-v*.js"):
             if path.stem not in {one.name for one in self.shown}:
@@ -247,20 +247,19 @@ def _aggregates(runs: Runs) -> Mapping[str, Any]:
 # ---------------------------------------------------------------------------------------------- configuration
 
 
-def _details(shown: Shown, runs: Runs) -> dict[str, Any]:
+def _details(shown: Shown, runs: Runs, series: Series) -> dict[str, Any]:
     """Return curves and runs of a configuration, by method."""
     table = runs.table
     own = table[(table["task"] == shown.task) & (table["variant"] == shown.variant)]
     found = {}
     for name in shown.runs:
-        rows = own[own["method"] == name].sort_values("seed").to_dict("records")
-        loaded = [read_iterations(row["path"]) for row in rows]
-        series = [rows_on_axes(config, iterations) for config, iterations in loaded]
+        rows = own[own["method"] == name].sort_values("seed")
+        iterations = [series[index][1] for index in rows.index]
         found[name] = {
             "best": shown.runs[name]["config_hash"],
-            "runs": [_run(row, config) for row, (config, _) in zip(rows, loaded, strict=True)],
+            "runs": [_run(row, runs.configs[index]) for index, row in rows.to_dict("index").items()],
             "curves": {
-                column: {axis: _curve(band(series, axis, column, floor=floor)) for axis in AXES}
+                column: {axis: _curve(band(iterations, axis, column, floor=floor)) for axis in AXES}
                 for column, floor in _COLUMNS.items()
             },
         }

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from plab.config.families import SOLVED, known_family
 from plab.report.collect import Runs
 from plab.report.statistics import Interval, stratified_mean, summarise
 from plab.results import BUDGETS as SIMULATED
-from plab.results import read_curves, read_iterations
+from plab.results import read, read_curves
 
 AXES = ("episodes", "seconds", "substeps")
 """Axes of curves: episodes, wall time [s], simulated substeps."""
@@ -70,12 +69,13 @@ def load_series(runs: Runs) -> list[tuple[dict[str, str], Rows]]:
 
 def load_rows(path: str | Path) -> Rows:
     """Return the iterations of one run as :func:`load_series` does."""
-    return rows_on_axes(*read_iterations(path))
+    run = read(path)
+    return rows_on_axes(run.config, run.columns)
 
 
-def rows_on_axes(config: Mapping[str, Any], iterations: Rows | pd.DataFrame) -> Rows:
+def rows_on_axes(config: Mapping[str, Any], iterations: Rows) -> Rows:
     """Return the iterations of a run that has been read as :func:`load_series` does."""
-    rows = {str(name): np.asarray(iterations[name]) for name in iterations}
+    rows = {name: np.asarray(values) for name, values in iterations.items()}
     sim, known = config["sim"], known_family(config["method"]["family"])
     simulated = np.sum([rows[name] for name in SIMULATED], axis=0)
     if known is not None and known.ranking == "score":

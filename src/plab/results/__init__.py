@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config.identity import config_dict, config_hash
 from plab.config.selection import lookup
-from plab.results.run_file import RunFile, read, read_iterations, write
+from plab.results.run_file import RunFile, read, write
 from plab.results.schema import (
     BUDGETS,
     SCHEMA_VERSION,
@@ -56,7 +56,6 @@ __all__ = [
     "pack",
     "read",
     "read_curves",
-    "read_iterations",
     "row_count",
     "rows",
     "unpack",

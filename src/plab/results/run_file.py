@@ -17,7 +17,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -39,9 +39,6 @@ from plab.results.schema import (
     RunResult,
     stored_config,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _SUMMARY: dict[str, type] = {
     **dict.fromkeys(("config_hash", "status", "message"), str),
@@ -207,25 +204,6 @@ def read(path: str | Path) -> RunResult:
             resume=_tree(file, "resume") if "resume" in file else None,
             path=path,
         )
-
-
-def read_iterations(path: str | Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Read a run's configuration and iterations alone, in less time than :func:`read` takes for all of it.
-
-    Args:
-        path: The file, or the place in an archive, as for :func:`read`.
-
-    Returns:
-        The configuration, and the iterations, a row each.
-
-    Raises:
-        ResultsError: As for :func:`read`.
-    """
-    # Runs need no pandas.
-    import pandas as pd
-
-    with opened(Path(path)) as file:
-        return config_of(file), pd.DataFrame(curves_of(file))
 
 
 def read_progress(path: Path) -> dict[str, float]:
