@@ -23,6 +23,7 @@ from plab.objective import (
     score_scale,
     scores,
     scores_from_iou,
+    soft_iou,
     target_sdf,
     total_loss,
 )
@@ -201,7 +202,8 @@ class Problem:
         self.simulator.set_contact("soft")
         self.simulator.reset()
         self.initial_mass = self.simulator.mass_tensor()
-        judged = {kind: self._score(k, self.initial_mass[k]) for kind, k in first.items()}
+        pairs = {kind: (self.initial_mass[k], self.target_mass[k]) for kind, k in first.items()}
+        judged = {kind: scores(mass, mass, target) for kind, (mass, target) in pairs.items()}
         self.initial_scores = [judged[kind] for kind in kinds]
         start, best = zip(
             *((one.iou_initial, one.iou_target_self) for one in self.initial_scores), strict=True
@@ -276,20 +278,19 @@ class Problem:
 
     def scores(self, mass: np.ndarray) -> list[Scores]:
         """Score states by their mass tensors, shape [batch, n, n, n]."""
-        return [self._score(e, final) for e, final in enumerate(mass)]
+        return [self._score(e, soft_iou(own, self.target_mass[e])) for e, own in enumerate(mass)]
 
-    def _score(self, e: int, mass: np.ndarray) -> Scores:
-        return scores(self.initial_mass[e], mass, self.target_mass[e])
+    def _score(self, e: int, iou: float) -> Scores:
+        first = self.initial_scores[e]
+        return scores_from_iou(first.iou_initial, iou, first.iou_target_self)
 
     def _final_scores(self, result: Rollout, final_mass: np.ndarray | None) -> list[Scores]:
-        """Score the last states, by their mass tensors if there are any; failures have none."""
-        judged = []
-        for e, (first, iou) in enumerate(zip(self.initial_scores, result.step_iou[:, -1], strict=True)):
-            if final_mass is None or e in result.failures:
-                judged.append(scores_from_iou(first.iou_initial, float(iou), first.iou_target_self))
-            else:
-                judged.append(self._score(e, final_mass[e]))
-        return judged
+        """Score the last states, by their mass tensors if there are any; those of failures mean nothing."""
+        ious = [float(iou) for iou in result.step_iou[:, -1]]
+        for e, own in enumerate(() if final_mass is None else final_mass):
+            if e not in result.failures:
+                ious[e] = soft_iou(own, self.target_mass[e])
+        return [self._score(e, iou) for e, iou in enumerate(ious)]
 
 
 def _distance(mass: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from omegaconf.errors import OmegaConfBaseException
 from plab.config import Config, ProtocolConfig, SimConfig, TargetsConfig, TaskConfig, build_scene, load_config
 from plab.config.compose import cuda_devices
 from plab.errors import tell
-from plab.objective import scores_from_iou, soft_iou
 from plab.problem import Problem, build_scenes, make_simulator
 from plab.render.graphics import RenderError
 from plab.results import read
@@ -214,7 +213,8 @@ def _recordings(
     for state in _states(problem.simulator, actions):
         states.append(state)
         if scored:
-            scores.append(_scores(problem))
+            judged = problem.scores(problem.simulator.mass_tensor())
+            scores.append([one.score for one in judged])
     return [
         RecordedRollout(
             task=cfg.task.name,
@@ -232,15 +232,6 @@ def _history(states: Sequence[State], number: int, *, motion: bool) -> dict[str,
     """Return what a recording has of each state, of one environment of the batch."""
     names = ("x", "poses", *(("v", "F") if motion else ()))
     return {name: np.stack([getattr(state, name)[number] for state in states]) for name in names}
-
-
-def _scores(problem: Problem) -> list[float]:
-    """As :meth:`plab.problem.Problem.scores`, but what does not change is not computed again."""
-    mass = problem.simulator.mass_tensor()
-    return [
-        scores_from_iou(first.iou_initial, soft_iou(now, target), first.iou_target_self).score
-        for first, now, target in zip(problem.initial_scores, mass, problem.target_mass, strict=True)
-    ]
 
 
 @functools.cache
