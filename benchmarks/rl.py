@@ -1,4 +1,4 @@
-"""Where the time of reinforcement learning goes, and how it grows with the number of environments.
+"""Time of the parts of reinforcement learning, by the number of environments and agents.
 
     python benchmarks/rl.py task=Move --methods ppo sac --envs 1 16
     python benchmarks/rl.py task=Move sim.device=cuda method.torch_device=cuda --envs 1 16 64 256

@@ -101,7 +101,7 @@ def _note(progress: Progress, task: TaskID, kernel: str) -> None:
 
 
 class _TextColumn(ProgressColumn):
-    """How a run goes, or which kernel is being compiled and for how long."""
+    """Text of a run's progress, or the kernel that is being compiled and for how long."""
 
     def __init__(self) -> None:
         super().__init__(Column(no_wrap=True))
@@ -165,9 +165,9 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
     def report(done: int, text: str) -> None:
         nonlocal first, last
         now = time.monotonic()
-        if first is None:
+        if first is None or done == first[1]:
             # The first step compiles the simulator: it says nothing about the pace.
-            first, left = (now, done), "started"
+            first, left = first or (now, done), "started"
         else:
             begin, before = first
             left = f"{timedelta(seconds=round((now - begin) / (done - before) * (total - done)))} left"

@@ -39,7 +39,7 @@ Kind = TypeVar("Kind")
 
 @dataclass(frozen=True)
 class Appearance:
-    """How a method appears in tables and figures.
+    """Appearance of a method in tables and figures.
 
     Attributes:
         label: Name for readers.

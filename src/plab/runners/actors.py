@@ -1,5 +1,7 @@
-"""What the methods share that train a policy through the simulator's gradient: networks, the scenes to train
-in, and the runner, whose rows judge the deterministic policy in the hard contact model."""
+"""Training of policies through the simulator's gradient: keys, state, scenes, and the runner.
+
+Rows judge the deterministic policy in the hard contact model.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,7 @@ FIRST_SCENE = 1000
 
 @dataclass
 class ActorConfig(PolicyConfig):
-    """What the methods have in common that train a policy by the simulator's gradient, in one scene or many.
+    """Keys of the methods that train a policy by the simulator's gradient, in one scene or many.
 
     Attributes:
         scenes: Scenes that the environments of the training are drawn from; 0: that of the run.
@@ -220,7 +222,7 @@ class ActorRunner(PolicyRunner):
             self._training.restore(state)
 
     def has_more(self, track: Track) -> bool:
-        """Whether there are episodes to train for, or the untrained policy has not been looked at."""
+        """Return whether there are episodes to train for, or the untrained policy has not been evaluated."""
         return track.iteration == 0 or self._training.episodes < self._training.total_episodes
 
     def step(self, track: Track) -> Step:

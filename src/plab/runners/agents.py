@@ -37,7 +37,7 @@ LARGEST = 2**62
 
 @dataclass
 class RlConfig(PolicyConfig):
-    """What the reinforcement-learning methods have in common.
+    """Keys of all reinforcement-learning methods.
 
     Attributes:
         profile: Which of the profiles gives the values that are not overridden; None: there are none.
@@ -54,7 +54,7 @@ class RlConfig(PolicyConfig):
 
 @dataclass
 class OffPolicyConfig(RlConfig):
-    """What the methods that learn from a replay buffer have in common.
+    """Keys of the methods that learn from a replay buffer.
 
     Attributes:
         buffer_size: Transitions kept for replay.
@@ -292,7 +292,7 @@ class Agents:
 
 
 class OffPolicyAgents(Agents):
-    """What the agents that learn from a replay buffer share."""
+    """Agents that learn from a replay buffer."""
 
     method: OffPolicyConfig
 

@@ -1,4 +1,4 @@
-"""Where a run's rows go beside its result file while it lasts: ``logger=tensorboard``, ``logger=wandb``.
+"""Logs of runs beside their result files: ``logger=tensorboard``, ``logger=wandb``.
 
 Each row is logged at the environment steps that its actions have cost, under the names of the results'
 columns, and the final evaluation under ``final/``.
@@ -28,7 +28,7 @@ _LONGEST_ID = 128
 
 
 class RunLog:
-    """What a run logs, if anything. Nothing is opened before the first numbers come."""
+    """Log of a run, opened when the first numbers come, or none."""
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
         """Keep the run's configuration and file."""
@@ -37,7 +37,7 @@ class RunLog:
 
     @property
     def wanted(self) -> bool:
-        """Whether numbers go anywhere."""
+        """Whether the run has a logger."""
         return self._cfg.logger != "none"
 
     def write(self, values: Mapping[str, float], steps: int) -> None:

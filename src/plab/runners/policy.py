@@ -76,7 +76,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class PolicyConfig(MethodConfig):
-    """What the methods have in common whose trained policy is kept.
+    """Keys of the methods whose trained policy is kept.
 
     Attributes:
         algorithm: Learning algorithm, one of the family's.
@@ -173,7 +173,7 @@ class PolicyRunner(Runner):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an episode of a deterministic policy gave: values of
+    """Result of an episode of a deterministic policy: values of
     :func:`plab.runners.runner.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
     not; from then on it rests as :meth:`plab.envs.core.EpisodeBatch.step` has it."""
 

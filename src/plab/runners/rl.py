@@ -125,7 +125,8 @@ class Population:
         while self.episodes < episodes and self.steps < self._total:
             for _ in range(self._cycle // self._envs):
                 self._step()
-                if self.steps % (self._envs * self._horizon) == 0:
+                # The last batch is reported with its evaluation.
+                if self.steps % (self._envs * self._horizon) == 0 and self.episodes < episodes:
                     report()
 
     def evaluate(self) -> list[Evaluation]:
@@ -248,6 +249,7 @@ class RlRunner(PolicyRunner):
     kind = RlConfig
     _population: Population | None = None
     _shown = ""
+    _pace = 0.0
 
     def context(self) -> AbstractContextManager[Any]:
         """Give torch its settings."""
@@ -282,7 +284,7 @@ class RlRunner(PolicyRunner):
                 track.fail(error)
 
     def has_more(self, track: Track) -> bool:
-        """Whether there are steps to train for."""
+        """Return whether there are steps to train for."""
         state = track.run.result.resume
         return state is None or int(state["steps"]) < self._total
 
@@ -308,6 +310,7 @@ class RlRunner(PolicyRunner):
         losses, states = population.take_losses(), population.states()
         lost, (broken, ended) = population.lost(), population.take_broken()
         share = (time.perf_counter() - start) / len(tracks)
+        self._pace = (population.steps - before) / share
         for place, (track, done) in enumerate(zip(tracks, evaluations, strict=True)):
             start = time.perf_counter()
             unusable = self.unusable(track, broken.get(place, ()), ended, done.failure)
@@ -340,11 +343,12 @@ class RlRunner(PolicyRunner):
         return done, self._total // self._sizes.horizon, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Note how the agents that were evaluated do on average; the training reports the pace, too."""
+        """Report how the agents do on average, and the transitions of all per second."""
         reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
         mean = "" if len(rows) == 1 else "mean "
         self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
-        self.report(self._episodes(tracks[0].run.result.resume), self._shown)
+        text = f"{self._pace:.0f} steps/s {self._shown}" if self._pace else self._shown
+        self.report(self._episodes(tracks[0].run.result.resume), text)
 
     def close(self) -> None:
         """Let go of networks and replay buffers."""

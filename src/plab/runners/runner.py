@@ -1,4 +1,4 @@
-"""What all runners have in common: a run from where its file stands to the end, told once, with named hooks.
+"""Base of all runners: runs from where their files stand to the end, with named hooks.
 
 A family of methods is a subclass of :class:`Runner` that says how it begins, what an iteration is and what
 the next one starts from. Taking up files, rows, the best actions so far, wall times, progress, runs that
@@ -51,7 +51,7 @@ LAST = ("iou", "score")
 """Columns that judge the last state; the others are sums over the steps."""
 
 _MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError, RuntimeError)
-"""What NumPy and torch answer to a state that has other arrays than it should."""
+"""Errors of NumPy and torch at a state of other arrays."""
 
 
 class Runner:
@@ -102,7 +102,7 @@ class Runner:
         """Make what a run has of its own, from a :attr:`Step.state` if there is one, else from nothing."""
 
     def has_more(self, track: Track) -> bool:
-        """Whether a run has iterations to do; by default up to ``method.iterations``."""
+        """Return whether a run has iterations left; by default up to ``method.iterations``."""
         return track.iteration < self.iterations(track)
 
     def iterations(self, track: Track) -> int:

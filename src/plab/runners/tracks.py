@@ -22,7 +22,7 @@ from plab.targets import TargetError
 __all__ = ["USER_ERRORS", "Outcome", "RunError", "Step", "TogetherError", "Track", "batch_title", "report"]
 
 USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
-"""What a user has to put right: mistakes in the configuration, files that cannot be read or written."""
+"""Errors for the user to put right: mistakes in the configuration, files that cannot be read or written."""
 
 
 class RunError(PlabError, RuntimeError):
@@ -38,7 +38,7 @@ class TogetherError(RuntimeError):
 
 @dataclass(frozen=True)
 class Step:
-    """What an iteration of a run gave.
+    """Result of an iteration of a run.
 
     Attributes:
         measures: What the actions are measured by: :func:`plab.runners.runner.episode_columns`, and the
@@ -226,7 +226,7 @@ _UNFINISHED = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one run of a sweep ended.
+    """End of one run of a sweep.
 
     Attributes:
         title: Task, variant, method and seed.

@@ -116,7 +116,7 @@ class TrajectoryRunner(Runner):
 
 
 class UpdateRule:
-    """How actions change by a gradient, with the two things that :class:`ActionSequence` needs of a rule.
+    """Change of actions by their gradient, as :class:`ActionSequence` applies it.
 
     In NumPy, not as ``torch.optim``: importing torch takes 1.5 s of CPU time before the first progress line.
 

@@ -1,4 +1,4 @@
-"""What the planners share: trying many candidates in one simulator, starts, resuming, rows.
+"""Base of the planners: keys, candidates tried in one simulator, starts, curves, and the runner.
 
 A planner asks for candidates to be tried, by ``yield``, and is sent what they gave; the runner tries those of
 all runs of a batch together. Candidates, losses, scores and gradients are tensors on the simulator's device.
@@ -51,7 +51,7 @@ CURVES = ("constant", "linear")
 
 @dataclass
 class PlannerConfig(MethodConfig):
-    """What the planners have in common.
+    """Keys of all planners.
 
     Attributes:
         algorithm: How it searches, one of the family's rules.
@@ -79,7 +79,7 @@ class PlannerConfig(MethodConfig):
 
 @dataclass
 class SamplerConfig(PlannerConfig):
-    """What planners have in common that draw candidates and learn from what they cost, without a gradient.
+    """Keys of the planners that draw candidates and learn from their costs, without a gradient.
 
     Attributes:
         knots: Actions are a curve through so many points in time, at most one per environment step.
@@ -110,7 +110,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """What candidates gave.
+    """Results of candidates.
 
     Attributes:
         measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
@@ -125,7 +125,7 @@ class Answer:
     broken: Tensor
 
     def cost(self, objective: str) -> Tensor:
-        """What candidates are ranked by, shape [P]: the lower the better, infinite for what broke off."""
+        """Return the costs that rank candidates, shape [P]: infinite for those that broke off."""
         loss, score = self.measures["loss"], self.measures["score"]
         # Where the score is 0 the loss still tells one from another, between 0 and 1.
         by_score = torch.where(score > 0, -score, loss / (1.0 + loss))
@@ -135,7 +135,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Preview:
-    """What an iteration is told by: actions in [-1, 1], shape [T, A], and what they are measured by."""
+    """Best candidate of an iteration: actions in [-1, 1], shape [T, A], and its measures."""
 
     actions: Tensor
     measures: dict[str, float]
@@ -145,7 +145,7 @@ Asking: TypeAlias = Generator[Request, Answer, Preview]
 
 
 class CandidateStart:
-    """Where a run's candidates start from.
+    """Source of a run's first candidates.
 
     Attributes:
         shape: Steps T and length A of the action vector.
@@ -370,7 +370,7 @@ class PlannerRunner(Runner):
             self._planners[number].restore(state)
 
     def has_more(self, track: Track) -> bool:
-        """Whether a run has iterations to do: none once it is solved."""
+        """Return whether a run has iterations left: none once it is solved."""
         return super().has_more(track) and not track.solved
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
@@ -456,7 +456,7 @@ class PlannerRunner(Runner):
 
 
 def _alike(a: Request, b: Request) -> bool:
-    """Whether two runs' candidates can be tried together."""
+    """Return whether two runs' candidates can be tried together."""
     return a.gradient == b.gradient and a.actions.shape == b.actions.shape
 
 

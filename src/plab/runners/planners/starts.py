@@ -50,7 +50,7 @@ _SUPPORT: dict[str, Callable[[Sequence[float], np.ndarray], float]] = {
     "Torus": lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1],
     "Box": lambda size, d: float(np.abs(d) @ np.asarray(size)),
 }
-"""How far a shape reaches from its position, by its sizes and a direction in its own frame."""
+"""Reach of a shape from its position, by its sizes and a direction in its own frame."""
 
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
