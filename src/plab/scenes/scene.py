@@ -162,7 +162,7 @@ class Manipulator:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that the simulator needs to know about one environment.
+    """Scene of one environment, as the simulator takes it.
 
     Attributes:
         name: Task name, for messages.
@@ -280,7 +280,7 @@ class Scene:
         """Check that the scene can be simulated.
 
         Raises:
-            SceneError: With the reason and a value that would do.
+            SceneError: If it cannot; the message names the field and a value that can.
         """
         _require(self.grid_size >= 8, f"grid_size {self.grid_size} is too small: at least 8 nodes per axis")
         self.material.validate()

@@ -129,11 +129,10 @@ class BodiesTarget(PointsRecipe):
         """See :meth:`PointsRecipe.sample`."""
         if not self.bodies:
             raise TargetError("target.bodies is empty: name at least one body")
+        solids = []
         for name, body in self.bodies.items():
             if len(body.center) != 3:
                 raise TargetError(f"target.bodies.{name}.center must be 3 numbers, not {body.center}")
-        solids = []
-        for name, body in self.bodies.items():
             try:
                 solids.append(body.build(1))
             except (SceneError, ShapeError) as error:
