@@ -9,6 +9,7 @@ import sys
 import warnings
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -22,6 +23,7 @@ from omegaconf import OmegaConf
 from stable_baselines3.common import env_checker
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+import plab
 import plab.envs.core as core
 import plab.sim.runtime as runtime
 from plab.config import Config, ConfigError, choices, conf_folder
@@ -29,7 +31,7 @@ from plab.config.suite import suite_tasks
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
-from plab.objective import OBSERVED_PARTICLES, target_observation, total_loss
+from plab.objective import OBSERVED_PARTICLES, target_observation, target_sdf, total_loss
 from plab.sim import SimulationError
 from suite import make_not_finite
 
@@ -217,6 +219,32 @@ def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVe
         assert data_equivalence(wanted, [one.step(action) for action in actions[2:]], exact=True)
         assert data_equivalence(wanted, [copied.step(action) for action in actions[2:]], exact=True)
         copied.close()
+
+
+@pytest.mark.parametrize("changed", ["state", "target", "material", "scene"])
+def test_a_reset_follows_changes_of_the_simulator(changed: str) -> None:
+    env = plab.make("Move", overrides=[*OVERRIDES, "observe_target=true"]).unwrapped
+    simulator, before = env.batch.problem.simulator, env.reset()
+    if changed == "state":
+        state = simulator.state()
+        state.x[:] += 0.03
+        simulator.set_initial_state(state)
+    elif changed == "target":
+        mass = np.roll(env.batch.problem.target_mass, 2, axis=1)
+        simulator.set_target(mass, np.stack([target_sdf(one) for one in mass]))
+    elif changed == "material":
+        simulator.set_material(yield_stress=3.0)
+    else:
+        simulator.set_scenes([replace(simulator.scenes[0], gravity=(0.0, -1.0, 0.0))])
+    after, fresh = env.reset(), env.batch.problem.simulator.measure()
+    if changed in ("state", "target"):
+        assert not np.array_equal(before[0], after[0]) and before[1]["iou"] != after[1]["iou"]
+    assert after[1]["iou"] == pytest.approx(fresh.iou[0]) and after[1]["score"] == pytest.approx(0, abs=1e-6)
+    wanted = target_observation(env.batch.problem.initial_mass[0], env.batch.problem.target_mass[0])
+    np.testing.assert_allclose(after[0][-len(wanted) :], wanted, rtol=1e-6)
+    _observation, reward, *_ends, info = env.step(np.zeros(6))
+    assert reward == pytest.approx(after[1]["loss"] - info["loss"], rel=1e-9)
+    env.close()
 
 
 def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:

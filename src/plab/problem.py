@@ -200,15 +200,29 @@ class Problem:
         self.simulator.set_weights({name: weights[name] for name in self.term_names})
         # Making a target leaves another contact model behind than finding it in the cache.
         self.simulator.set_contact("soft")
+        self._held_weights = Constants(self.weights)
+        self.refresh(kinds)
+
+    def refresh(self, kinds: Sequence[str] | None = None) -> None:
+        """Reset the simulator, and follow changes of its scenes, targets and initial states.
+
+        Args:
+            kinds: Texts that are equal for equal environments; all may differ if None.
+        """
         self.simulator.reset()
+        self.scenes, self.target_mass = self.simulator.scenes, self.simulator.target_mass
         self.initial_mass = self.simulator.mass_tensor()
-        pairs = {kind: (self.initial_mass[k], self.target_mass[k]) for kind, k in first.items()}
+        kinds = [str(k) for k in range(len(self.scenes))] if kinds is None else kinds
+        pairs = {
+            kind: (mass, target)
+            for kind, mass, target in zip(kinds, self.initial_mass, self.target_mass, strict=True)
+        }
         judged = {kind: scores(mass, mass, target) for kind, (mass, target) in pairs.items()}
         self.initial_scores = [judged[kind] for kind in kinds]
         start, best = zip(
             *((one.iou_initial, one.iou_target_self) for one in self.initial_scores), strict=True
         )
-        self._scale, self._held_weights = Constants(score_scale(start, best)), Constants(self.weights)
+        self._scale = Constants(score_scale(start, best))
 
     def loss_of(self, terms: Any) -> Any:
         """Weigh and add terms, shape [..., term]; an array or a tensor of shape [...]."""

@@ -238,6 +238,7 @@ class EpisodeBatch:
     def _begin(self) -> None:
         """Observe the initial states; no episode has started."""
         self._step: int | None = None
+        self._changes = self._simulator.changes
         self._failures: dict[int, str] = {}
         # Observations, loss terms and IoU of the last step, which environments that break off keep.
         self._initial = self._last = self._seen()
@@ -270,6 +271,12 @@ class EpisodeBatch:
         Raises:
             RuntimeError: If the environment is closed or its simulator's memory is gone.
         """
+        if self._simulator.changes != self._changes:
+            # The caller has changed scenes, targets or initial states.
+            self.problem.refresh()
+            self._observer = Observer(self.problem, self.configs[0])
+            self._sensors.refresh()
+            self._begin()
         self._simulator.reset()
         self._step, self._failures = 0, {}
         self._last = self._seen(like) if on_device(like) else self._initial

@@ -56,6 +56,8 @@ class Simulator:
         action_dim: Action components per environment step.
         grid_size: Grid nodes per axis.
         substeps: Substeps per environment step.
+        target_mass: Mass tensors of the targets, shape [batch, n, n, n], once they are set.
+        changes: Number of changes of scenes, materials, targets and initial states so far.
     """
 
     def __init__(
@@ -125,6 +127,7 @@ class Simulator:
         self._start_from(particles)
         # Changes with all that a rollout's gradient depends on.
         self._version = 0
+        self.changes = 0
         self.set_contact("soft")
         self.set_weights({term.name: term.weight for term in self.terms})
         self.reset()
@@ -190,6 +193,7 @@ class Simulator:
             raise SceneError(f"{len(scenes)} scenes for a simulator of {self.batch} environments")
         require_alike(scenes, self.scenes[0])
         self.scenes = tuple(scenes)
+        self.changes += 1
         self._engine.fill_parameters(scenes)
         self._start_from(particles)
         self.reset()
@@ -218,6 +222,7 @@ class Simulator:
         for scene in scenes:
             scene.validate()
         self.scenes = scenes
+        self.changes += 1
         self._version += 1
         self._engine.fill_material(scenes)
 
@@ -236,6 +241,8 @@ class Simulator:
         for name, value in (("mass", mass), ("sdf", sdf)):
             if np.shape(value) != expected:
                 raise ArgumentError(f"target {name} has shape {np.shape(value)}, not {expected}")
+        self.changes += 1
+        self.target_mass = np.asarray(mass)
         held = {"mass": np.asarray(mass, self._numpy_real), "sdf": np.asarray(sdf, self._numpy_real)}
         for name, field in self._engine.references.items():
             self._engine.write(field, held[name])
@@ -378,6 +385,7 @@ class Simulator:
         """Replace the state from which :meth:`reset` and :meth:`rollout` start; shapes as in
         :class:`State`."""
         self.set_state(state)
+        self.changes += 1
         self._initial_poses = np.array(state.poses, np.float64)
         self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
 
