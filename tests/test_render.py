@@ -339,7 +339,7 @@ def replayed(monkeypatch, recording) -> list:
 
 def test_the_best_actions_of_a_result_are_replayed_as_a_strip(capsys, replayed, told):
     cfg = load_config(["task=Rope", "variant=2", *COARSE])
-    found = results.RunResult(results.config_dict(cfg), results.cfg.hash)
+    found = results.RunResult(results.config_dict(cfg), cfg.hash)
     results.write(found, Path("run.h5"))
     assert "run.h5 has no actions" in told("run.h5")
     found.best_actions = np.full((3, 6), 0.25)

@@ -146,9 +146,9 @@ def simulated(monkeypatch, recording) -> list:
 def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, simulated, page):
     cfg = load_config(["task=Rope", "variant=2", *COARSE])
     numbers = {"status": "finished", "best_actions": ACTIONS}
-    path = results.cfg.path
+    path = cfg.path
     path.parent.mkdir(parents=True)
-    results.write(results.RunResult(results.config_dict(cfg), results.cfg.hash, **numbers), path)
+    results.write(results.RunResult(results.config_dict(cfg), cfg.hash, **numbers), path)
     folder = path.parents[2]
     results.pack(folder, Path("runs.plab.zip.xz"))
     for source, shown in (
@@ -178,7 +178,7 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulat
     (shown,) = re.findall('<iframe [^>]*height: 300px[^>]* srcdoc="([^"]*)"></iframe>', view._repr_html_())
     assert html.unescape(shown) == page and len(repr(view)) < 100
 
-    found = results.RunResult(results.config_dict(cfg), results.cfg.hash, best_actions=ACTIONS)
+    found = results.RunResult(results.config_dict(cfg), cfg.hash, best_actions=ACTIONS)
     results.write(found, Path("seed0.h5"))
     show("seed0.h5")
     show(cfg)
