@@ -31,13 +31,6 @@ def test_cuda_without_a_device(refused):
     assert "sim.device" in refused(["sim.device=cuda"])
 
 
-def test_ways_to_ask_for_a_sweep(seen):
-    for word in ("-m", "++hydra.mode=MULTIRUN"):
-        assert main(["seed=0,1", word, "variant=1,2"]) == 0
-    assert [(cfg.seed, cfg.variant) for cfg in seen] == [(0, "1"), (0, "2"), (1, "1"), (1, "2")] * 2
-    assert list(Path.cwd().rglob("*")) == []
-
-
 # ----------------------------------------------------------------------------------------------- help, --cfg
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,6 @@ import plab.sweep.plan as planning
 import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.results import RunFile, read
 from plab.results.locks import acquire
 from plab.runners.tracks import Outcome, TogetherError
@@ -58,20 +56,9 @@ def test_each_run_is_computed_once_unless_forced(sweep) -> None:
     assert_complete(configs(seeds=(0, 1)))
 
 
-def test_jobs_of_a_glob_and_of_an_experiment(seen) -> None:
+def test_jobs_of_a_glob(seen) -> None:
     assert main(["-m", "task=glob(R*)"]) == 0
     assert len(seen) == len({cfg.task.name for cfg in seen}) == 2
-    seen.clear()
-    assert main(["+experiment=smoke"]) == 0
-    assert len(seen) == len({cfg.hash for cfg in seen}) == 6
-    assert {cfg.method.name for cfg in seen} == {"adam", "gd", "adam_h"}
-
-
-@pytest.mark.nightly
-def test_runs_of_the_paper(seen) -> None:
-    assert main(["+experiment=paper_gradient"]) == 0
-    runs = {(cfg.task.name, cfg.variant, cfg.method.name, cfg.seed) for cfg in seen}
-    assert runs == set(product(suite_tasks(), SUITE_VARIANTS, ("adam", "gd", "adam_h"), range(3)))
 
 
 def test_failed_runs_do_not_stop_the_others(sweep) -> None:

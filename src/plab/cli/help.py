@@ -10,8 +10,6 @@ from pathlib import Path
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
 from plab.config.families import schemas
 
-__all__ = ["full_help_text", "help_text"]
-
 _USAGE = """\
 plab run [KEY=VALUE ...] [-m]
 

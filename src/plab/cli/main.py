@@ -23,8 +23,6 @@ from collections.abc import Sequence
 
 from plab.errors import PlabError, pick, tell
 
-__all__ = ["COMMANDS", "main"]
-
 COMMANDS = {
     "run": "plab.cli.run:main",
     "status": "plab.cli.status:main",

@@ -29,8 +29,6 @@ from plab.report.writing import origin, write_curves, write_tables
 from plab.results import ResultsError
 from plab.results.examples import EXAMPLES, measurements, resolve
 
-__all__ = ["main"]
-
 YIELD_STRESS = "task.yield_stress"
 
 _PAUSE = 5.0

@@ -32,8 +32,6 @@ from plab.results.query import query, scores
 from plab.results.schema import STATUSES, ResultsError
 from plab.results.table import readable_rows
 
-__all__ = ["main"]
-
 SELECTABLE = ("task", "variant", "method", "seed", "status")
 
 

@@ -20,8 +20,6 @@ from plab.render.graphics import RenderError, require_graphics, require_packages
 if TYPE_CHECKING:
     from plab.config import Config
 
-__all__ = ["export", "render", "view"]
-
 WITHOUT_EFFECT = ("method", "seed", "sim.memory_mb", *IDLE)
 """Keys of a configuration that change no picture."""
 

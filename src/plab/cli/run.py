@@ -20,8 +20,6 @@ from plab.config.compose import (
 )
 from plab.config.words import parse, prepared
 
-__all__ = ["main", "parser"]
-
 _OF_SWEEPS = re.compile(r"[+]*hydra[./](launcher|sweep)")
 
 

@@ -15,8 +15,6 @@ from plab.cli.tables import print_table
 from plab.config.selection import select
 from plab.status.survey import NAMES, STATES, Survey, survey
 
-__all__ = ["main"]
-
 
 @command_line
 def main(argv: Sequence[str]) -> None:

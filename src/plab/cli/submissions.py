@@ -33,8 +33,6 @@ from plab.submissions.verifying import TOLERANCE, Verification, write_verificati
 from plab.submissions.verifying import verify as simulate_again
 from plab.targets.store import PHYSICS_VERSION
 
-__all__ = ["leaderboard", "submit", "verify"]
-
 EXIT_NOT_TRUE = 1
 
 _PACKAGE = "plab.submissions"

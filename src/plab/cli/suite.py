@@ -27,8 +27,6 @@ from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
 from plab.targets.scripted import DECIMALS
 
-__all__ = ["ReplayedDemonstration", "demonstrations", "moments", "replay", "targets"]
-
 HEADING = """\
 # Demonstrations
 

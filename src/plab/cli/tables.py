@@ -11,8 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["measure_table", "print_table", "write_csv", "write_markdown"]
-
 _NUMBER = re.compile(r"([-+]?(\d[\d,]*(\.\d+)?(e[-+]\d+)?|inf))?")
 
 

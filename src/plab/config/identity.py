@@ -15,8 +15,6 @@ from typing import Any
 from plab.config.selection import lookup
 from plab.scenes.bodies import MATERIAL_KEYS
 
-__all__ = ["IDLE", "SUFFIX", "config_dict", "config_hash", "member_name"]
-
 SUFFIX = ".h5"
 """End of the names of result files."""
 

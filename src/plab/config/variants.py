@@ -21,16 +21,6 @@ from plab.errors import ConfigError, pick
 from plab.scenes import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
 
-__all__ = [
-    "ATTEMPTS",
-    "FIRST_TARGET_SEED",
-    "RANDOM",
-    "draw_variant",
-    "merge_variant",
-    "undone_key",
-    "variant_changes",
-]
-
 RANDOM = "random"
 """The variant that is drawn, by :func:`draw_variant`, instead of looked up."""
 

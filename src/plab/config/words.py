@@ -23,17 +23,6 @@ from yaml import MarkedYAMLError, YAMLError
 
 from plab.errors import ConfigError, pick
 
-__all__ = [
-    "COMPOSE_ERRORS",
-    "combinations",
-    "explain",
-    "parse",
-    "prepared",
-    "quoted",
-    "require_effect",
-    "swept",
-]
-
 FOLDERS = ("results_dir", "targets.source")
 """Keys whose values are names of folders, with any letters."""
 
@@ -141,24 +130,14 @@ COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionEr
 """What composing a configuration raises where the configuration is wrong."""
 
 
-LAUNCHER_EXTRAS = {
-    "joblib": "joblib",
-    "ray": "ray",
-    "submitit_local": "submitit",
-    "submitit_slurm": "submitit",
-}
-"""Launchers of other packages, to the extra of plab that installs them."""
-
-
 def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:
     """Return one line, without a full stop, on an error of Hydra's, OmegaConf's or YAML's."""
     if isinstance(error, RecursionError):
         return (
             "the configuration refers to itself, or is nested too deeply: look at defaults, ${...}, brackets"
         )
-    launcher = re.search(r"Could not (?:load|find) 'hydra/launcher/(\w+)'", str(error))
-    if launcher and launcher[1] in LAUNCHER_EXTRAS:
-        return f"this launcher is not installed: pip install 'plab[{LAUNCHER_EXTRAS[launcher[1]]}]'"
+    if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|ray|submitit)", str(error)):
+        return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return f"{group} '{name}' does not exist; {pick(name, error.options)}"

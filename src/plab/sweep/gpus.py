@@ -20,8 +20,6 @@ from plab.progress import forward_to, show_several
 from plab.runners.runner import SimulatorCache
 from plab.runners.tracks import Outcome
 
-__all__ = ["choose", "gpu_workers"]
-
 Kind: TypeAlias = tuple[str, str]
 """Task and family of methods: batches of one kind may share a simulator."""
 

@@ -17,8 +17,6 @@ from plab.scenes import Scene
 from plab.sim.batch import scene_kind
 from plab.sim.memory import batch_limit, most_environments
 
-__all__ = ["plan"]
-
 
 def plan(
     cfgs: Sequence[Config], size: int | None = None, processes: int = 1, sharing: int = 1

@@ -32,8 +32,6 @@ from plab.sweep.gpus import gpu_workers
 from plab.sweep.plan import plan
 from plab.targets import TargetError
 
-__all__ = ["compose_jobs", "jobs_of", "look_up", "run_batches", "sweep"]
-
 Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
 """Carries out batches: takes them and a function that says how far the sweep has come, yields outcomes."""
 
