@@ -48,11 +48,11 @@ def commands(pattern: str) -> list[str]:
     return sorted({match[0].partition(" #")[0].rstrip(" &") for match in found if match})
 
 
-# Two words name a program, and do not say how it is used.
+# The bare name of a command does not say how it is used.
 PLAB = [
     command.replace("python -m plab.", "plab ").replace("plab bench.", "plab bench ")
     for command in commands(rf"(?<![\w./])(python -m plab\.|plab )({'|'.join(COMMANDS)})\b.*")
-    if "..." not in command and len(command.replace("python -m ", "").replace(".", " ").split()) > 2
+    if "..." not in command and not re.fullmatch(r".*plab[ .]((results|bench)[ .])?\w+", command)
 ]
 
 
