@@ -105,7 +105,8 @@ def test_an_optimiser_from_outside_is_a_rule_and_its_runs_share_simulators(folde
 
 
 def test_everything_that_a_record_names_is_there() -> None:
-    for record in FAMILIES.values():
+    for name, record in FAMILIES.items():
+        assert FAMILIES.get(name) is FAMILIES[name] is record
         assert isinstance(record, Family) and issubclass(record.runner_type(), Runner)
         assert set(record.may_be_nan) <= set(record.columns)
         assert all(issubclass(record.config_type(rule), MethodConfig) for rule in (None, *record.rules))

@@ -123,6 +123,9 @@ class _Registry(dict[str, Any]):
             self[name] = record = load_object(record, Family)
         return record
 
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
     def values(self) -> Iterator[Family]:  # type: ignore[override]
         return (self[name] for name in self)
 
