@@ -29,8 +29,9 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def _mathml(formula: re.Match[str]) -> str:
-    display = "block" if formula[1] == "div" else "inline"
-    return convert(unescape(formula[2]), display=display)
+    if formula[1] == "span":
+        return convert(unescape(formula[2]))
+    return f'<div class="formula">{convert(unescape(formula[2]), display="block")}</div>'
 
 
 def _link(role: re.Match[str]) -> str:
