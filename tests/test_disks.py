@@ -150,8 +150,9 @@ def test_files_of_a_refused_run_are_removed_unless_an_earlier_process_left_them(
 
 def test_a_repetition_begins_without_the_state_that_it_replaces() -> None:
     """A repetition that is killed must not go on from that state, as its replay buffer is another one."""
-    run = RunFile(configs(seeds=(0,))[0])
-    run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(run.result.config)})
+    cfg = configs(seeds=(0,))[0]
+    run = RunFile(cfg)
+    run.record({"iteration": 0, "loss": 1.0}, {"x": toy_runner.start(cfg)})
     run.close("stopped", "interrupted")
     assert run.partial_path.exists()
     RunFile(configs("force=true", seeds=(0,))[0]).release()
