@@ -28,7 +28,6 @@ from plab.sim.state import (
     require_none,
     rest_state,
 )
-from plab.sim.taichi_internals import free_with
 from plab.sim.tape import ClosedLoop, Recording, Tape
 from plab.sim.tensors import action_array, copy_numbers, numbers_of, on_device, output_for, step_actions
 from plab.sim.term_phases import LossTerm
@@ -114,7 +113,6 @@ class Simulator:
         self._engine = engine(self.scenes, self._runtime, full_gradient, deterministic, _singular_values)
         self._engine.attach(terms)
         self.terms: tuple[LossTerm, ...] = tuple(term for term in self._engine.terms if term.weighted)
-        free_with(self._engine)
         self._engine.fill_parameters(self.scenes)
         register_user(self)
         self._numpy_real = np.float32 if precision == "float32" else np.float64

@@ -26,7 +26,6 @@ from plab.sim.batch import material_parameters
 from plab.sim.linalg import Series
 from plab.sim.runtime import Runtime
 from plab.sim.shapes import SURFACES, require_surfaces
-from plab.sim.taichi_internals import free_with
 from plab.sim.tensors import Array
 
 STATE = 24
@@ -224,7 +223,6 @@ class Storage:
         """Allocate what only gradients need, once."""
         if not self.adjoint_sums:
             self._allocate_adjoint()
-            free_with(self)
 
     def _allocate_adjoint(self) -> None:
         b = self.batch

@@ -148,29 +148,6 @@ def free_own_arrays_only() -> None:
     kind.__init__, kind.__del__ = made, freed
 
 
-def free_with(owner: object) -> None:
-    """Free the memory of all fields declared since the last kernel together with their owner: watches
-    ``FieldsBuilder.finalize`` of Taichi's current builder.
-
-    A field keeps its memory until Taichi starts anew otherwise. Taichi's ``SNodeTree.destroy`` would forget
-    all compiled kernels, those of other simulators, too.
-    """
-    builder, trees = impl._root_fb, []
-    finalize = builder.finalize
-    builder.finalize = lambda **words: trees.append(finalize(**words))
-    impl.get_runtime().materialize()
-    # A builder without fields is not finalized and serves the next owner.
-    del builder.finalize
-    for tree in trees:
-        weakref.finalize(owner, _free_tree, tree)
-
-
-def _free_tree(tree: Any) -> None:
-    runtime = impl.get_runtime()
-    if runtime is not None and tree.prog is runtime.prog:
-        tree.ptr.destroy_snode_tree(tree.prog)
-
-
 def address_of(array: ti.Ndarray) -> int:
     """Return the address of an array's first number, which bitcode takes."""
     return int(impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr))
