@@ -18,7 +18,7 @@ from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.results import BUDGETS, RunResult, checking, read
 from plab.results.checking import faults
-from plab.runners import RunError, run_batch, run_config, runner
+from plab.runners import RunError, run_batch, run_config, tracks
 from plab.runners.planners import planner
 from plab.runners.planners.planner import (
     Answer,
@@ -385,7 +385,7 @@ def test_a_run_ends_when_it_is_solved(finished, others, halved, tmp_path: Path, 
 
     # One run reaches it after fewer rows than the other, which may not.
     enough = next(one for one in sorted(scores[0] + scores[1]) if len(set(map(len, until(one)))) == 2)
-    for module in (runner, checking):
+    for module in (tracks, checking):
         monkeypatch.setattr(module, "SOLVED", enough)
     cfgs = [make_config(tmp_path, "cem"), make_config(tmp_path, "cem", *OTHER)]
     run_batch(cfgs, cache=CACHE)

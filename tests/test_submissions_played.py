@@ -251,8 +251,8 @@ def test_a_policy_is_run_only_if_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # Of five variants and ten unseen ones.
-    monkeypatch.setattr(submit, "SUITE_VARIANTS", ("1", "2"))
-    monkeypatch.setattr(submit, "UNSEEN", UNSEEN[:2])
+    monkeypatch.setattr("plab.cli.submissions.SUITE_VARIANTS", ("1", "2"))
+    monkeypatch.setattr("plab.cli.submissions.UNSEEN", UNSEEN[:2])
     file = tmp_path / "a.pt"
     torchscript(file, Acting(env.observation_space.shape[0]))
     made = submission(tmp_path, "--policy", f"RollingPin={file}", "--steps", "60", "--unseen", *COARSE)
