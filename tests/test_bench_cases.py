@@ -1,4 +1,4 @@
-"""Benchmarks of stability and accuracy: refusals, common scenes, cases that survive, errors, diagrams."""
+"""Benchmarks of stability and accuracy: scenes, cases that survive, errors, diagrams."""
 
 from __future__ import annotations
 
@@ -9,47 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import precision
-import stress
-from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Attempt, Plan, angle, lattice, rows
-from plab.bench.stability import StressPlan, main, run_cases
+from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Attempt, Plan, lattice, rows
+from plab.bench.stability import main
 from plab.report.accuracy import diagrams
 from plab.report.figures import save, style
-from plab.scenes import Body, SceneError
-
-
-def test_what_cannot_be_simulated_is_refused_and_told_what_would_do() -> None:
-    for scene in stress.refusals().values():
-        with pytest.raises(SceneError):
-            scene.validate()
-    said = {row["case"]: row["where"] for row in stress.run_refusals()}
-    assert "substeps >= 112" in said["E times 100 without more substeps"]
-    assert "0.3 " in said["manipulator moves by cells per substep"]
-    assert "substeps >= 64" in said["manipulator moves by cells per substep"]
-    assert "lower_bound" in said["manipulator's bounds are the wrong way round"]
-
-
-@pytest.mark.nightly
-def test_few_particles_survive(tmp_path: Path) -> None:
-    cases = [c for c in stress.stress_cases(StressPlan(8, ("1",), horizon=3)) if c.scene.particle_count == 1]
-    found = list(run_cases(cases, "float32"))
-    assert len(found) == 4
-    assert {row["outcome"] for row in found} == {"survived"}
-    path = tmp_path / "new" / "norms.csv"
-    stress.write_norms(found, path)
-    table = pd.read_csv(path).set_index(["case", "back"])["norm"]
-    assert len(table) == 4 * 3 and np.isfinite(table).all()
-    for row in found:
-        # The last step is none back.
-        assert table[row["case"], 0] == pytest.approx(row["norms"][2], rel=1e-5)
-    assert path.with_suffix(".png").stat().st_size > 1000
-
-
-def test_angle_is_exact_for_small_and_large_ones() -> None:
-    a = np.random.default_rng(0).normal(size=(5, 3))
-    assert angle(a, a) == 0.0
-    assert angle(a, -3.0 * a) == pytest.approx(180.0)
-    assert angle(np.array([1.0, 0.0]), np.array([1.0, 1e-9])) == pytest.approx(np.degrees(1e-9), rel=1e-6)
+from plab.scenes import Body
 
 
 def test_lattices_fill_bodies_evenly_and_every_setting_has_a_scene() -> None:
@@ -95,15 +59,8 @@ def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_every_quick_case_survives_and_float32_is_close_to_float64(tmp_path: Path) -> None:
+def test_every_quick_case_survives() -> None:
     assert main(["--quick", "--precision", "float32"]) == 0
-    out, summary = tmp_path / "rows.csv", tmp_path / "new" / "summary.md"
-    command = ["--task", "Move", "--variant", "1", "--particles", "200", "--csv", str(out)]
-    assert precision.main([*command, "--markdown", str(summary)]) == 0
-    table = pd.read_csv(out, keep_default_na=False)
-    assert list(table["actions"]) == ["demonstration", "random"] and (table["failures"] == "").all()
-    assert table["difference"].abs().max() < 0.01
-    assert "| Move | random |" in summary.read_text(encoding="utf-8")
 
 
 @pytest.mark.nightly

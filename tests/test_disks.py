@@ -39,7 +39,7 @@ def _toy_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("error", "lasting"),
     [
-        pytest.param(DEATH, True, id="killed"),
+        pytest.param(DEATH, True, id="killed", marks=pytest.mark.nightly),
         pytest.param(errno.ENOSPC, True, id="full"),
         pytest.param(errno.EIO, False, id="broken once", marks=pytest.mark.nightly),
     ],
