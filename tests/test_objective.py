@@ -174,7 +174,7 @@ def test_scores_of_tensors_are_those_of_arrays() -> None:
 
 @pytest.mark.parametrize("x", [[1.0 - 1.0 / N, 0.5, 0.5], [0.5, -1.0 / N, 0.5]])
 def test_particles_outside_the_grid_are_refused(x):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="outside the grid"):
         spread_mass([x], N, 1.0)
 
 
