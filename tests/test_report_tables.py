@@ -327,7 +327,7 @@ AGREEMENT = {
 def test_words_stand_for_the_archives_that_come_with_plab(name: str, tmp_path: Path, capsys) -> None:
     assert main(["tables", name, "--out", str(tmp_path)]) == 0
     # The runs with other yield stresses are for a figure of their own.
-    count = len(load(example_archive(name))) - 5 * (name == "release")
+    count = len(load(name)) - 5 * (name == "release")
     tables = 16 if name == "authors" else 17  # no method of the paper: none of agreement
     assert f"{tables} tables of {count} out of" in capsys.readouterr().out
     if name != "authors":

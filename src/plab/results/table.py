@@ -27,6 +27,7 @@ import pandas as pd
 from plab.config.identity import SUFFIX
 from plab.config.selection import lookup
 from plab.files import cache_dir
+from plab.results.examples import resolve
 from plab.results.run_file import (
     actions_of,
     config_of,
@@ -113,7 +114,8 @@ def load(
     in one warning.
 
     Args:
-        source: A folder, searched with its subfolders, an archive, a single result file, or several of them.
+        source: A folder, searched with its subfolders, an archive, a single result file, or several of them;
+            the texts ``example``, ``release``, ``targets`` and ``authors`` are archives that come with plab.
         keys: Configuration keys to add as columns, dotted: ``task.yield_stress``.
         index: Take rows of unchanged files from the folder's index, and keep it up to date.
 
@@ -170,8 +172,10 @@ def readable_rows(source: str | Path | Sequence[str | Path]) -> tuple[list[Row],
 
 
 def sources_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Return the folders, archives and files that are meant."""
-    return [Path(source)] if isinstance(source, str | Path) else list(map(Path, source))
+    """Return folders, archives and files; the text ``example`` and its like are archives that come with
+    plab."""
+    given = [source] if isinstance(source, str | Path) else source
+    return [resolve(one) if isinstance(one, str) else one for one in given]
 
 
 def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
