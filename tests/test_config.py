@@ -148,10 +148,10 @@ def test_scalar_overrides_reach_the_scene():
     assert scene.manipulators[1].friction == 0.9
 
 
-def test_a_tilde_is_the_home(monkeypatch):
-    monkeypatch.setenv("HOME", "/home/me")
+def test_a_tilde_is_the_home(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
     cfg = load_config(["results_dir=~/my results", "targets.source=~/files"])
-    assert (cfg.results_dir, cfg.targets.source) == ("/home/me/my results", "/home/me/files")
+    assert (cfg.results_dir, cfg.targets.source) == (f"{tmp_path}/my results", f"{tmp_path}/files")
 
 
 def test_the_variant_is_a_string_and_seed_scene_is_left_out():

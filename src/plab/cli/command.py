@@ -23,7 +23,7 @@ EXIT_BUG = 70
 """As sysexits.h has it, so that no refusal is taken for a bug, and no bug for a refusal."""
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
-"""What a shell says of a program that a closed pipe has ended."""
+"""Exit code of a program ended by a closed pipe."""
 
 
 def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:

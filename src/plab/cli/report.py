@@ -32,7 +32,7 @@ from plab.results.examples import EXAMPLES, measurements, resolve
 YIELD_STRESS = "task.yield_stress"
 
 _PAUSE = 5.0
-"""How often ``--follow`` looks at the runs [s]."""
+"""Interval at which ``--follow`` reads the runs [s]."""
 
 _QUIET = 2
 """Looks in a row at which no run is under way, until it ends: a sweep's next run may be about to begin."""
@@ -102,7 +102,7 @@ def _make_page(runs: Runs, options: argparse.Namespace, out: Path, command: str)
 
 
 _MAKERS = {"tables": _make_tables, "curves": _make_curves, "notebooks": _make_notebooks, "html": _make_page}
-"""What can be made; each returns what it was in a word or two."""
+"""Functions that make reports, by name; each returns its summary."""
 
 
 def _require_runs(runs: Runs, sources: Sequence[Path]) -> None:

@@ -36,7 +36,7 @@ from plab.targets.store import PHYSICS_VERSION
 EXIT_NOT_TRUE = 1
 
 _PACKAGE = "plab.submissions"
-"""Where the files of the page are."""
+"""Folder of the page's templates."""
 
 
 @command_line

@@ -14,7 +14,7 @@ __all__ = ["MethodConfig"]
 
 @dataclass
 class MethodConfig(ranges.Section):
-    """What all methods have in common; a family of methods adds its own keys in a subclass.
+    """Keys that all methods share; a family of methods adds its own keys in a subclass.
 
     Attributes:
         name: Name of the method in results and reports.

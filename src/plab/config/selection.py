@@ -22,7 +22,7 @@ class SelectionError(PlabError, ValueError):
 
 
 class _Run(Protocol):
-    """What is known of a run of the results: see :class:`plab.results.Row`."""
+    """Facts about a run of the results: see :class:`plab.results.Row`."""
 
     @property
     def values(self) -> dict[str, Any]: ...

@@ -1,4 +1,4 @@
-"""Which tasks and variants the suite has, found without importing Hydra, torch or Taichi."""
+"""Tasks and variants of the suite, found without importing Hydra, torch or Taichi."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ class DrawConfig(RangeConfig):
 
 @dataclass
 class RandomConfig(ranges.Section):
-    """What ``variant=random`` draws.
+    """Ranges that ``variant=random`` draws from.
 
     Attributes:
         variant: Variant that gives what is not drawn; None where the task itself gives it.
@@ -164,7 +164,7 @@ class RandomConfig(ranges.Section):
 
 @dataclass
 class TaskConfig(ranges.Section):
-    """What is in the scene, and what shape the plasticine is to take.
+    """Scene and target shape of a task.
 
     Attributes:
         name: Name of the task in results and reports.

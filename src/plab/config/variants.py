@@ -25,7 +25,7 @@ RANDOM = "random"
 """The variant that is drawn, by :func:`draw_variant`, instead of looked up."""
 
 ATTEMPTS = 100
-"""How often a scene is drawn until one is valid."""
+"""Maximum number of draws until a scene is valid."""
 
 DECIMALS = 4
 """Drawn numbers are rounded to so many decimals, as the suite's own are."""

@@ -127,7 +127,7 @@ def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None
 # ---------------------------------------------------------------------------------------------- explanations
 
 COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionError)
-"""What composing a configuration raises where the configuration is wrong."""
+"""Exceptions raised for a wrong configuration."""
 
 
 def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:

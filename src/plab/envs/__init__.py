@@ -16,7 +16,7 @@ from plab.config.suite import SUITE_VARIANTS, suite_tasks
 __all__ = ["ENTRY_POINT", "make", "make_vec", "register_suite", "register_task"]
 
 ENTRY_POINT = "plab.envs.single:PlabEnv"
-"""What Gymnasium makes an environment of plab's with."""
+"""Entry point of plab's environments in Gymnasium's registry."""
 
 
 def make(task: str, variant: str | int = 1, **kwargs: Any) -> gymnasium.Env[Any, Any]:

@@ -76,7 +76,7 @@ def check_gradient(
 
 
 def _free(scene: Scene) -> np.ndarray:
-    """Which of the manipulators' 8 numbers each can change, 1 or 0, shape [manipulator, 8]."""
+    """Mask of the manipulators' pose numbers that can change, 1 or 0, shape [manipulator, 8]."""
     kinds = [MANIPULATOR_SHAPES[m.shape] for m in scene.manipulators]
     return np.array([[kind.moves] * 3 + [kind.turns] * 4 + [kind.grips] for kind in kinds], float)
 

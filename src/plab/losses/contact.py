@@ -17,7 +17,7 @@ FAR = 1e9
 """Distance of the nearest particle before any was looked at [domain units]."""
 
 SHARPNESS = 1e4
-"""How fast the soft minimum's weights fall with the distance [1 / domain units^2], as in the PlasticineLab
+"""Decay of the soft minimum's weights with the squared distance [1 / domain units^2], as in the PlasticineLab
 release."""
 
 

@@ -1,4 +1,4 @@
-"""What drawing needs from the system: packages, and an OpenGL that works without a screen."""
+"""Requirements of drawing: packages, and an OpenGL that works without a screen."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def aligned(cells: pd.DataFrame) -> list[str]:
 
 
 _NUMBER = re.compile(rf"\[?[+{MINUS}]?\d[\d.,]*(e[-+]?\d+)?(?![\d.,A-Za-z_])")
-"""What begins a cell with a number: a share of runs, an interval, a mean with its spread, one with a unit."""
+"""Pattern of cells with numbers: a share of runs, an interval, a mean with its spread, a unit."""
 
 
 def mean_and_std(summary: Summary, decimals: int = 2) -> str:

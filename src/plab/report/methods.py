@@ -11,7 +11,7 @@ from plab.config.suite import PAPER_METHODS
 
 @dataclass(frozen=True)
 class Method:
-    """How a method appears.
+    """Appearance of a method.
 
     Attributes:
         name: Name in results and configuration.

@@ -23,7 +23,7 @@ SHARED = (
     "digits_convention",
     "floor_stencil",
 )
-"""What scenes of one simulator have in common, beside their manipulators' shapes."""
+"""Properties that scenes of one simulator share, beside their manipulators' shapes."""
 
 YIELD_STRAIN_MAX = 1e30
 """Stands for infinity, which would turn the unused branch into infinity times zero."""

@@ -50,7 +50,7 @@ class SimulationError(PlabError, RuntimeError):
 
 @dataclass(frozen=True)
 class Runtime:
-    """What Taichi was initialised with.
+    """Settings that Taichi was initialised with.
 
     Attributes:
         device: ``cpu`` or ``cuda``.

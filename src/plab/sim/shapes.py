@@ -15,7 +15,7 @@ from plab.scenes import MANIPULATOR_SHAPES, SceneError
 
 @dataclass(frozen=True)
 class Surface:
-    """What contact needs to know of one shape.
+    """Functions of a shape that contact needs.
 
     The functions take a local point [domain units], 3-vector; the shape's lengths in the order of
     ``MANIPULATOR_SHAPES[shape].size_names``, padded to a 3-vector; and the gap.

@@ -36,7 +36,7 @@ class State:
 
 @dataclass(frozen=True)
 class Measures:
-    """What a state is judged by; arrays, or CUDA tensors where the caller asked for them.
+    """Measures of a state; arrays, or CUDA tensors where the caller asked for them.
 
     Attributes:
         terms: Unweighted loss terms, in the order of :attr:`Simulator.terms`, shape [batch, term].
@@ -51,7 +51,7 @@ class Measures:
 
 @dataclass(frozen=True)
 class Rollout:
-    """What a rollout of T environment steps gives; arrays, or CUDA tensors if the actions were one.
+    """Result of a rollout of T environment steps; arrays, or CUDA tensors if the actions were one.
 
     Attributes:
         initial_terms: Unweighted loss terms of the initial state, in the order of :attr:`Simulator.terms`,

@@ -34,7 +34,7 @@ STATE = 24
 AT_V = 3
 AT_C = 6
 AT_F = 15
-"""Where v, C and F begin; x is first."""
+"""Offsets of v, C and F; x is first."""
 
 BLOCK_BITS = 2
 BLOCK = 1 << BLOCK_BITS

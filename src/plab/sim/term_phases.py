@@ -1,4 +1,4 @@
-"""What a state offers to terms of a loss, and how they are summed: mass tensor, particles, distances from the
+"""Terms of a loss, and their sums over the state: mass tensor, particles, distances from the
 manipulators; and the way back from their slopes to the adjoints of particles and poses.
 
 The terms themselves are elsewhere (:mod:`plab.losses`): each is an object with a few functions, which are

@@ -27,7 +27,7 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 """The variable that tells a process which GPUs it has."""
 
 PATIENCE = 30.0
-"""How long processes may take to close their files after Ctrl-C [s]."""
+"""Time for processes to close their files after Ctrl-C [s]."""
 
 
 @contextmanager

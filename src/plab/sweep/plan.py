@@ -1,4 +1,4 @@
-"""Which runs of a sweep run together: those that one simulator can serve, as many as fit the memory."""
+"""Batches of a sweep: runs that one simulator can serve, as many as fit the memory."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 DRAWS = 200
-"""How often a script is drawn anew when its way is too long for an episode."""
+"""Maximum number of draws of a script whose way is too long for an episode."""
 
 CLEARANCE = 0.02
 """Height at which a body is carried over another [domain units]."""
@@ -384,7 +384,7 @@ def _top(body: Body) -> float:
 
 
 def _below(tool: Manipulator) -> float:
-    """How far an upright manipulator reaches below its position [domain units]."""
+    """Distance that an upright manipulator reaches below its position [domain units]."""
     reach = {"Sphere": (1.0,), "Capsule": (0.5, 1.0), "Torus": (0.0, 1.0)}.get(tool.shape)
     if reach is None:
         raise TargetError(f"the recipe needs a Sphere, Capsule or Torus, not a {tool.shape}")
