@@ -74,7 +74,7 @@ RUNS = (("seed=0",), ("seed=1", "task.yield_stress=20"), ("seed=2", "variant=3")
 """A population: different in seed, material and scene."""
 
 STEPS = {"tqc": (sb3._Watch, "_on_step")}
-"""What makes a step of training, where it is not a population."""
+"""Step of training outside populations."""
 
 COLUMNS = episode_columns(["density", "sdf", "contact"])
 
