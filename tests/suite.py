@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DEVICE = os.environ.get("PLAB_TEST_DEVICE", "cpu")
 """Device on which the simulator's tests run."""
 
-KINDS = tuple(MANIPULATOR_SHAPES)
+KINDS = tuple(name for name, shape in MANIPULATOR_SHAPES.items() if shape.motion != "twist")
 CENTER = np.array([0.5, 0.3, 0.5])
 WIDTH = 0.2
 TILT = (math.cos(0.2), 0.6 * math.sin(0.2), 0.0, 0.8 * math.sin(0.2))

@@ -140,7 +140,7 @@ def full(device: str) -> Simulator:
     """With all gradients, all terms, and every kind of motion."""
     scenes = with_tools("Sphere", "RollingPin", "Chopsticks", "Box", "Cylinder")
     motions = {MANIPULATOR_SHAPES[m.shape].motion for m in scenes[0].manipulators}
-    assert motions == {one.motion for one in MANIPULATOR_SHAPES.values()}
+    assert motions == {MANIPULATOR_SHAPES[kind].motion for kind in KINDS}
     terms = make_terms(dict.fromkeys(NAMES, 1.0), NAMES)
     simulator = Simulator(scenes, terms=terms, precision="float64", device=device, full_gradient=True)
     sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))

@@ -23,8 +23,8 @@ from plab.render.rollouts import record
 from plab.render.shadows import hidden_share
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.render.surface import BodySurface, target_field
-from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene, sample_particles
-from suite import SCALES, SIZES
+from plab.scenes import Body, Manipulator, Scene, sample_particles
+from suite import KINDS, SCALES, SIZES
 
 COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 SIZE = (160, 120)
@@ -71,7 +71,7 @@ def random_pose(gap: float) -> np.ndarray:
     return np.array([*rng.random(3), *rotation / np.linalg.norm(rotation), gap])
 
 
-@pytest.mark.parametrize("kind", MANIPULATOR_SHAPES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_meshes_of_manipulators_lie_on_the_zero_level_of_their_distance(kind):
     manipulator = Manipulator(kind, SIZES[kind], (0.5, 0.5, 0.5), scale=SCALES[kind])
     pose = random_pose(gap=0.08)
@@ -241,7 +241,7 @@ def test_plasticine_is_seen_through_manipulators_and_ghosts_through_plasticine()
     assert ghost[0] < plain[0] - 15 and ghost[2] > plain[2] + 15
 
 
-@pytest.mark.parametrize("kind", MANIPULATOR_SHAPES)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_manipulator_is_drawn_at_its_pose(kind):
     tilt = (math.cos(0.3), 0.0, 0.0, math.sin(0.3))
     manipulator = Manipulator(kind, SIZES[kind], (0.7, 0.3, 0.5), rotation=tilt, scale=SCALES[kind], gap=0.1)

@@ -170,9 +170,10 @@ def level_entries(scene: Scene, cfg: Config) -> np.ndarray:
 
 
 def _pose_entries(scene: Scene) -> np.ndarray:
-    """Return the indices of the observed ones of the manipulators' 8 numbers: the gap only of chopsticks."""
+    """Return the indices of the observed ones of the manipulators' 8 numbers: the gap only of those that
+    grip."""
     observed = np.ones((len(scene.manipulators), 8), bool)
-    observed[:, -1] = [m.shape == "Chopsticks" for m in scene.manipulators]
+    observed[:, -1] = [m.kind.grips for m in scene.manipulators]
     return np.flatnonzero(observed)
 
 
@@ -217,7 +218,7 @@ def _pose_bounds(scene: Scene) -> tuple[list[float], list[float]]:
     """Return the lowest and the highest poses of the manipulators, 8 numbers each."""
     low, high = [], []
     for m in scene.manipulators:
-        widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.shape == "Chopsticks" else m.gap
+        widest = m.gap + scene.horizon * abs(m.scale[-1]) if m.kind.grips else m.gap
         low += [*m.lower_bound, *[-1.0] * 4, min(m.gap, m.minimal_gap)]
         # A margin for the rounding of steps.
         high += [*m.upper_bound, *[1.0] * 4, max(widest, m.minimal_gap) * (1 + 1e-6)]

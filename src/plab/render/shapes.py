@@ -47,19 +47,18 @@ class Part:
 def manipulator_parts(manipulator: Manipulator) -> list[Part]:
     """Return the parts of a manipulator."""
     size = manipulator.size
-    if manipulator.shape == "Box":
+    if manipulator.outline == "Box":
         return [_box(np.array(size))]
-    if manipulator.shape == "Chopsticks":
+    if manipulator.outline == "Chopsticks":
         stick = _revolve(_capsule(-size[0], 0.0, size[1]))
         return [Part(*stick, side=-0.5), Part(*stick, side=0.5)]
     profiles: dict[str, Callable[..., np.ndarray]] = {
         "Sphere": lambda radius: _capsule(0.0, 0.0, radius),
         "Capsule": lambda h, r: _capsule(-h / 2, h / 2, r),
-        "RollingPin": lambda h, r: _capsule(-h / 2, h / 2, r),
         "Torus": _circle,
         "Cylinder": lambda radius, half: np.array([[0, -half], [radius, -half], [radius, half], [0, half]]),
     }
-    return [Part(*_revolve(profiles[manipulator.shape](*size)))]
+    return [Part(*_revolve(profiles[manipulator.outline](*size)))]
 
 
 def pose_matrix(pose: np.ndarray, side: float = 0.0) -> np.ndarray:

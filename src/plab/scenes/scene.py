@@ -71,14 +71,16 @@ class ManipulatorShape:
 
     Attributes:
         size_names: Names of the entries of :attr:`Manipulator.size`, in order; all lengths [domain units].
-        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation) or
-            ``static``.
+        motion: Motion rule: ``translate``, ``roll``, ``grip``, ``rigid`` (translation and world rotation),
+            ``twist`` (the same, neither scaled nor clipped nor bounded) or ``static``.
         action_names: Name of each action component, in order. Each is clipped to [-1, 1].
+        outline: Shape whose surface it has; its own name if empty.
     """
 
     size_names: tuple[str, ...]
     motion: str
     action_names: tuple[str, ...]
+    outline: str = ""
 
     @property
     def moves(self) -> bool:
@@ -88,7 +90,12 @@ class ManipulatorShape:
     @property
     def turns(self) -> bool:
         """Whether it can turn: whether its rotation depends on the actions."""
-        return self.motion in ("roll", "grip", "rigid")
+        return self.motion in ("roll", "grip", "rigid", "twist")
+
+    @property
+    def scaled(self) -> bool:
+        """Whether its actions are shares of :attr:`Manipulator.scale`, clipped to [-1, 1]."""
+        return self.motion != "twist"
 
     @property
     def grips(self) -> bool:
@@ -102,7 +109,7 @@ _ROTATION = ("rotation_x", "rotation_y", "rotation_z")
 MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
     "Sphere": ManipulatorShape(("radius",), "translate", _XYZ),
     "Capsule": ManipulatorShape(("h", "r"), "translate", _XYZ),
-    "RollingPin": ManipulatorShape(("h", "r"), "roll", ("roll", "yaw", "vertical")),
+    "RollingPin": ManipulatorShape(("h", "r"), "roll", ("roll", "yaw", "vertical"), "Capsule"),
     "Chopsticks": ManipulatorShape(("h", "r"), "grip", (*_XYZ, *_ROTATION, "close")),
     "Torus": ManipulatorShape(("tx", "ty"), "translate", _XYZ),
     "Cylinder": ManipulatorShape(("radius", "half_height"), "static", ()),
@@ -110,7 +117,16 @@ MANIPULATOR_SHAPES: dict[str, ManipulatorShape] = {
 }
 """The manipulators of the suite: Sphere, Capsule (axis y), RollingPin (a capsule that rolls), Chopsticks
 (two parallel capsules along own -y), Torus (axis y; major radius tx, minor radius ty), Cylinder (axis y),
-Box."""
+Box; and links of articulated models, ``<outline>Link``, which follow a twist per environment step: their
+displacement [domain units] and the rotation vector of their turn about the world's axes [rad]."""
+
+MANIPULATOR_SHAPES |= {
+    f"{name}Link": ManipulatorShape(MANIPULATOR_SHAPES[name].size_names, "twist", (*_XYZ, *_ROTATION), name)
+    for name in ("Capsule", "Box", "Sphere", "Cylinder")
+}
+
+MANIPULATORS_MAX = 31
+"""Maximum number of manipulators in a scene: those near a node are the bits of an integer."""
 
 
 @dataclass(frozen=True)
@@ -143,15 +159,26 @@ class Manipulator:
     minimal_gap: float = 0.06
 
     @property
+    def kind(self) -> ManipulatorShape:
+        """Properties of its shape."""
+        return MANIPULATOR_SHAPES[self.shape]
+
+    @property
+    def outline(self) -> str:
+        """Shape whose surface it has."""
+        return self.kind.outline or self.shape
+
+    @property
     def action_dim(self) -> int:
         """Number of action components, 0 for a static manipulator."""
-        return len(MANIPULATOR_SHAPES[self.shape].action_names)
+        return len(self.kind.action_names)
 
     def largest_step(self) -> float:
-        """Bound on how far any of its points moves in an environment step [domain units]."""
-        motion, scale = MANIPULATOR_SHAPES[self.shape].motion, np.abs(self.scale)
+        """Bound on how far any of its points moves in an environment step [domain units]; 0 for a link, whose
+        motion is bounded by the model that it belongs to."""
+        motion, scale = self.kind.motion, np.abs(self.scale)
         reach = sum(self.size) + self.gap
-        if motion == "static":
+        if motion in ("static", "twist"):
             return 0.0
         if motion == "roll":
             roll, yaw, vertical = scale
@@ -310,6 +337,8 @@ class Scene:
         _require(len(self.bodies) > 0, "a scene needs at least one body")
         for number, body in enumerate(self.bodies):
             self._validate_body(number, body)
+        count = len(self.manipulators)
+        _require(count <= MANIPULATORS_MAX, f"{count} manipulators are more than {MANIPULATORS_MAX}")
         for number, manipulator in enumerate(self.manipulators):
             self._validate_manipulator(number, manipulator)
 
@@ -358,10 +387,10 @@ class Scene:
             and all(0 < size < math.inf for size in manipulator.size),
             f"{label}: a {manipulator.shape} needs positive, finite sizes ({names}), not {manipulator.size}",
         )
+        scales = manipulator.action_dim if shape.scaled else 0
         _require(
-            len(manipulator.scale) == manipulator.action_dim,
-            f"{label}: a {manipulator.shape} needs {manipulator.action_dim} scale(s), "
-            f"not {len(manipulator.scale)}",
+            len(manipulator.scale) == scales,
+            f"{label}: a {manipulator.shape} needs {scales} scale(s), not {len(manipulator.scale)}",
         )
         norm = math.sqrt(sum(c * c for c in manipulator.rotation))
         _require(

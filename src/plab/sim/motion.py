@@ -135,7 +135,9 @@ def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
     if ti.static(motion != "static"):
         move = displacement(motion, pose, u)
         for i in ti.static(range(3)):
-            out[i] = ti.min(ti.max(pose[i] + move[i], low[i]), high[i])
+            out[i] = pose[i] + move[i]
+            if ti.static(motion != "twist"):
+                out[i] = ti.min(ti.max(out[i], low[i]), high[i])
         q = vec4(pose[3], pose[4], pose[5], pose[6])
         if ti.static(motion == "roll"):
             yaw, roll = roll_factors(u)
@@ -143,7 +145,7 @@ def advance_pose(motion: ti.template(), pose, u, low, high, minimal_gap):
         elif ti.static(motion == "grip"):
             q = quat_mul(q, quat_from_rotvec(vec3(u[3], u[4], u[5])))
             out[7] = ti.max(pose[7] - u[6], minimal_gap)
-        elif ti.static(motion == "rigid"):
+        elif ti.static(motion in ("rigid", "twist")):
             q = quat_mul(quat_from_rotvec(vec3(u[3], u[4], u[5])), q)
         for i in ti.static(range(4)):
             out[3 + i] = q[i]
@@ -161,8 +163,9 @@ def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap,
         move_bar = vec3(bar[0], bar[1], bar[2])
         for i in ti.static(range(3)):
             target = pose[i] + move[i]
-            if target < low[i] or target > high[i]:
-                move_bar[i] = 0.0
+            if ti.static(motion != "twist"):
+                if target < low[i] or target > high[i]:
+                    move_bar[i] = 0.0
             pose_bar[i] = move_bar[i]
         q = vec4(pose[3], pose[4], pose[5], pose[6])
         q_bar = vec4(bar[3], bar[4], bar[5], bar[6])
@@ -184,7 +187,7 @@ def advance_pose_adjoint(motion: ti.template(), pose, u, low, high, minimal_gap,
         else:
             for i in ti.static(range(3)):
                 u_bar[i] = move_bar[i]
-        if ti.static(motion in ("grip", "rigid")):
+        if ti.static(motion in ("grip", "rigid", "twist")):
             w = vec3(u[3], u[4], u[5])
             turn = quat_from_rotvec(w)
             w_bar = vec3(0.0)
@@ -241,11 +244,14 @@ class PosePhases(Storage):
 
     @ti.func
     def substep_motion(self, e, start: ti.template(), m, actions: ti.template(), t):
-        """One substep's share of the clipped, scaled action of manipulator m."""
+        """One substep's share of the action of manipulator m, clipped and scaled where its shape asks so."""
         u = vec7(0.0)
         entry = self.action_of(e, start, m, t)
         for i in ti.static(range(self.action_dims[start])):
-            u[i] = ti.min(ti.max(actions[entry + i], -1.0), 1.0) * self.scale[e, m][i] / self.substeps
+            if ti.static(MANIPULATOR_SHAPES[self.shapes[start]].scaled):
+                u[i] = ti.min(ti.max(actions[entry + i], -1.0), 1.0) * self.scale[e, m][i] / self.substeps
+            else:
+                u[i] = actions[entry + i] / self.substeps
         return u
 
     @ti.func
@@ -355,5 +361,7 @@ class PosePhases(Storage):
         """Add the adjoint of :meth:`substep_motion` to that of the action."""
         entry = self.action_of(e, start, m, t)
         for i in ti.static(range(self.action_dims[start])):
-            if ti.abs(actions[entry + i]) <= 1.0:
+            if ti.static(not MANIPULATOR_SHAPES[self.shapes[start]].scaled):
+                actions_bar[entry + i] += u_bar[i] / self.substeps
+            elif ti.abs(actions[entry + i]) <= 1.0:
                 actions_bar[entry + i] += u_bar[i] * self.scale[e, m][i] / self.substeps

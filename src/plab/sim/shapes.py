@@ -239,13 +239,14 @@ def cylinder_hessian_product(p, size, _gap, w):
 SURFACES: dict[str, Surface] = {
     "Sphere": Surface(sphere_distance, sphere_hessian_product, round=True),
     "Capsule": Surface(capsule_distance, capsule_hessian_product),
-    "RollingPin": Surface(capsule_distance, capsule_hessian_product),
     "Chopsticks": Surface(chopsticks_distance, chopsticks_hessian_product, chopsticks_gap_slope),
     "Torus": Surface(torus_distance, torus_hessian_product),
     "Cylinder": Surface(cylinder_distance, cylinder_hessian_product),
     "Box": Surface(box_distance, box_hessian_product),
 }
 """The surface of each of :data:`plab.scenes.MANIPULATOR_SHAPES`."""
+
+SURFACES |= {name: SURFACES[kind.outline] for name, kind in MANIPULATOR_SHAPES.items() if kind.outline}
 
 
 def require_surfaces(shapes: Iterable[str]) -> None:

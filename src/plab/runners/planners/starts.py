@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from plab.scenes import MANIPULATOR_SHAPES, ROLL_RADIUS, Manipulator, Scene, sample_particles
+from plab.scenes import ROLL_RADIUS, Manipulator, Scene, sample_particles
 from plab.targets.scripted import ActionTrack
 
 __all__ = ["ContactStarts", "support"]
@@ -46,11 +46,10 @@ OVERSHOOT = (0.5, 1.5)
 _SUPPORT: dict[str, Callable[[Sequence[float], np.ndarray], float]] = {
     "Sphere": lambda size, d: size[0],
     "Capsule": lambda size, d: 0.5 * size[0] * abs(d[1]) + size[1],
-    "RollingPin": lambda size, d: 0.5 * size[0] * abs(d[1]) + size[1],
     "Torus": lambda size, d: size[0] * np.hypot(d[0], d[2]) + size[1],
     "Box": lambda size, d: float(np.abs(d) @ np.asarray(size)),
 }
-"""Reach of a shape from its position, by its sizes and a direction in its own frame."""
+"""Reach of an outline from its position, by its sizes and a direction in its own frame."""
 
 
 def support(tool: Manipulator, direction: np.ndarray) -> float:
@@ -60,7 +59,7 @@ def support(tool: Manipulator, direction: np.ndarray) -> float:
         tool: The manipulator; chopsticks, which hold between them what they are to carry, reach no farther.
         direction: Unit vector [3].
     """
-    reach = _SUPPORT.get(tool.shape)
+    reach = _SUPPORT.get(tool.outline)
     return 0.0 if reach is None else float(reach(tool.size, _rotation(tool).inv().apply(direction)))
 
 
@@ -129,7 +128,7 @@ class ContactStarts:
         for tool in self._tools:
             own = points[body == self._owner(tool)]
             track = ActionTrack(tool)
-            if not MANIPULATOR_SHAPES[tool.shape].grips:
+            if not tool.kind.grips:
                 offset = own.mean(0) - np.asarray(tool.position)
                 direction = offset / np.linalg.norm(offset)
                 track.go(_action(tool, self._to_touch(tool, own, own.mean(0), direction) + press * direction))
@@ -179,7 +178,7 @@ def _rotation(tool: Manipulator) -> Rotation:
 def _action(tool: Manipulator, way: np.ndarray) -> np.ndarray:
     """Return what takes a manipulator a way [3] [domain units] as far as it can without turning, one entry
     per action component."""
-    if MANIPULATOR_SHAPES[tool.shape].motion == "roll":
+    if tool.kind.motion == "roll":
         axis = _rotation(tool).apply([0.0, 1.0, 0.0])
         return np.array([(axis[0] * way[2] - axis[2] * way[0]) / ROLL_RADIUS, 0.0, way[1]])
     return np.concatenate([way, np.zeros(tool.action_dim - 3)])
