@@ -19,7 +19,6 @@ from plab.scenes import PRECISIONS
 from plab.submissions.board import board
 from plab.submissions.collecting import from_policies, from_sources, submission_files
 from plab.submissions.submission import (
-    CARD_BYTES,
     SUFFIX,
     UNSEEN,
     Submission,
@@ -32,8 +31,6 @@ from plab.submissions.submission import (
 from plab.submissions.verifying import TOLERANCE, Verification, write_verification
 from plab.submissions.verifying import verify as simulate_again
 from plab.targets.store import PHYSICS_VERSION
-
-EXIT_NOT_TRUE = 1
 
 _PACKAGE = "plab.submissions"
 """Folder of the page's templates."""
@@ -70,8 +67,7 @@ def submit(argv: Sequence[str]) -> None:
     if options.unseen and not options.policy:
         parser.error("--unseen is for --policy")
     try:
-        with options.card.open("rb") as file:
-            card = parse_card(file.read(CARD_BYTES + 1), str(options.card))
+        card = parse_card(options.card.read_bytes(), str(options.card))
     except OSError as error:
         raise SubmissionError(f"cannot read {options.card}: {error.strerror or error}") from None
     if options.policy:
@@ -139,31 +135,23 @@ def verify(argv: Sequence[str]) -> int:
         kept = write_verification(found, path)
         good = sum(verdict.outcome == "holds" for verdict in found.verdicts)
         print(f"{path}: {good} of {len(found.verdicts)} claim(s) hold; kept in {kept}")
-        codes.append(0 if good == len(found.verdicts) else EXIT_NOT_TRUE)
+        codes.append(int(good < len(found.verdicts)))
     return max(codes)
 
 
 def _submissions(sources: Sequence[Path]) -> list[Path]:
     found = []
     for source in sources:
-        if source.is_file():
-            # Whatever it is called: reading says what is wrong with it.
-            found.append(source)
-        elif not source.exists():
-            raise SubmissionError(f"{source} does not exist")
-        elif not (inside := submission_files(source)):
+        inside = submission_files(source) if source.is_dir() else [source]
+        if not inside:
             raise SubmissionError(f"{source} has no submissions, files <name>{SUFFIX}")
-        else:
-            found += inside
+        found += inside
     return found
 
 
 def _show(submission: Submission, verification: Verification, precisions: Sequence[str]) -> None:
     name = submission.card.name if submission.card else "a recording"
-    version = f"plab {submission.plab}"
-    if submission.plab != plab.__version__:
-        version += f", simulated by plab {plab.__version__}"
-    print(f"{name}: {submission.track}, {version}")
+    print(f"{name}: {submission.track}, plab {submission.plab}, simulated by plab {plab.__version__}")
     rows = []
     for verdict in verification.verdicts:
         entry, scores = verdict.entry, verdict.scores

@@ -161,6 +161,7 @@ class EpisodeBatch:
         action_space: Space of one sub-environment's action.
         picture_size: Width and height of pictures [pixels], to be set before the first.
         picture_target: Whether pictures show the target, as a ghost; likewise.
+        listener: Called with the actions and the result of each step; None if nothing listens.
     """
 
     def __init__(
@@ -195,6 +196,7 @@ class EpisodeBatch:
         self.contact, self.size, self.horizon = contact, len(cfgs), cfgs[0].sim.horizon
         self.picture_size, self.picture_target = PICTURE_SIZE, False
         self._renderers: list[Renderer] = []
+        self.listener: Callable[[Array, Transition], None] | None = None
         self._take(cfgs, problem)
         state_space, self.action_space = spaces(cfgs[0], self.problem.scenes)
         self._sensors = Sensors(observe, cameras, problem.simulator, state_space)
@@ -321,8 +323,10 @@ class EpisodeBatch:
         self._step = now + 1
         info = self._info(*seen[1:])
         reward = self._initial_loss.like(actions) - info["loss"]
-        failures = dict(self._failures)
-        return Transition(observation, reward, self._step == self.horizon, info, failures)
+        result = Transition(observation, reward, self._step == self.horizon, info, dict(self._failures))
+        if self.listener is not None:
+            self.listener(actions, result)
+        return result
 
     def get_state(self) -> EpisodeState:
         """Return a copy of the state, from which :meth:`set_state` continues: on the CPU with the same bits.

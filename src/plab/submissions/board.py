@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
+import pandas as pd
+
 from plab.config.families import GRADIENT
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.report.methods import method
@@ -24,7 +26,6 @@ from plab.submissions.submission import (
     Card,
     Configuration,
     Digests,
-    Submission,
     SubmissionError,
     read,
 )
@@ -40,22 +41,8 @@ _PAPER_STEPS = {True: 200 * 50, False: 10_000 * 50}
 TableKey: TypeAlias = tuple[str, str]
 """Set of configurations (``suite``, ``unseen`` or ``authors``) and protocol (``plab`` or ``release``)."""
 
-
-@dataclass(frozen=True)
-class Point:
-    """A score in a task and variant.
-
-    Attributes:
-        configuration: Task and variant.
-        steps: Environment steps until it was reached.
-        score: The score in float32.
-        exact: The score in float64, or NaN.
-    """
-
-    configuration: tuple[str, str]
-    steps: int
-    score: float
-    exact: float = math.nan
+Point: TypeAlias = tuple[str, str, int, float, float]
+"""Task, variant, environment steps, score in float32 and in float64 (NaN if that is not known)."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +119,7 @@ _SHOWN_IF_EMPTY = 4
 
 
 def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
-    """Make the leaderboard of a folder of submissions, each with what ``plab.verify`` has kept beside it.
+    """Make the leaderboard of a folder of submissions, each with what ``plab verify`` has kept beside it.
 
     Overrides are settings of every configuration that belongs here, if not plab's own.
 
@@ -150,57 +137,49 @@ def board(folder: Path, overrides: Sequence[str] = ()) -> Board:
                 tables[table].append(line)
         except ResultsError as error:
             left_out.append(str(error))
-    for archive, table in (("example", ("suite", "plab")), ("targets", ("authors", "plab"))):
-        tables[table] += _own_runs(archive, table[0])
+    tables["suite", "plab"] += _own_runs("example", "suite")
+    tables["authors", "plab"] += _own_runs("targets", "authors")
     tables["authors", "release"] += _own_runs("release", "authors")
-    sections = []
-    for number, ((kind, terms), title) in enumerate(_TITLES.items()):
-        if tables[kind, terms] or number < _SHOWN_IF_EMPTY:
-            protocol = f"{_ORIGIN[terms]}; {_TARGETS[kind]}. {_PLAYED}"
-            lines = _best_first(tables[kind, terms])
-            sections.append(BoardTable(title, protocol, len(_expected(kind)), lines))
+    sections = [
+        _table(title, f"{_ORIGIN[terms]}; {_TARGETS[kind]}. {_PLAYED}", kind, tables[kind, terms])
+        for number, ((kind, terms), title) in enumerate(_TITLES.items())
+        if tables[kind, terms] or number < _SHOWN_IF_EMPTY
+    ]
     return Board((*sections, _paper()), tuple(left_out))
 
 
-def _best_first(lines: Iterable[Line]) -> tuple[Line, ...]:
-    return tuple(sorted(lines, key=lambda line: (-line.score, line.card.name)))
+def _table(title: str, protocol: str, kind: str, lines: Iterable[Line]) -> BoardTable:
+    best_first = tuple(sorted(lines, key=lambda line: (-line.score, line.card.name)))
+    return BoardTable(title, protocol, len(suite_tasks()) * _variants(kind), best_first)
 
 
-def _expected(kind: str) -> list[tuple[str, str]]:
-    variants = UNSEEN if kind == "unseen" else SUITE_VARIANTS
-    return [(task, variant) for task in suite_tasks() for variant in variants]
+def _variants(kind: str) -> int:
+    """Return the number of variants of a task in a set of configurations."""
+    return len(UNSEEN if kind == "unseen" else SUITE_VARIANTS)
 
 
-def _line(card: Card, track: str, status: str, kind: str, points: Sequence[Point]) -> Line:
+def _line(card: Card, track: str, status: str, kind: str, points: Iterable[Point]) -> Line:
     """Summarise the points of a method in a table of some kind of configurations."""
-    expected = _expected(kind)
-    best = _best(points, math.inf)
-    within = [_best(points, limit) for limit in BUDGETS]
-    exact = [point.exact for point in best.values()]
-    tasks: dict[str, list[float]] = defaultdict(list)
-    for (task, _), point in best.items():
-        tasks[task].append(point.score)
-    each = len(expected) // len(suite_tasks())
+    table = pd.DataFrame(points, columns=["task", "variant", "steps", "score", "exact"])
+    each = _variants(kind)
+    expected = len(suite_tasks()) * each
+
+    def best(rows: pd.DataFrame) -> pd.DataFrame:
+        return rows.loc[rows.groupby(["task", "variant"])["score"].idxmax()]
+
+    within = [best(table[table["steps"] <= limit]) for limit in BUDGETS]
+    whole = best(table)
+    tasks = (whole.groupby("task")["score"].sum() / each).to_dict()
     return Line(
         card,
         track,
         status,
-        covered=len(best),
-        budgets=tuple(sum(p.score for p in f.values()) / len(expected) if f else None for f in within),
-        score=sum(point.score for point in best.values()) / len(expected),
-        exact=None if any(map(math.isnan, exact)) else sum(exact) / len(expected),
-        tasks=tuple(sum(tasks[name]) / each if name in tasks else None for name in suite_tasks()),
+        covered=len(whole),
+        budgets=tuple(float(rows["score"].sum()) / expected if len(rows) else None for rows in within),
+        score=float(whole["score"].sum()) / expected,
+        exact=None if whole["exact"].isna().any() else float(whole["exact"].sum()) / expected,
+        tasks=tuple(map(tasks.get, suite_tasks())),
     )
-
-
-def _best(points: Sequence[Point], limit: float) -> dict[tuple[str, str], Point]:
-    """Return the best point of each configuration within a budget."""
-    found: dict[tuple[str, str], Point] = {}
-    for point in points:
-        best = found.get(point.configuration)
-        if point.steps <= limit and (best is None or point.score > best.score):
-            found[point.configuration] = point
-    return found
 
 
 # ------------------------------------------------------------------------------------------------- handed in
@@ -211,19 +190,6 @@ def _digests(configuration: Configuration, overrides: tuple[str, ...]) -> Digest
     return Digests.of(configuration.config(overrides))
 
 
-def _foreign_part(submission: Submission, overrides: tuple[str, ...]) -> str | None:
-    """Return the scene or target that differs from the leaderboard's; None if all agree."""
-    for entry in submission.entries:
-        configuration = entry.configuration
-        # The scene does not depend on the target, and the authors' files need not be here.
-        known = _digests(replace(configuration, targets="suite"), overrides)
-        if entry.digests.scene != known.scene:
-            return f"the scene of {configuration.name}"
-        if configuration.targets == "suite" and entry.digests.target != known.target:
-            return f"the target of {configuration.name}"
-    return None
-
-
 def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKey, Line]]:
     """Yield the lines of a submission, with their tables.
 
@@ -232,26 +198,28 @@ def _handed_in(path: Path, overrides: tuple[str, ...]) -> Iterator[tuple[TableKe
     """
     submission = read(path)
     if submission.card is None:
-        raise SubmissionError(f"{path} has no card: python -m plab.submit makes a submission of recordings")
+        raise SubmissionError(f"{path} has no card: plab submit makes a submission of recordings")
     if submission.physics != PHYSICS_VERSION:
-        raise SubmissionError(
-            f"{path} is of physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
-        )
-    if other := _foreign_part(submission, overrides):
-        raise SubmissionError(f"{path}: {other} is another one than on this leaderboard")
-    verification = read_verification(submission)
-    status = "claimed"
+        what = f"physics version {submission.physics}, the leaderboard of {PHYSICS_VERSION}"
+        raise SubmissionError(f"{path} is of {what}")
+    for entry in submission.entries:
+        # The scene does not depend on the target, and the authors' files need not be here.
+        known = _digests(replace(entry.configuration, targets="suite"), overrides)
+        part = entry.digests.difference(known)
+        if part == "scene" or (part and entry.configuration.targets == "suite"):
+            other = f"the {part} of {entry.configuration.name} is another one than on this leaderboard"
+            raise SubmissionError(f"{path}: {other}")
+    verification, status = read_verification(submission), "claimed"
     if verification is not None:
-        wrong = [v for v in verification.verdicts if v.outcome in (LIES, BROKE_OFF)]
-        if wrong:
+        if wrong := [v for v in verification.verdicts if v.outcome in (LIES, BROKE_OFF)]:
             raise SubmissionError(f"{path}: {len(wrong)} claim(s) do not hold; {wrong[0].why}")
         status = "verified" if verification.outcomes == {HOLDS} else "claimed"
     tables: dict[TableKey, list[Point]] = defaultdict(list)
     for number, entry in enumerate(submission.entries):
         scores = {} if verification is None else verification.verdicts[number].scores
         own, score = entry.configuration, scores.get("float32", entry.score)
-        point = Point((own.task, own.variant), entry.steps, score, scores.get("float64", math.nan))
-        tables["unseen" if own.unseen else own.targets, own.terms].append(point)
+        point = own.task, own.variant, entry.steps, score, scores.get("float64", math.nan)
+        tables["unseen" if own.variant in UNSEEN else own.targets, own.terms].append(point)
     for table, points in tables.items():
         yield table, _line(submission.card, submission.track, status, table[0], points)
 
@@ -272,32 +240,33 @@ def _runs(archive: str) -> dict[Card, list[Row]]:
 
 def _own_runs(archive: str, kind: str) -> Iterator[Line]:
     for card, runs in _runs(archive).items():
-        points = [Point(_which(row), steps_to_best(row), row.values["score_best"]) for row in runs]
+        points = [_point(row, steps_to_best(row), "score_best") for row in runs]
         yield _line(card, "plans", "own runs", kind, points)
 
 
-def _which(row: Row) -> tuple[str, str]:
-    return row.values["task"], row.values["variant"]
+def _point(row: Row, steps: int, score: str) -> Point:
+    return row.values["task"], row.values["variant"], steps, row.values[score], math.nan
 
 
 def _paper() -> BoardTable:
     """Return the paper's table, with plab's runs that were judged in the same way."""
-    table = paper_table("iou_per_configuration")
     lines = []
-    for name, rows in table.groupby("method", sort=False):
+    for name, rows in paper_table("iou_per_configuration").groupby("method", sort=False):
         look = method(str(name))
         gradient = look.kind == GRADIENT
-        steps = _PAPER_STEPS[gradient]
-        points = [Point((row.task, row.variant), steps, row.iou_mean) for row in rows.itertuples()]
         card = replace(PAPER, name=look.label, gradient=gradient)
-        lines.append(_line(card, "plans" if gradient else "policies", "printed", "authors", points))
+        points = rows[["task", "variant"]].assign(
+            steps=_PAPER_STEPS[gradient], score=rows["iou_mean"], exact=math.nan
+        )
+        track = "plans" if gradient else "policies"
+        lines.append(_line(card, track, "printed", "authors", points.itertuples(index=False, name=None)))
     for card, runs in _runs("release").items():
-        points = [Point(_which(row), _PAPER_STEPS[True], row.values["score"]) for row in runs]
-        lines.append(_line(card, "plans", "own runs", "authors", points))
+        own = [_point(row, _PAPER_STEPS[True], "score") for row in runs]
+        lines.append(_line(card, "plans", "own runs", "authors", own))
     protocol = (
         f"{_ORIGIN['release']}; the authors' target files. The score is that of the last iteration as it was "
         "simulated, for Adam and GD in the soft contact model, as the authors' code logs it: mean over "
         f"{PAPER_SEED_COUNT} seeds in the paper, of one seed of plab's runs. Nothing handed in is judged "
         "like this, so that these numbers compare with those of no other table."
     )
-    return BoardTable("The paper's table", protocol, len(_expected("authors")), _best_first(lines))
+    return _table("The paper's table", protocol, "authors", lines)

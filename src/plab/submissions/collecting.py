@@ -49,7 +49,7 @@ def from_sources(sources: Sequence[Path], chosen: Selection) -> list[Entry]:
             if unreadable:
                 raise unreadable[0]
             finished = (row for row in rows if row.values["status"] == "finished")
-            groups += [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
+            groups = [(row.path, [_of_run(row)]) for row in finished if chosen(row.values, row.config)]
         for path, entries in groups:
             for configuration in {entry.configuration for entry in entries}:
                 if configuration in found:

@@ -1,7 +1,6 @@
-"""Submissions: configurations, plans or policies for them, claimed scores, a card; their files.
+"""Submissions: plans or policies with claimed scores, a card that describes the method, and their files.
 
-Files are read as those of strangers: nothing in them is executed, no name leads out of the archive, and sizes
-are bounded before anything is unpacked.
+Nothing in a file is executed, and its size is bounded before it is unpacked.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from operator import attrgetter
 from pathlib import Path
@@ -23,7 +22,6 @@ import yaml
 import plab
 from plab.config import Config, build_scene, load_config
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
-from plab.errors import pick
 from plab.files import UnreadableError, member_bytes, one_line, opened_zip
 from plab.results import ResultsError
 from plab.results.archive import zipped
@@ -48,11 +46,8 @@ UNSEEN = tuple(f"random{seed}" for seed in range(9000, 9010))
 
 VARIANTS = (*SUITE_VARIANTS, *UNSEEN)
 
-CARD_BYTES = 64_000
-"""Maximum size of a card."""
-
-_MEMBERS, _MEMBER_BYTES, _TOTAL_BYTES = 4000, 100_000_000, 500_000_000
-"""Maximum number of members of a file, bytes of one, and of all together."""
+_CARD_BYTES, _TOTAL_BYTES = 64_000, 500_000_000
+"""Maximum size of a card, and of all members of a file together."""
 
 _CARD, _MANIFEST = "card.yaml", "manifest.json"
 
@@ -101,17 +96,10 @@ class Configuration:
     terms: str = "plab"
 
     @property
-    def unseen(self) -> bool:
-        """Whether nothing is to be trained on it."""
-        return self.variant in UNSEEN
-
-    @property
     def name(self) -> str:
-        """A short name, such as ``Move-v1`` or ``Move-v1-authors-release``."""
-        parts = [f"{self.task}-v{self.variant}"]
-        parts += [self.targets] if self.targets != "suite" else []
-        parts += [self.terms] if self.terms != "plab" else []
-        return "-".join(parts)
+        """Short name, such as ``Move-v1`` or ``Move-v1-authors-release``."""
+        more = [part for part in (self.targets, self.terms) if part not in (TARGETS[0], TERMS[0])]
+        return "-".join([self.task, f"v{self.variant}", *more])
 
     def config(self, overrides: tuple[str, ...]) -> Config:
         """Compose its configuration, with overrides such as ``sim.device=cuda``; with the authors' targets,
@@ -187,6 +175,10 @@ class Digests:
         facts = json.dumps(scene.facts(), sort_keys=True, default=attrgetter("sha256")).encode()
         return cls(hashlib.sha256(facts).hexdigest(), hashlib.sha256(target).hexdigest())
 
+    def difference(self, other: Digests) -> str | None:
+        """Return ``scene`` or ``target``, whichever differs first; None if both agree."""
+        return next((part for part, own in vars(self).items() if own != getattr(other, part)), None)
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -244,86 +236,55 @@ class Submission:
 
 # ------------------------------------------------------------------------------------------------ fields
 
-Rules = Mapping[str, tuple[Callable[[Any], Any], str]]
-"""For each key a predicate of its value, and what the value must be."""
+Rules = Mapping[str, tuple[Any, str, str]]
+"""Type, pattern and description of the value of each key; the pattern of a list is that of its entries."""
 
-
-def _is_line(length: int, value: Any) -> bool:
-    return isinstance(value, str) and value.isprintable() and 0 < len(value.strip()) <= len(value) <= length
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**15
-
-
-def is_share(value: Any) -> bool:
-    """Return whether a value from a file is a number in [0, 1]."""
-    return isinstance(value, int | float) and 0.0 <= value <= 1.0
-
-
-def _line(length: int, pattern: str = ".*") -> Callable[[Any], Any]:
-    return lambda value: _is_line(length, value) and re.fullmatch(pattern, value)
-
-
-def _one_of(names: tuple[str, ...] | list[str]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, str) and value in names
-
-
-_SHA_256 = _line(64, "[0-9a-f]{64}"), "must be a SHA-256"
+_STEPS = int, r"\d{1,15}", "a whole number of environment steps"
+_SHA_256 = str, "[0-9a-f]{64}", "a SHA-256"
 _CARD_RULES: Rules = {
-    "name": (_line(60), "must be a line of at most 60 characters"),
-    "authors": (
-        lambda value: isinstance(value, list) and 0 < len(value) <= 50 and all(map(_line(60), value)),
-        "must be a list of 1 to 50 names",
-    ),
-    "link": (_line(300, r"https?://[^\s\"'<>]+"), "must begin with https:// or http://"),
-    "budget": (_is_count, "must be a whole number of environment steps"),
-    "hardware": (_line(200), "must be a line of at most 200 characters"),
-    "gradient": (lambda value: isinstance(value, bool), "must be true or false"),
-    "description": (
-        lambda value: value == "" or _is_line(500, value),
-        "must be a line of at most 500 characters",
-    ),
+    "name": (str, r"\S.{0,59}", "a line of at most 60 characters"),
+    "authors": (list, r"\S.{0,59}", "a list of 1 to 50 names"),
+    "link": (str, r"https?://[^\s\"'<>]{1,290}", "an address that begins with https:// or http://"),
+    "budget": _STEPS,
+    "hardware": (str, r"\S.{0,199}", "a line of at most 200 characters"),
+    "gradient": (bool, "True|False", "true or false"),
+    "description": (str, ".{0,500}", "a line of at most 500 characters"),
 }
 _MANIFEST_RULES: Rules = {
-    "format": (_is_count, "must be a number"),
-    "plab": (_line(40, r"[\w.+-]+"), "must be a version of plab"),
-    "physics": (_is_count, "must be a number"),
-    "entries": (lambda value: isinstance(value, list), "must be a list"),
+    "format": (int, r"\d{1,9}", "a number"),
+    "plab": (str, r"[\w.+-]{1,40}", "a version of plab"),
+    "physics": (int, r"\d{1,9}", "a number"),
 }
 _ENTRY_RULES: Rules = {
-    "task": (_one_of(suite_tasks()), "must be a task of the suite"),
-    "variant": (_one_of(VARIANTS), f"must be one of 1 to 5, {UNSEEN[0]} to {UNSEEN[-1]}"),
-    "targets": (_one_of(TARGETS), f"must be {' or '.join(TARGETS)}"),
-    "terms": (_one_of(TERMS), f"must be {' or '.join(TERMS)}"),
+    "task": (str, "|".join(suite_tasks()), "a task of the suite"),
+    "variant": (str, "|".join(VARIANTS), f"one of 1 to 5, {UNSEEN[0]} to {UNSEEN[-1]}"),
+    "targets": (str, "|".join(TARGETS), " or ".join(TARGETS)),
+    "terms": (str, "|".join(TERMS), " or ".join(TERMS)),
     "scene": _SHA_256,
     "target": _SHA_256,
-    "steps": (_is_count, "must be a whole number of environment steps"),
-    "score": (is_share, "must be in [0, 1]"),
+    "steps": _STEPS,
+    "score": (int | float, r"[01]|0\.\d+|1\.0|\d(\.\d+)?e-\d+", "a number in [0, 1]"),
     "file": (
-        _line(100, r"actions/[\w.-]+\.npy|policies/[\w.-]+\.(pt|onnx)"),
-        "must be actions/*.npy, policies/*.pt or *.onnx",
+        str,
+        r"actions/[\w.-]+\.npy|policies/[\w.-]+\.(pt|onnx)",
+        "actions/*.npy or policies/*.pt, *.onnx",
     ),
 }
 
 
-def _faults(record: Any, rules: Rules, optional: str = "") -> Iterator[str]:
-    """Yield a line for each mistake in a record that was read from a file."""
-    if not isinstance(record, dict):
-        yield f"must have the keys {', '.join(rules)}"
-        return
-    for key in record:
-        if key not in rules:
-            yield f"unknown key {repr(key)[:60]}; {pick(str(key)[:60], list(rules))}"
-    for key, (is_right, wanted) in rules.items():
-        if key not in record:
-            if key != optional:
-                yield f"{key} is missing"
-        elif not is_right(record[key]):
-            yield f"{key} {wanted}, not {repr(record[key])[:60]}"
-
-
-# ------------------------------------------------------------------------------------------------- cards
+def _check(record: Any, rules: Rules, where: str) -> None:
+    """Raise UnreadableError for the first mistake in a record that was read from a file."""
+    if not isinstance(record, dict) or record.keys() != rules.keys():
+        odd = list(record.keys() ^ rules.keys()) if isinstance(record, dict) else []
+        which = f": {odd[0]!r:.60} is missing or unknown" if odd else ""
+        raise UnreadableError(f"{where} must have the keys {', '.join(rules)}{which}")
+    for key, (kind, pattern, wanted) in rules.items():
+        value = record[key]
+        parts = value if isinstance(value, list) else [value]
+        texts = [str(part) for part in parts if isinstance(part, str | int | float)]
+        fits = all(text.isprintable() and re.fullmatch(pattern, text) for text in texts)
+        if not (isinstance(value, kind) and fits and 0 < len(texts) == len(parts) <= 50):
+            raise UnreadableError(f"{where}: {key} must be {wanted}, not {value!r:.60}")
 
 
 def parse_card(text: bytes, source: str) -> Card:
@@ -332,23 +293,20 @@ def parse_card(text: bytes, source: str) -> Card:
     Raises:
         SubmissionError: If it is no YAML or has mistakes.
     """
-    if len(text) > CARD_BYTES:
-        raise SubmissionError(f"{source} is larger than the {CARD_BYTES // 1000} kB allowed")
     try:
+        if len(text) > _CARD_BYTES:
+            raise UnreadableError(f"it is larger than the {_CARD_BYTES // 1000} kB allowed")
         decoded = text.decode("utf-8")
         # A few nested aliases can stand for more than memory holds.
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(decoded, yaml.SafeLoader)):
-            raise SubmissionError(f"{source} must not have aliases (*)")
-        read = yaml.safe_load(decoded)
-        faults = list(_faults(read, _CARD_RULES, optional="description"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        place = getattr(error, "problem_mark", None)
-        raise SubmissionError(
-            f"{source} is no YAML" + ("" if place is None else f", line {place.line + 1}")
-        ) from None
-    if faults:
-        raise SubmissionError(f"{source}: {'; '.join(faults)}")
-    return Card(**(read | {"authors": tuple(read["authors"])}))
+            raise UnreadableError("it must not have aliases (*)")
+        record = yaml.safe_load(decoded)
+        if isinstance(record, dict):
+            record = {"description": ""} | record
+        _check(record, _CARD_RULES, "a card")
+    except (UnreadableError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise SubmissionError(f"{source}: {one_line(error)}") from None
+    return Card(**(record | {"authors": tuple(record["authors"])}))
 
 
 # ------------------------------------------------------------------------------------------------- files
@@ -380,11 +338,8 @@ def encode(submission: Submission) -> bytes:
             content = io.BytesIO()
             np.save(content, np.ascontiguousarray(entry.actions, "<f8"), allow_pickle=False)
             members[name] = content.getvalue()
-        listed.append(
-            asdict(entry.configuration)
-            | asdict(entry.digests)
-            | {"steps": entry.steps, "score": entry.score, "file": name}
-        )
+        record = {"steps": entry.steps, "score": entry.score, "file": name}
+        listed.append(asdict(entry.configuration) | asdict(entry.digests) | record)
     about = {"format": FORMAT, "plab": plab.__version__, "physics": PHYSICS_VERSION, "entries": listed}
     members[_MANIFEST] = json.dumps(about, indent=1).encode()
     return zipped((members | dict(submission.policies)).items(), zipfile.ZIP_DEFLATED)
@@ -399,28 +354,23 @@ def read(path: str | Path) -> Submission:
     path = Path(path)
     try:
         members = read_members(path)
-        about = _manifest(members)
-        entries = tuple(_entry(f"entry {n}", one, members) for n, one in enumerate(about["entries"]))
-    except UnreadableError as error:
-        raise SubmissionError(f"{path}: {error}") from None
+        about = json.loads(members.get(_MANIFEST, b"null"))
+        listed = about.pop("entries", None) if isinstance(about, dict) else None
+        if not isinstance(listed, list):
+            raise UnreadableError(f"it is no submission: it has no {_MANIFEST} with entries")
+        _check(about, _MANIFEST_RULES, _MANIFEST)
+        if about["format"] != FORMAT:
+            layout = f"layout {about['format']}, this plab ({plab.__version__}) reads {FORMAT}"
+            raise UnreadableError(f"it has {layout}")
+        entries = tuple(_entry(f"entry {n}", one, members) for n, one in enumerate(listed))
     except FileNotFoundError:
         raise SubmissionError(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:
-        # zipfile's messages of a file that is cut off speak of its insides.
-        raise SubmissionError(f"{path} is cut off, damaged or no zip file ({one_line(error)})") from None
+        raise SubmissionError(f"{path} is damaged or no submission: {one_line(error)}") from None
+    policies = {entry.policy: members[entry.policy] for entry in entries if entry.policy}
     card = parse_card(members[_CARD], f"{path}: {_CARD}") if _CARD in members else None
-    used = {_CARD, _MANIFEST, *(record["file"] for record in about["entries"])}
-    if unused := [name for name in members if name not in used]:
-        raise SubmissionError(f"{path} holds {unused[0]}, which its {_MANIFEST} does not mention")
-    submission = Submission(
-        card,
-        entries,
-        {name: members[name] for name in sorted({e.policy for e in entries if e.policy})},
-        plab=about["plab"],
-        physics=about["physics"],
-        path=path,
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
-    )
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    submission = Submission(card, entries, policies, about["plab"], about["physics"], path, digest)
     if fault := inconsistency(submission):
         raise SubmissionError(f"{path}: {fault}")
     return submission
@@ -430,27 +380,14 @@ def read_members(path: Path) -> dict[str, bytes]:
     """Read all of a zip file into memory; return the content of each member by name.
 
     Raises:
-        UnreadableError: If it holds more than is allowed, or a member that is encrypted, or whose name occurs
-            twice or leads out of a folder; see :func:`plab.files.opened_zip`.
-        ValueError: If it is cut off or damaged.
+        UnreadableError: If it unpacks to more than is allowed; see also :func:`plab.files.opened_zip`.
+        ValueError: If it is cut off, damaged or encrypted.
         OSError: If it cannot be opened.
     """
-    if path.stat().st_size > _TOTAL_BYTES:
-        raise UnreadableError(f"it is larger than the {_TOTAL_BYTES / 1e6:.3g} MB allowed")
     with opened_zip(path) as archive:
         infos = archive.infolist()
-        if len(infos) > _MEMBERS:
-            raise UnreadableError(f"it holds {len(infos)} members, more than the {_MEMBERS} allowed")
-        for info in infos:
-            if not re.fullmatch(r"[\w.+-]+(/[\w.+-]+)*", info.filename):
-                raise UnreadableError(f"the name of its member {info.filename!r} is not allowed")
-            if info.file_size > _MEMBER_BYTES:
-                most = f"more than the {_MEMBER_BYTES / 1e6:.3g} MB allowed"
-                raise UnreadableError(f"unpacked, {info.filename} would take {most}")
         if sum(info.file_size for info in infos) > _TOTAL_BYTES:
-            raise UnreadableError(
-                f"unpacked, it would take more than the {_TOTAL_BYTES / 1e6:.3g} MB allowed"
-            )
+            raise UnreadableError(f"it would unpack to more than the {_TOTAL_BYTES / 1e6:.3g} MB allowed")
         return {info.filename: member_bytes(archive, info.filename) for info in infos}
 
 
@@ -473,56 +410,25 @@ def inconsistency(submission: Submission) -> str | None:
     return None
 
 
-def _manifest(members: Mapping[str, bytes]) -> dict[str, Any]:
-    """Return the manifest, its own keys checked.
-
-    Raises:
-        UnreadableError: If it has mistakes.
-    """
-    if _MANIFEST not in members:
-        raise UnreadableError(f"it is no submission: it has no {_MANIFEST}")
-    try:
-        about = json.loads(members[_MANIFEST])
-    except (ValueError, RecursionError):
-        raise UnreadableError(f"{_MANIFEST} is no JSON") from None
-    if fault := next(_faults(about, _MANIFEST_RULES), None):
-        raise UnreadableError(f"{_MANIFEST}: {fault}")
-    if about["format"] != FORMAT:
-        raise UnreadableError(
-            f"it has layout {about['format']}, this plab ({plab.__version__}) reads {FORMAT}"
-        )
-    return about
-
-
 def _entry(where: str, record: Any, members: Mapping[str, bytes]) -> Entry:
     """Return an entry of the manifest with its actions; raise UnreadableError for mistakes."""
-    if fault := next(_faults(record, _ENTRY_RULES), None):
-        raise UnreadableError(f"{where}: {fault}")
+    _check(record, _ENTRY_RULES, where)
     configuration = Configuration(*(record[key] for key in ("task", "variant", "targets", "terms")))
-    if configuration.unseen and configuration.targets == "authors":
+    if configuration.variant in UNSEEN and configuration.targets == "authors":
         raise UnreadableError(f"{where}: the authors have no targets of {configuration.variant}")
-    file = record["file"]
+    file, claim = record["file"], (record["steps"], float(record["score"]))
     if file not in members:
         raise UnreadableError(f"{where} names a file that is not there: {file}")
-    is_plan = file.startswith("actions/")
-    return Entry(
-        configuration,
-        Digests(record["scene"], record["target"]),
-        record["steps"],
-        float(record["score"]),
-        _plan(file, members[file]) if is_plan else None,
-        "" if is_plan else file,
-    )
-
-
-def _plan(name: str, packed: bytes) -> np.ndarray:
+    digests = Digests(record["scene"], record["target"])
+    if not file.startswith("actions/"):
+        return Entry(configuration, digests, *claim, policy=file)
     try:
-        actions = np.load(io.BytesIO(packed), allow_pickle=False)
+        actions = np.load(io.BytesIO(members[file]), allow_pickle=False)
     # NumPy answers damage with whatever error its parser runs into.
     except Exception as error:
-        raise UnreadableError(f"{name} is no NumPy file, or cut off ({one_line(error)})") from None
+        raise UnreadableError(f"{file} is no NumPy file, or cut off ({one_line(error)})") from None
     if not isinstance(actions, np.ndarray) or actions.dtype != "<f8" or actions.ndim != 2 or not actions.size:
-        raise UnreadableError(f"{name} must hold float64 numbers of shape [steps, components]")
+        raise UnreadableError(f"{file} must hold float64 numbers of shape [steps, components]")
     if not (np.abs(actions) <= 1.0).all():
-        raise UnreadableError(f"{name} holds actions outside of [-1, 1]")
-    return actions
+        raise UnreadableError(f"{file} holds actions outside of [-1, 1]")
+    return Entry(configuration, digests, *claim, actions)

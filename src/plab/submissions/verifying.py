@@ -13,14 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 import plab
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
-from plab.files import one_line
+from plab.files import DAMAGE, one_line
 from plab.results.provenance import now
 from plab.results.run_file import replace_file
 from plab.scenes import PRECISIONS
@@ -31,7 +31,6 @@ from plab.submissions.submission import (
     Entry,
     Submission,
     SubmissionError,
-    is_share,
 )
 from plab.targets.store import PHYSICS_VERSION
 
@@ -39,7 +38,7 @@ TOLERANCE = 0.02
 """Largest difference between a claimed score and the simulated one: on the CPU the same actions give the same
 bits, on CUDA the last digits vary and contact magnifies them."""
 
-HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
+OUTCOMES = HOLDS, LIES, BROKE_OFF, NOT_RUN = "holds", "does not hold", "broke off", "not run"
 
 _BATCH = 25
 """Maximum number of configurations in one simulator."""
@@ -48,8 +47,7 @@ Policy: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """Function of observations, float32, shape [batch, entry], that returns actions, shape [batch, action]."""
 
 
-@dataclass(frozen=True)
-class Played:
+class Played(NamedTuple):
     """Score of an episode's last state, NaN if it broke off, and the failure."""
 
     score: float
@@ -63,7 +61,7 @@ class Verdict:
     Attributes:
         entry: The claim.
         scores: Simulated score by precision; empty if it was not run.
-        outcome: ``holds``, ``does not hold``, ``broke off`` or ``not run``.
+        outcome: One of :data:`OUTCOMES`.
         why: A line, unless it holds.
     """
 
@@ -143,14 +141,12 @@ def _configs(submission: Submission, overrides: tuple[str, ...]) -> dict[Configu
     found = {configuration: configuration.config(overrides) for configuration in sorted(names)}
     digests = {configuration: Digests.of(cfg) for configuration, cfg in found.items()}
     for entry in submission.entries:
-        configuration = entry.configuration
-        for part in ("scene", "target"):
-            if getattr(entry.digests, part) != getattr(digests[configuration], part):
-                raise SubmissionError(
-                    f"{submission.path}: the {part} of {configuration.name} is another one than here: give "
-                    f"the overrides that it was made with, or use its plab ({submission.plab}, this is "
-                    f"{plab.__version__})"
-                )
+        if part := entry.digests.difference(digests[entry.configuration]):
+            raise SubmissionError(
+                f"{submission.path}: the {part} of {entry.configuration.name} is another one than here: give "
+                f"the overrides that it was made with, or use its plab ({submission.plab}, this is "
+                f"{plab.__version__})"
+            )
     return found
 
 
@@ -189,46 +185,38 @@ def play(
     for start in range(0, len(cfgs), _BATCH):
         some = cfgs[start : start + _BATCH]
         batch = EpisodeBatch([replace(cfg, sim=replace(cfg.sim, precision=precision)) for cfg in some])
-        shape = (batch.horizon, *(batch.action_space.shape or ()))
-        if callable(actor):
-            choose = _by_policy(actor, name, shape[1])
-        else:
-            choose = _by_plans(some, actor[start : start + _BATCH], shape)
         observations, _ = batch.reset()
+        (components,) = batch.action_space.shape or (0,)
+        if callable(actor):
+            _check_policy(actor, observations, name, components)
+        else:
+            plans = _stacked(some, actor[start : start + _BATCH], [batch.horizon, components])
         for t in range(batch.horizon):
-            step = batch.step(choose(t, observations), strict=False)
+            actions = actor(observations) if callable(actor) else plans[:, t]
+            step = batch.step(actions, strict=False)
             observations = step.observation
         batch.close()
-        played += [
-            Played(math.nan, step.failures[n]) if n in step.failures else Played(float(score))
-            for n, score in enumerate(step.info["score"])
-        ]
+        for n, score in enumerate(step.info["score"]):
+            failure = step.failures.get(n, "")
+            played.append(Played(math.nan if failure else float(score), failure))
     return played
 
 
-Choice: TypeAlias = Callable[[int, np.ndarray], np.ndarray]
-
-
-def _by_plans(cfgs: Sequence[Config], plans: Sequence[np.ndarray], shape: tuple[int, ...]) -> Choice:
+def _stacked(cfgs: Sequence[Config], plans: Sequence[np.ndarray], shape: list[int]) -> np.ndarray:
     for cfg, plan in zip(cfgs, plans, strict=True):
-        if plan.shape != shape:
-            where, has = f"{cfg.task.name}-v{cfg.variant}", list(plan.shape)
-            raise SubmissionError(f"{where}: the plan has shape {has}, its task takes {list(shape)}")
-    whole = np.stack(plans)
-    return lambda t, _: whole[:, t]
+        if list(plan.shape) != shape:
+            where = f"{cfg.task.name}-v{cfg.variant}"
+            raise SubmissionError(f"{where}: the plan has shape {list(plan.shape)}, its task takes {shape}")
+    return np.stack(plans)
 
 
-def _by_policy(policy: Policy, name: str, components: int) -> Choice:
-    def choose(t: int, observations: np.ndarray) -> np.ndarray:
-        actions = policy(observations)
-        if actions.shape[1] != components:
-            given = f"{name} gives actions of {actions.shape[1]} components"
-            raise SubmissionError(f"{given}, its task takes {components}")
-        if t == 0 and not np.array_equal(actions, policy(observations)):
-            raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
-        return actions
-
-    return choose
+def _check_policy(policy: Policy, observations: np.ndarray, name: str, components: int) -> None:
+    actions = policy(observations)
+    if actions.shape[1] != components:
+        given = f"{name} gives actions of {actions.shape[1]} components"
+        raise SubmissionError(f"{given}, its task takes {components}")
+    if not np.array_equal(actions, policy(observations)):
+        raise SubmissionError(f"{name} is not deterministic: one observation has two answers")
 
 
 def load_policy(name: str, content: bytes) -> Policy:
@@ -239,14 +227,19 @@ def load_policy(name: str, content: bytes) -> Policy:
     Raises:
         SubmissionError: If it cannot be loaded, or ONNX Runtime is missing.
     """
-    policy = (_torchscript if name.endswith(".pt") else _onnx)(name, content)
+    if name.endswith(".onnx") and find_spec("onnxruntime") is None:
+        raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
+    try:
+        policy = (_torchscript if name.endswith(".pt") else _onnx)(content)
+    # PyTorch, ONNX Runtime and the policy's own code raise errors of any class; likewise below.
+    except Exception as error:
+        raise SubmissionError(f"{name} cannot be loaded ({_reason(error)})") from None
 
     def answer(observations: np.ndarray) -> np.ndarray:
         try:
             actions = np.asarray(policy(observations), np.float64)
-        # Whatever its author's code or the runtime raises.
         except Exception as error:
-            raise SubmissionError(f"{name} cannot be run ({_first(error)})") from None
+            raise SubmissionError(f"{name} cannot be run ({_reason(error)})") from None
         if actions.ndim != 2 or len(actions) != len(observations):
             raise SubmissionError(f"{name} gives actions of shape {list(actions.shape)}, not [batch, action]")
         if not np.isfinite(actions).all():
@@ -256,13 +249,10 @@ def load_policy(name: str, content: bytes) -> Policy:
     return answer
 
 
-def _torchscript(name: str, content: bytes) -> Policy:
+def _torchscript(content: bytes) -> Policy:
     import torch
 
-    try:
-        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
-    except (RuntimeError, ValueError, OSError) as error:
-        raise SubmissionError(f"{name} is no TorchScript module ({_first(error)})") from None
+    module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
 
     def policy(observations: np.ndarray) -> np.ndarray:
         with torch.no_grad():
@@ -271,24 +261,17 @@ def _torchscript(name: str, content: bytes) -> Policy:
     return policy
 
 
-def _onnx(name: str, content: bytes) -> Policy:
-    if find_spec("onnxruntime") is None:
-        raise SubmissionError(f"{name} needs ONNX Runtime: pip install 'plab[onnx]'")
+def _onnx(content: bytes) -> Policy:
     import onnxruntime
 
-    try:
-        session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        (given,) = session.get_inputs()
-    # ONNX Runtime has exceptions of its own, each derived from Exception alone.
-    except Exception as error:
-        raise SubmissionError(f"{name} is no ONNX model of one input ({_first(error)})") from None
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    (given,) = session.get_inputs()
     return lambda observations: session.run(None, {given.name: observations})[0]
 
 
-def _first(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """Return the last line of an error's message: PyTorch puts the reason there, below its trace."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1][:200] if lines else type(error).__name__
+    return (str(error).strip() or type(error).__name__).splitlines()[-1].strip()[:200]
 
 
 # ------------------------------------------------------------------------------------------------------ files
@@ -306,6 +289,16 @@ def write_verification(verification: Verification, submission: Path) -> Path:
         plab.results.ResultsError: If it cannot be written.
     """
     path = verification_path(submission)
+    entries = [
+        {
+            "name": verdict.entry.name,
+            "claimed": verdict.entry.score,
+            "scores": {name: None if math.isnan(v) else v for name, v in verdict.scores.items()},
+            "outcome": verdict.outcome,
+            "why": verdict.why,
+        }
+        for verdict in verification.verdicts
+    ]
     record = {
         "submission": verification.digest,
         "plab": plab.__version__,
@@ -313,16 +306,7 @@ def write_verification(verification: Verification, submission: Path) -> Path:
         "overrides": list(verification.overrides),
         "tolerance": TOLERANCE,
         "time": now(),
-        "entries": [
-            {
-                "name": verdict.entry.name,
-                "claimed": verdict.entry.score,
-                "scores": {name: None if math.isnan(v) else v for name, v in verdict.scores.items()},
-                "outcome": verdict.outcome,
-                "why": verdict.why,
-            }
-            for verdict in verification.verdicts
-        ],
+        "entries": entries,
     }
     replace_file(path, (json.dumps(record, indent=1) + "\n").encode(), sync=False)
     return path
@@ -341,25 +325,16 @@ def read_verification(submission: Submission) -> Verification | None:
         record = json.loads(path.read_text(encoding="utf-8"))
         if record["submission"] != submission.digest or record["physics"] != PHYSICS_VERSION:
             return None
-        verdicts = tuple(
-            _kept(entry, own) for entry, own in zip(submission.entries, record["entries"], strict=True)
-        )
-        return Verification(record["submission"], verdicts, tuple(map(str, record["overrides"])))
+        verdicts = []
+        for entry, own in zip(submission.entries, record["entries"], strict=True):
+            scores = {name: math.nan if v is None else float(v) for name, v in own["scores"].items()}
+            wrong = any(v is not None and not 0.0 <= v <= 1.0 for v in own["scores"].values())
+            if wrong or own["outcome"] not in OUTCOMES or not own["why"].isprintable():
+                raise ValueError(f"{entry.name} has an outcome that plab verify does not write")
+            verdicts.append(Verdict(entry, scores, own["outcome"], own["why"]))
+        return Verification(submission.digest, tuple(verdicts), tuple(record["overrides"]))
     except FileNotFoundError:
         return None
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise SubmissionError(
-            f"{path} cannot be read ({one_line(error)}): verify the submission again"
-        ) from None
-
-
-def _kept(entry: Entry, record: Any) -> Verdict:
-    """Return a verdict that was read from a file; raise ValueError if a value is wrong."""
-    scores = {name: value for name, value in record["scores"].items() if name in PRECISIONS}
-    if not all(value is None or is_share(value) for value in scores.values()):
-        raise ValueError("a score is not in [0, 1]")
-    outcome, why = record["outcome"], record["why"]
-    if outcome not in (HOLDS, LIES, BROKE_OFF, NOT_RUN) or not (isinstance(why, str) and why.isprintable()):
-        raise ValueError("an outcome is unknown")
-    numbers = {name: math.nan if value is None else float(value) for name, value in scores.items()}
-    return Verdict(entry, numbers, outcome, why)
+    except DAMAGE as error:
+        why = f"cannot be read ({one_line(error)}): verify the submission again"
+        raise SubmissionError(f"{path} {why}") from None
