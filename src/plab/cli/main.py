@@ -8,6 +8,7 @@ plab render task=Rope                     pictures and films of runs
 plab view task=Rope                       a 3-D page of a run
 plab export task=Rope                     a run as files for other programs
 plab demonstrations                       best known actions of the suite
+plab dataset task=Move                    demonstrations as datasets in Minari's format
 plab targets                              targets of tasks
 plab submit, verify, leaderboard          results to publish, and tables of them
 plab bench speed                          benchmarks of speed, accuracy and stability
@@ -32,6 +33,7 @@ COMMANDS = {
     "view": "plab.cli.rollouts:view",
     "export": "plab.cli.rollouts:export",
     "demonstrations": "plab.cli.suite:demonstrations",
+    "dataset": "plab.cli.dataset:main",
     "targets": "plab.cli.suite:targets",
     "submit": "plab.cli.submissions:submit",
     "verify": "plab.cli.submissions:verify",

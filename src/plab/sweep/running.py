@@ -65,7 +65,7 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
         # A mistake in what all jobs have in common.
         raise ConfigError(ended[0].message)
     with ExitStack() as stack:
-        carry, processes = _carry_here, 1
+        carry, processes = carry_here, 1
         if settings["inner"] is not None:
             carry, processes = _Elsewhere(master, settings["inner"], by_path), _processes(settings["inner"])
         else:
@@ -192,7 +192,7 @@ def run_batches(
         yield from (one for one in away if held(one.path))
 
 
-def _carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
+def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iterator[Outcome]:
     """Carry out batches in this process, one after the other."""
     cache = SimulatorCache()
     for batch in batches:

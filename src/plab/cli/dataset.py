@@ -1,0 +1,279 @@
+"""The command ``plab dataset``: demonstrations as datasets in Minari's format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import yaml
+from gymnasium.spaces import Dict, Space
+
+from plab.cli.command import Parser, command_line, folder, positive, sources_and_words
+from plab.cli.tables import print_table
+from plab.config import Config
+from plab.config.compose import check_sources, require_runnable
+from plab.config.selection import OBSERVED, one_protocol, select
+from plab.config.suite import SUITE_VARIANTS
+from plab.config.words import parse, prepared
+from plab.demonstrations import known_actions
+from plab.demonstrations.minari import DatasetError, Episode, write_dataset
+from plab.envs.core import EpisodeBatch
+from plab.envs.observations import mapped, spaces
+from plab.errors import ArgumentError, tell
+from plab.problem import build_scenes, fits
+from plab.results import read
+from plab.results.table import readable_rows
+from plab.scenes import Camera
+
+REPLAYED = ("sim.device", "sim.memory_mb", *OBSERVED)
+"""Keys that change how the runs of results are replayed; other words choose among them."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """Actions of a configuration, shape [T, A], and their source."""
+
+    cfg: Config
+    actions: np.ndarray
+    source: str
+
+
+@command_line
+def main(argv: Sequence[str]) -> None:
+    """Write demonstrations as datasets in Minari's format, one for each task.
+
+    plab dataset KEY=VALUE ...                  the best known actions of tasks, or their targets' scripts
+    plab dataset KEY=VALUE ... method=NAME      actions that a method finds; its runs go to results_dir
+    plab dataset RESULTS ... [KEY=VALUE ...]    the best actions of runs
+
+    Words are those of plab run -m. RESULTS are folders, files, archives or a name such as example; words then
+    choose among their runs, but for sim.device, sim.memory_mb, observe_particles and observe_target. The
+    actions are played in the hard contact model; minari.load_dataset finds what is written with
+    MINARI_DATASETS_PATH=datasets.
+
+    EXAMPLES
+      plab dataset task=Move
+      plab dataset task=Torus variant=random 'seed_scene=range(1000,1050)' observe_target=true
+      plab dataset task=Move variant=random 'seed_scene=range(1000,1050)' method=adam sim.device=cuda
+      plab dataset example method=solve --observe state,depth
+    """
+    parser = Parser("plab dataset", main.__doc__)
+    add = parser.add_argument
+    add("what", nargs="+", metavar="RESULTS | KEY=VALUE", help="keys are those of plab run -m")
+    add("--output", type=folder, help="folder of datasets: $MINARI_DATASETS_PATH, or datasets, by default")
+    add("--name", help="name of the dataset, plab/<Task>-v0 by default")
+    add("--observe", default="state", metavar="NAME,...", help="state (default), particles, depth, rgb, ...")
+    add(
+        "--cameras",
+        type=folder,
+        metavar="FILE",
+        help="cameras by name: YAML with position, target, size, ...",
+    )
+    add("--min-score", type=float, default=0.0, metavar="S", help="leave out episodes that score less")
+    add(
+        "--together", type=positive, default=25, metavar="N", help="scenes simulated at a time, 25 by default"
+    )
+    add("--config-dir", metavar="FOLDER", help="folder with tasks of your own, as for plab run")
+    options = parser.parse_intermixed_args(argv)
+    output = options.output or Path(os.environ.get("MINARI_DATASETS_PATH") or "datasets")
+    cameras = None if options.cameras is None else _cameras(options.cameras)
+    observe = options.observe.split(",") if "," in options.observe else options.observe
+    found = _demonstrations(*sources_and_words(options.what, default=None), options.config_dir)
+    tasks: dict[str, list[Demonstration]] = {one.cfg.task.name: [] for one in found}
+    for one in found:
+        tasks[one.cfg.task.name].append(one)
+    if options.name and len(tasks) > 1:
+        parser.error(f"--name is of one dataset, but there are {len(tasks)} tasks: {', '.join(tasks)}")
+    rows = []
+    for task, own in tasks.items():
+        name = options.name or f"plab/{task}-v0"
+        recorder = _Recorder(own, observe, cameras, options.together)
+        episodes = (one for one in recorder.play() if one.attributes["score"] >= options.min_score)
+        about = {
+            "algorithm_name": ", ".join(sorted({one.source for one in own})),
+            "code_permalink": "",
+            "author": ["plab"],
+            "author_email": [],
+        }
+        kept = write_dataset(output, name, episodes, recorder.spaces, recorder.env_spec(), about)
+        scores = [one["score"] for one in kept]
+        rows.append([output / name, len(kept), len(own) - len(kept), np.mean(scores), min(scores)])
+    print_table(["dataset", "episodes", "left out", "mean score", "lowest"], rows, digits=3)
+
+
+def _cameras(path: Path) -> dict[str, Camera]:
+    try:
+        given = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return {name: Camera(**own) for name, own in given.items()}
+    except (OSError, yaml.YAMLError, AttributeError, TypeError) as error:
+        raise ArgumentError(f"--cameras {path}: {' '.join(str(error).split())}") from None
+
+
+# --------------------------------------------------------------------------------------------------- actions
+
+
+def _demonstrations(
+    sources: Sequence[Path], words: Sequence[str], config_dir: str | None
+) -> list[Demonstration]:
+    if sources:
+        return _of_results(sources, words)
+    from plab.sweep.running import compose_jobs, jobs_of
+
+    given = {one.key_or_group for one in parse(prepared(words))}
+    every = [] if "variant" in given else [f"variant={','.join(SUITE_VARIANTS)}"]
+    cfgs = []
+    for one in compose_jobs(jobs_of(prepared([*words, *every]), {}, config_dir), config_dir):
+        if not isinstance(one, Config):
+            raise ArgumentError(one.message)
+        if one.seed_scene is None or fits(one):
+            cfgs.append(one)
+    require_runnable(cfgs[0])
+    if "method" in given:
+        return _solved(cfgs)
+    actions = [known_actions(cfg) for cfg in cfgs]
+    for cfg, own in zip(cfgs, actions, strict=True):
+        if own is None:
+            raise ArgumentError(
+                f"no actions are known for {cfg.task.name}, variant {cfg.variant}: add a method that finds "
+                "some, such as method=adam"
+            )
+    pairs = zip(cfgs, actions, strict=True)
+    return [Demonstration(cfg, own, "demonstration") for cfg, own in pairs if own is not None]
+
+
+def _solved(cfgs: Sequence[Config]) -> list[Demonstration]:
+    """Carry out runs, and return their best actions; those that break off are left out."""
+    from plab.sweep.running import carry_here, run_batches
+
+    for one in run_batches(cfgs, carry_here):
+        if not one.finished:
+            tell(f"{one.title}: {one.message}")
+    done = [(cfg, read(cfg.path)) for cfg in cfgs if cfg.path.is_file()]
+    if not done:
+        raise DatasetError("no run has finished")
+    return [
+        Demonstration(cfg, run.best_actions, cfg.method.name)
+        for cfg, run in done
+        if run.best_actions is not None
+    ]
+
+
+def _of_results(sources: Sequence[Path], words: Sequence[str]) -> list[Demonstration]:
+    from plab.render.rollouts import result
+
+    parsed = {one.key_or_group: one for one in parse(prepared(words))}
+    chosen = select(
+        [str(one.input_line) for key, one in parsed.items() if key not in REPLAYED],
+        ("task", "variant", "method", "seed"),
+    )
+    rows = [
+        row
+        for row in readable_rows(sources)[0]
+        if row.values["status"] == "finished" and chosen(row.values, row.config)
+    ]
+    one_protocol(row.config for row in rows)
+    if not rows:
+        raise DatasetError(f"there is no finished run in {', '.join(map(str, sources))}: no run fits")
+    changes = {key: one.value() for key, one in parsed.items() if key in REPLAYED}
+    # Without a gradient the budget of memory has no effect, but all have to have the same.
+    sim = {"memory_mb": rows[0].config["sim"]["memory_mb"]}
+    sim |= {key[4:]: value for key, value in changes.items() if key.startswith("sim.")}
+    own = {key: value for key, value in changes.items() if key in OBSERVED}
+    found = []
+    for row in rows:
+        cfg, actions = result(row.path)
+        seen = {key: row.config[key] for key in OBSERVED} | own
+        cfg = replace(cfg, sim=replace(cfg.sim, **sim), seed_scene=row.config.get("seed_scene"), **seen)
+        cfg.check()
+        check_sources(cfg)
+        found.append(Demonstration(cfg, actions, row.values["method"]))
+    return found
+
+
+# -------------------------------------------------------------------------------------------------- episodes
+
+
+class _Recorder:
+    """Plays demonstrations of one task, some at a time.
+
+    Attributes:
+        spaces: Spaces of observations and of actions; they hold those of all scenes.
+    """
+
+    def __init__(
+        self,
+        demonstrations: Sequence[Demonstration],
+        observe: str | list[str],
+        cameras: Mapping[str, Camera] | None,
+        together: int,
+    ) -> None:
+        """Build the environments."""
+        self._all, self._observe, self._cameras = demonstrations, observe, cameras
+        cfgs = [one.cfg for one in demonstrations]
+        self._batch = EpisodeBatch(cfgs[:together], observe=observe, cameras=cameras)
+        state, actions = spaces(cfgs[0], build_scenes(cfgs))
+        seen: Space[Any] = self._batch.observation_space
+        if observe == "state":
+            seen = state
+        elif isinstance(seen, Dict) and "state" in seen.spaces:
+            seen = Dict({**seen.spaces, "state": state})
+        self.spaces = seen, actions
+
+    def play(self) -> Iterator[Episode]:
+        """Yield the episodes; what breaks off is left out."""
+        size = self._batch.size
+        for first in range(0, len(self._all), size):
+            part = self._all[first : first + size]
+            filled = [part[k % len(part)] for k in range(size)]
+            self._batch.renew([one.cfg for one in filled])
+            yield from self._episodes(part, filled)
+
+    def _episodes(self, part: Sequence[Demonstration], filled: Sequence[Demonstration]) -> Iterator[Episode]:
+        batch = self._batch
+        observation, info = batch.reset()
+        seen, infos, rewards, failures = [observation], [info], [], dict[int, str]()
+        actions = np.stack([one.actions for one in filled]).clip(-1.0, 1.0).astype(np.float32)
+        if actions.shape[1] != batch.horizon:
+            raise DatasetError(f"actions of {actions.shape[1]} steps for sim.horizon={batch.horizon}")
+        for t in range(batch.horizon):
+            step = batch.step(actions[:, t], strict=False)
+            seen.append(step.observation)
+            infos.append(step.info)
+            rewards.append(step.reward)
+            failures = dict(step.failures)
+        for e, one in enumerate(part):
+            if e in failures:
+                tell(f"{one.cfg.task.name}-v{one.cfg.variant}: left out: {failures[e]}")
+                continue
+            named = {"task": one.cfg.task.name, "variant": one.cfg.variant, "source": one.source}
+            measured = {key: np.array([info[key][e] for info in infos]) for key in ("loss", "iou", "score")}
+            yield Episode(
+                observations=mapped(lambda *rows, e=e: np.stack([row[e] for row in rows]), *seen),
+                actions=actions[e],
+                rewards=np.array([reward[e] for reward in rewards]),
+                infos=measured,
+                attributes=named | {"score": float(measured["score"][-1])},
+            )
+
+    def env_spec(self) -> gymnasium.envs.registration.EnvSpec:
+        """Return the environment of the first episode, for minari's ``recover_environment``."""
+        cfg = self._all[0].cfg
+        words = [f"protocol={cfg.protocol.name}", *(f"{key}={getattr(cfg, key)}" for key in OBSERVED)]
+        words += [f"sim.{key}={value}" for key, value in asdict(cfg.sim).items() if value is not None]
+        words += [] if cfg.seed_scene is None else [f"seed_scene={cfg.seed_scene}"]
+        kwargs: dict[str, Any] = {
+            "task": cfg.task.name,
+            "variant": cfg.variant if cfg.seed_scene is None else "random",
+            "overrides": words,
+            "observe": self._observe,
+        }
+        if self._cameras is not None:
+            kwargs["cameras"] = {name: asdict(camera) for name, camera in self._cameras.items()}
+        return gymnasium.envs.registration.EnvSpec(
+            id=f"plab/{cfg.task.name}-v0", entry_point="plab.envs.single:PlabEnv", kwargs=kwargs
+        )

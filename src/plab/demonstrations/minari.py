@@ -1,0 +1,187 @@
+"""Datasets in the format of Minari (Farama Foundation): HDF5, and metadata in JSON.
+
+A dataset is a folder ``<namespace>/<name>-v<k>/data`` of two files: ``main_data.hdf5`` has a group of each
+episode, with observations and infos of T + 1 states and actions, rewards, terminations and truncations of T
+steps; ``metadata.json`` has the spaces. The package minari reads both, and is not needed here.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Dict, Space
+
+from plab.errors import PlabError
+
+__all__ = ["DatasetError", "Episode", "metadata_of", "read_episodes", "write_dataset"]
+
+VERSION = "0.5.4"
+"""Version of Minari whose format is written."""
+
+_ARRAYS = ("actions", "rewards", "terminations", "truncations")
+
+
+class DatasetError(PlabError, ValueError):
+    """A dataset that cannot be read or written; the message names it and the reason."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode of T steps, the last of which truncates it.
+
+    Attributes:
+        observations: Observations before each step and after the last, shape [T + 1, ...], or by key.
+        actions: Actions, shape [T, A].
+        rewards: Rewards, shape [T].
+        infos: Measures of the states, by name, shape [T + 1] each.
+        attributes: Facts about the episode: numbers and texts by name.
+    """
+
+    observations: Any
+    actions: np.ndarray
+    rewards: np.ndarray
+    infos: Mapping[str, np.ndarray]
+    attributes: Mapping[str, Any]
+
+
+def write_dataset(
+    folder: Path,
+    name: str,
+    episodes: Iterable[Episode],
+    spaces: tuple[Space[Any], Space[Any]],
+    env_spec: EnvSpec,
+    about: Mapping[str, Any],
+) -> list[Mapping[str, Any]]:
+    """Write a dataset; it appears when it is whole.
+
+    Args:
+        folder: Folder of datasets, such as ``MINARI_DATASETS_PATH`` names.
+        name: Name of the dataset in it, such as ``plab/Move-v0``.
+        episodes: Its episodes, of which one is in memory at a time.
+        spaces: Spaces of observations and actions.
+        env_spec: Environment that minari's ``recover_environment`` is to make.
+        about: Further metadata.
+
+    Returns:
+        The attributes of the episodes.
+
+    Raises:
+        DatasetError: If there is such a dataset, or there are no episodes.
+    """
+    place = folder / name / "data"
+    if place.exists():
+        raise DatasetError(f"{place.parent} exists: remove it, or choose another name with --name")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=".data-", dir=place.parent))
+    try:
+        attributes, steps = [], 0
+        with h5py.File(beside / "main_data.hdf5", "w", track_order=True) as file:
+            for number, episode in enumerate(episodes):
+                _write_episode(file.create_group(f"episode_{number}"), number, episode)
+                attributes.append(episode.attributes)
+                steps += len(episode.rewards)
+        if not attributes:
+            raise DatasetError(f"{name}: no episode is left to write")
+        metadata = {
+            "dataset_id": name,
+            "minari_version": VERSION,
+            "data_format": "hdf5",
+            "jpeg_encoding": False,
+            "total_episodes": len(attributes),
+            "total_steps": steps,
+            "dataset_size": round((beside / "main_data.hdf5").stat().st_size / 1e6, 1),
+            "observation_space": json.dumps(_described(spaces[0])),
+            "action_space": json.dumps(_described(spaces[1])),
+            "env_spec": env_spec.to_json(),
+            **about,
+        }
+        (beside / "metadata.json").write_text(json.dumps(metadata), encoding="utf-8")
+        beside.chmod(0o755)
+        beside.rename(place)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return attributes
+
+
+def _write_episode(group: h5py.Group, number: int, episode: Episode) -> None:
+    steps = len(episode.rewards)
+    group.attrs.update({"id": number, "total_steps": steps, **episode.attributes})
+    arrays = {
+        "observations": episode.observations,
+        "actions": episode.actions,
+        "rewards": episode.rewards,
+        "terminations": np.zeros(steps, bool),
+        "truncations": np.arange(steps) == steps - 1,
+        "infos": episode.infos,
+    }
+    _write(group, arrays)
+
+
+def _write(group: h5py.Group, arrays: Mapping[str, Any]) -> None:
+    for name, values in arrays.items():
+        if isinstance(values, Mapping):
+            _write(group.create_group(name), values)
+        else:
+            # Minari appends to what has no largest shape.
+            shape = (None, *values.shape[1:])
+            group.create_dataset(name, data=values, maxshape=shape, chunks=values.shape, compression="gzip")
+
+
+def _described(space: Space[Any]) -> dict[str, Any]:
+    """Return what Minari's metadata say of a space."""
+    if isinstance(space, Dict):
+        return {"type": "Dict", "subspaces": {key: _described(own) for key, own in space.items()}}
+    assert isinstance(space, Box)
+    bounds = {"low": space.low.tolist(), "high": space.high.tolist()}
+    return {"type": "Box", "dtype": str(space.dtype), "shape": list(space.shape), **bounds}
+
+
+# ---------------------------------------------------------------------------------------------------- reading
+
+
+def metadata_of(path: str | Path) -> dict[str, Any]:
+    """Return the metadata of a dataset, a folder with the folder ``data`` or that folder itself; with
+    ``path``, the latter.
+
+    Raises:
+        DatasetError: If there is none.
+    """
+    for place in (Path(path).expanduser() / "data", Path(path).expanduser()):
+        if (file := place / "metadata.json").is_file():
+            try:
+                return json.loads(file.read_text(encoding="utf-8")) | {"path": place}
+            except ValueError as error:
+                raise DatasetError(f"{file} cannot be read: {error}") from error
+    raise DatasetError(f"{path} is no dataset: it has no data/metadata.json; plab dataset writes one")
+
+
+def read_episodes(path: str | Path, limit: int | None = None) -> Iterator[Episode]:
+    """Yield the episodes of a dataset, in order, at most ``limit``.
+
+    Raises:
+        DatasetError: If it cannot be read.
+    """
+    metadata = metadata_of(path)
+    file = metadata["path"] / "main_data.hdf5"
+    try:
+        with h5py.File(file) as opened:
+            for number in range(min(metadata["total_episodes"], limit or metadata["total_episodes"])):
+                group = opened[f"episode_{number}"]
+                actions, rewards, *_ = (group[name][()] for name in _ARRAYS)
+                infos = _read(group["infos"]) if "infos" in group else {}
+                yield Episode(_read(group["observations"]), actions, rewards, infos, dict(group.attrs))
+    except (OSError, KeyError) as error:
+        raise DatasetError(f"{file} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _read(item: Any) -> Any:
+    return {key: _read(own) for key, own in item.items()} if isinstance(item, h5py.Group) else item[()]

@@ -1,0 +1,76 @@
+"""Datasets of demonstrations: what is written, how it is read, and refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import plab
+from plab.cli.dataset import main
+from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
+
+COARSE = (
+    "observe_particles=5", "observe_target=true", "sim.grid_size=32", "sim.particles_scale=0.03",
+    "sim.dt=2.7e-4", "sim.substeps=7", "progress=false",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a dataset of drawn scenes, solved by two updates, with pictures."""
+    folder = tmp_path_factory.mktemp("datasets")
+    (folder / "cameras.yaml").write_text(
+        "top: {position: [0.5, 2, 0.5], target: [0.5, 0, 0.5], size: [8, 4]}"
+    )
+    words = ["task=Move", "variant=random", "seed_scene=1000,1001,1003", "method=adam", "method.iterations=2"]
+    seen = ["--observe", "state,depth", "--cameras", str(folder / "cameras.yaml"), "--together", "2"]
+    assert main([*words, f"results_dir={folder}/results", *COARSE, *seen, "--output", str(folder)]) == 0
+    return folder
+
+
+def test_an_episode_is_what_its_environment_gives(written: Path) -> None:
+    metadata = metadata_of(written / "plab/Move-v0")
+    assert (metadata["total_episodes"], metadata["total_steps"]) == (3, 150)
+    kwargs = json.loads(metadata["env_spec"])["kwargs"]
+    env = plab.make("Move", 1, **{key: kwargs[key] for key in ("observe", "cameras")}, overrides=[
+        *kwargs["overrides"], "variant=random"])  # fmt: skip
+    first, *others = read_episodes(written / "plab/Move-v0")
+    assert [one.attributes["variant"] for one in (first, *others)] == [
+        "random1000",
+        "random1001",
+        "random1003",
+    ]
+    assert first.attributes["source"] == "adam" and first.observations["top_depth"].shape == (51, 4, 8, 1)
+    steps = [(env.reset()[0], 0.0), *(env.step(action)[:2] for action in first.actions)]
+    for key in ("state", "top_depth"):
+        assert np.array_equal(np.stack([seen[key] for seen, _ in steps]), first.observations[key])
+    assert np.array_equal([reward for _, reward in steps[1:]], first.rewards)
+    assert not np.array_equal(first.observations["state"], others[0].observations["state"])
+
+
+def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(written))
+    dataset = minari.load_dataset("plab/Move-v0")
+    for own, read in zip(read_episodes(written / "plab/Move-v0"), dataset, strict=True):
+        assert (
+            np.array_equal(own.actions, read.actions) and read.truncations.sum() == read.truncations[-1] == 1
+        )
+        last = {key: values[-1] for key, values in read.observations.items()}
+        assert dataset.observation_space.contains(last)
+    assert dataset.recover_environment().observation_space == dataset.observation_space
+
+
+def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:
+    assert "method=adam" in told(["task=Move", "variant=random", "seed_scene=3", *COARSE], main)
+    again = ["task=Move", "variant=1", *COARSE, "--output", str(written)]
+    assert "exists" in told(again, main)
+    assert "--min-score" not in told([*again, "--name", "a-v0", "--min-score", "2"], main)
+    assert "observe" in told([*again, "--observe", "smell"], main)
+    (tmp_path / "cameras.yaml").write_text("top: {place: 1}")
+    assert "cameras.yaml" in told([*again, "--cameras", str(tmp_path / "cameras.yaml")], main)
+    with pytest.raises(DatasetError, match="no dataset"):
+        metadata_of(tmp_path)
