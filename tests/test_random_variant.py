@@ -7,10 +7,10 @@ from functools import reduce
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from plab.config import ConfigError, TaskConfig, build_scene, choices, conf_folder, load_config
+from plab.config import ConfigError, TaskConfig, build_scene, choices, load_config
+from plab.config.compose import compose
 from plab.config.variants import FIRST_TARGET_SEED, draw_variant
 
 SCENES = 12
@@ -28,8 +28,7 @@ def entries(tasks: list[dict], key: str) -> np.ndarray:
 
 @pytest.mark.parametrize("name", choices("task"))
 def test_ranges_are_respected_and_used(name: str) -> None:
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        task = compose("config", overrides=[f"task={name}"]).task
+    task = compose([f"task={name}"]).task
     OmegaConf.set_struct(task, None)
     # Every draw has been checked by then: scene, geometric target, script.
     changes = [draw_variant(task, seed_scene) for seed_scene in range(SCENES)]
