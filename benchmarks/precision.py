@@ -61,7 +61,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What one precision made of some actions.
+    """Scores, states and gradients of some actions in one precision.
 
     Attributes:
         x: Final positions in the hard contact model, shape [particle, 3].

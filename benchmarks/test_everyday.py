@@ -1,4 +1,4 @@
-"""What everyday use waits for, to be timed before and after a change: ``make benchmark``.
+"""Timing of everyday operations before and after a change: ``make benchmark``.
 
 The simulator's own benchmark, with phases, batches and devices, is ``python -m plab.bench.speed``.
 """

@@ -15,7 +15,7 @@ MASS = 3e-5
 
 @ti.data_oriented
 class Adder(SumPhases):
-    """What :class:`SumPhases` needs of a simulator."""
+    """Attributes of a simulator that :class:`SumPhases` needs."""
 
     def __init__(self, deterministic: bool) -> None:
         self.runtime = start_runtime("cpu", "float32")

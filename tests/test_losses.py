@@ -30,7 +30,7 @@ COARSE = ("sim.grid_size=16", "sim.horizon=3", "sim.substeps=5", "sim.dt=4e-4", 
 
 
 class Close(DistanceTerm):
-    """How many particles are close to a manipulator, smoothly counted."""
+    """Smooth count of the particles close to a manipulator."""
 
     @ti.func
     def add(self, tally, d, particle):

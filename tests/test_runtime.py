@@ -50,7 +50,7 @@ runtime.start_runtime("cpu", "float32")
 
 
 def test_arrays_of_an_earlier_start_free_nothing(monkeypatch) -> None:
-    """What Taichi keeps at their addresses by now may be another array, in use."""
+    """Their addresses may belong to another array in use by then."""
     start_runtime("cpu", "float32")
     former = ti.ndarray(ti.f32, 3)
     start_runtime("cpu", "float64")

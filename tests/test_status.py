@@ -1,4 +1,4 @@
-"""What ``python -m plab.status`` says about done, running, failed and missing runs."""
+"""``plab status``: done, running, failed and missing runs."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ __all__ = ["FAMILY", "RandomSearch", "RandomSearchConfig"]
 
 @dataclass
 class RandomSearchConfig(MethodConfig):
-    """What random search adds to the keys that all methods have.
+    """Keys of random search, beside those of all methods.
 
     Attributes:
         iterations: Sequences that are tried.

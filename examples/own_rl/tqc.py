@@ -21,7 +21,7 @@ __all__ = ["FAMILY", "TqcConfig"]
 
 @dataclass
 class TqcConfig(OffPolicyConfig):
-    """What truncated quantile critics add to the keys of all methods with a replay buffer.
+    """Keys of truncated quantile critics, beside those of all methods with a replay buffer.
 
     Attributes:
         critics: Number of critics.

@@ -107,7 +107,7 @@ def build_scenes(cfgs: Sequence[Config]) -> list[Scene]:
 
 
 def fits(cfg: Config) -> bool:
-    """Whether a scene and its target can be built: the grid's domain is smaller where nodes are far apart."""
+    """Return True if a scene and its target fit the grid's domain, which shrinks with coarse nodes."""
     try:
         check_target(build_scene(cfg), cfg.task.target)
     except (SceneError, TargetError):

@@ -53,7 +53,7 @@ class NodeTerm(Term):
 
     @ti.func
     def measure(self, e, node, mass):
-        """What a node of environment ``e`` adds to the value of an empty one.
+        """Return the share of a node of environment ``e``, beyond that of an empty node.
 
         ``node`` is its index along each axis, 3 integers in [0, n); ``sim.entry(e, node)`` is its entry in
         fields of n^3 numbers per environment. ``mass`` is its mass, positive; with the release's floor it may
@@ -72,8 +72,7 @@ class ParticleTerm(Term):
 
     @ti.func
     def measure(self, e, x, v):
-        """What a particle of environment ``e`` adds, at position ``x`` [domain units] with velocity ``v``,
-        3-vectors."""
+        """Return the share of a particle of environment ``e`` at ``x`` [domain units] with velocity ``v``."""
         return 0.0 * x[0]
 
     @ti.func
@@ -112,7 +111,7 @@ class DistanceTerm(Term):
 
     @ti.func
     def measure(self, tally):
-        """What a manipulator adds, float64."""
+        """Return the share of a manipulator, float64."""
         return 0.0 * tally[0]
 
     @ti.func

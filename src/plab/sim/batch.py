@@ -30,7 +30,7 @@ YIELD_STRAIN_MAX = 1e30
 
 
 def scene_kind(scene: Scene) -> tuple[Any, ...]:
-    """What is the same for scenes that one simulator can be of, one after the other or side by side."""
+    """Return a key that is equal for scenes that one simulator can hold, in sequence or in a batch."""
     return (*(getattr(scene, name) for name in SHARED), *(tool.shape for tool in scene.manipulators))
 
 

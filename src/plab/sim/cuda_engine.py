@@ -49,7 +49,7 @@ def device_attribute(number: int) -> int:
 
 
 def resident_blocks(number_bytes: int) -> int:
-    """How many blocks of the step that is one launch a multiprocessor certainly holds at once."""
+    """Return a lower bound on the resident blocks per multiprocessor of the single-launch step."""
     shared = number_bytes * (BLOCK_WARPS * WARP_NUMBERS + WARP_BLOCK * NODE_STRIDE) + RESERVED
     return max(1, min(RESIDENT_BLOCKS, device_attribute(SHARED_BYTES) // shared))
 
@@ -87,7 +87,7 @@ class CudaEngine(CudaPhases):
 
     @property
     def resident(self) -> bool:
-        """Whether a step is one launch."""
+        """True if a step is one launch."""
         few = self.particle_threads <= RESIDENT_TURNS * self.resident_threads
         # Blocks that move poses are among the resident ones.
         fits = few and self.frame_threads <= self.resident_threads
@@ -95,7 +95,7 @@ class CudaEngine(CudaPhases):
 
     @property
     def sorts(self) -> bool:
-        """Whether particles are put into the order of their cells before each step: where there are so many
+        """True if particles are sorted by cell before each step: where there are so many
         that atomics, not launches, take the time. Not where bodies have materials of their own, which are
         looked up by place, nor where results must not depend on timing, as the order within a cell does."""
         return not self.resident and not self.mixed and not self.deterministic

@@ -225,13 +225,13 @@ class SumPhases(Storage):
 
     @ti.func
     def largest_share(self, field: ti.template()):
-        """What no share of an affine field's first three components exceeds; the field is that of
-        :func:`plab.sim.particle_phases.affine_field`. Not finite where one of these is not."""
+        """Return an upper bound on the shares of the first three components of an affine field, see
+        :func:`plab.sim.particle_phases.affine_field`; not finite if a component is not."""
         total = ti.abs(field[0]) + 2.0 * (ti.abs(field[1]) + ti.abs(field[2]) + ti.abs(field[3]))
         return total[0] + total[1] + total[2]
 
     @ti.func
     def bits_of(self, bound):
-        """A number that is not negative as the bits of a float32, which are in the order of the numbers, with
-        infinity and NaN above all."""
+        """Return the bits of a nonnegative float32: they have the order of the numbers, with infinity and NaN
+        above all."""
         return ti.bit_cast(ti.cast(bound, ti.f32), ti.i32) & 0x7FFFFFFF

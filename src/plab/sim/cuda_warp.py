@@ -112,7 +112,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def turns_of(self, w, threads, total):
-        """How many of ``total`` items thread w of some threads works on."""
+        """Return the number of ``total`` items that thread w of some threads works on."""
         return (total - w + threads - 1) // threads
 
     @ti.func
@@ -212,8 +212,7 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def sorted_lane(self, state: ti.template(), source, place, own, lane):
-        """Which particle of the tile a lane of the warp takes: the one whose base node is the lane-th in
-        order, of those at the ``place`` of each lane that has its ``own``; and whether it takes one."""
+        """Return the particle of the tile for a lane of the warp, the one whose base node is the lane-th in order, of those at the ``place`` of each lane that has its ``own``; and whether it takes one."""
         base, _fx = self.stencil(self.vector(state, source, place))
         node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.

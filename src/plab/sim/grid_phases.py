@@ -252,7 +252,7 @@ class GridPhases(Storage):
 
     @ti.func
     def rubs(self, i, v, friction):
-        """Whether the floor acts on a node, beyond stopping it as any wall does."""
+        """Return True if the floor acts on a node, beyond stopping it as any wall does."""
         return friction > 0.0 and i[1] - 1 < WALL and v[1] < 0.0
 
     @ti.func

@@ -332,8 +332,7 @@ class PosePhases(Storage):
 
     @ti.func
     def frame_shares(self, e, start: ti.template(), m, s, frame):
-        """What a frame's adjoint adds to the adjoints of the poses at the end and at the start of substep
-        s."""
+        """Return a frame's share in the adjoints of the poses at the end and the start of substep s."""
         inv_dt = ti.cast(1.0, ti.f64) / self.dt
         end_bar = vec8(0.0)
         start_bar = vec8(0.0)

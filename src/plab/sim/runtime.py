@@ -192,5 +192,5 @@ def register_user(user: object) -> None:
 
 
 def is_current(runtime: Runtime) -> bool:
-    """Whether a runtime is still the one in force."""
+    """Return True if a runtime is still the active one."""
     return runtime is _current

@@ -158,14 +158,14 @@ class Storage:
         self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)
 
     def moves(self, shape: str) -> bool:
-        """Whether manipulators of this shape can move; decided while compiling, as what follows."""
+        """Return True if manipulators of this shape can move; decided while compiling, as what follows."""
         return MANIPULATOR_SHAPES[shape].moves
 
     def turns(self, shape: str) -> bool:
         return MANIPULATOR_SHAPES[shape].turns
 
     def rotated(self, shape: str) -> bool:
-        """Whether the rotation of a shape's frame matters: what is round has a spin only."""
+        """Return True if the rotation of a shape's frame matters: round shapes have a spin only."""
         return self.turns(shape) or not SURFACES[shape].round
 
     def _allocate(self) -> None:

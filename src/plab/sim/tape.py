@@ -331,7 +331,7 @@ class Recording:
             self._engine.add_pose_cotangents(self._bars["poses"][k])
 
     def _taken(self, size: int, fill: Callable[[Any], None]) -> Any:
-        """What a kernel adds to zeros, as an array or a tensor of ``size`` numbers."""
+        """Return zeros that a kernel has added to, as an array or a tensor of ``size`` numbers."""
         double = self._engine.real == ti.f64
         if self._like is None:
             out = np.zeros(size, np.float64 if double else np.float32)
@@ -342,7 +342,7 @@ class Recording:
     def _stacked(self, parts: list[Any]) -> Any:
         """States of all steps, each of [batch * number] numbers, as [batch, T, number]."""
         rows = [part.reshape(self._engine.batch, -1) for part in parts]
-        # Whoever gave a tensor has imported PyTorch.
+        # A tensor implies that PyTorch is imported.
         return np.stack(rows, axis=1) if self._like is None else sys.modules["torch"].stack(rows, dim=1)
 
     def _by_step(self, bar: Any) -> list[Any]:

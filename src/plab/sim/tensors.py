@@ -25,7 +25,7 @@ else:
 
 
 def on_device(array: object) -> "TypeIs[torch.Tensor]":
-    """Whether something is a CUDA tensor; PyTorch is not imported for that."""
+    """Return True if the value is a CUDA tensor, without importing PyTorch."""
     return bool(getattr(array, "is_cuda", False))
 
 
@@ -72,8 +72,8 @@ def output_for(fill: Callable[[Any], None], count: int, double: bool, like: "tor
 def numbers_of(
     array: ti.Ndarray, shape: tuple[int, ...], like: object, first: int = 0
 ) -> "np.ndarray | torch.Tensor":
-    """What an array on the device holds from its entry ``first``, as an array of some shape, or as a tensor
-    of the type of a CUDA tensor ``like``; what is beyond is left out."""
+    """Copy entries of a device array, from entry ``first`` on, to an array of some shape, or to a tensor of
+    the type of a CUDA tensor ``like``."""
     count = int(np.prod(shape))
     if on_device(like):
         filled = output_for(lambda out: copy_numbers(array, first, out, count, 0), count, True, like)
@@ -159,9 +159,9 @@ def _array_of(numbers: "np.ndarray | torch.Tensor", device: str) -> ti.Ndarray:
 
 
 def _in_default_stream() -> bool:
-    """Whether PyTorch works in the stream in which Taichi's kernels run, so that neither waits for the other.
+    """Return True if PyTorch works in the stream of Taichi's kernels, so that neither waits for the other.
 
-    Whoever has a CUDA tensor has imported PyTorch.
+    A CUDA tensor implies that PyTorch is imported.
     """
     cuda = sys.modules["torch"].cuda
     return bool(cuda.current_stream() == cuda.default_stream())

@@ -29,7 +29,7 @@ in which the state broke, from 1 on, or 0."""
 
 
 class LossTerm(Protocol):
-    """What every term is asked for, whatever its kind; :mod:`plab.losses.term` says what it means."""
+    """Interface of a loss term of any kind, see :mod:`plab.losses.term`."""
 
     name: str
     label: str
@@ -167,7 +167,7 @@ class TermPhases(Storage):
 
     @ti.func
     def is_empty(self, mass):
-        """Whether a node holds no mass; not for NaN."""
+        """Return True if a node holds no mass; False for NaN."""
         out = mass <= 0.0
         if ti.static(self.lowest_base == 0):
             out = mass == 0.0
@@ -175,8 +175,8 @@ class TermPhases(Storage):
 
     @ti.func
     def node_measures(self, e, i, mass):
-        """What a node, by its array index, adds to the terms of the mass tensor, and its mass; and the loss's
-        slope there."""
+        """Return the shares of a node, by its array index, in the terms of the mass tensor, followed by its
+        mass; and the slope of the loss there."""
         values = ti.Vector.zero(ti.f64, ti.static(len(self.node_terms) + 1))
         slope = 0.0 * mass
         node = i - 1
@@ -304,13 +304,13 @@ class TermPhases(Storage):
         return x_bar, pose_bar
 
     def acts(self, shape: str) -> bool:
-        """Whether a shape's distances count in the loss: where an action can move it; decided while
+        """Return True if a shape's distances count in the loss: where an action can move it; decided while
         compiling."""
         return MANIPULATOR_SHAPES[shape].moves
 
     @property
     def beyond_nearest(self) -> bool:
-        """Whether a term of distances has a gradient for more than the nearest particle."""
+        """Return True if a term of distances has a gradient for more than the nearest particle."""
         return any(not term.nearest_only for _k, _column, term in self.distance_terms)
 
     # -- all terms ----------------------------------------------------------------------------------
