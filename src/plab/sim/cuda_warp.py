@@ -212,7 +212,8 @@ class WarpPhases(SumPhases, TermPhases, GridPhases, ParticlePhases):
 
     @ti.func
     def sorted_lane(self, state: ti.template(), source, place, own, lane):
-        """Return a lane's particle in the tile, the one whose base node is the lane-th in order, of those at the ``place`` of each lane that has its ``own``; and whether it takes one."""
+        """Return a lane's particle in the tile, the one whose base node is the lane-th in order,
+        of those at the ``place`` of each lane that has its ``own``; and whether the lane takes one."""
         base, _fx = self.stencil(self.vector(state, source, place))
         node = ti.select(own, self.linear(base), self.nodes)
         # The node and the particle in one number; n = 256 takes 29 bits.
