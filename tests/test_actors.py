@@ -290,6 +290,7 @@ def test_what_is_observed_is_moved_together(monkeypatch) -> None:
     cfg = make_config("results", "pods", *words)
     batch, _ = environments(cfg)
     training, given = PodsTraining(cfg, batch), []
+    training.statistics.var = np.linspace(0.25, 4.0, batch.observation_space.shape[0])
     training._hold_moments()
     act = ActorPolicy.forward
     monkeypatch.setattr(ActorPolicy, "forward", lambda self, seen: given.append(seen) or act(self, seen))

@@ -248,7 +248,7 @@ def test_a_reset_follows_changes_of_the_simulator(changed: str) -> None:
 
 
 def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
-    words, actions = [*OVERRIDES, "observe_target=true", "observe_particles=3"], random_actions()
+    words, actions = [*OVERRIDES, "observe_target=true", "observe_particles=7"], random_actions()
 
     def made_of(*variants: str) -> list[Config]:
         each = [[f"variant={one}"] for one in variants]
@@ -264,7 +264,7 @@ def test_environments_can_be_others_of_their_kind(monkeypatch) -> None:
     before = episode(batch)
     # Every so many-th particle, the poses, and what there is to see of the target.
     problem, state = batch.problem, batch.problem.simulator.state()
-    stride = problem.scenes[0].particle_count // 3
+    stride = problem.scenes[0].particle_count // 7
     for k in range(2):
         particles = np.concatenate([state.x[k, ::stride], state.v[k, ::stride]], axis=1)
         aim = target_observation(problem.initial_mass[k], problem.target_mass[k])

@@ -1,9 +1,8 @@
-"""Layering of the packages, imports of the command lines, and the version."""
+"""Layering of the packages, imports of the command lines, and public names."""
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -58,12 +57,6 @@ def test_starting_imports_nothing_heavy(code, allowed, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == "[]"
-
-
-def test_the_version_is_semantic_and_in_one_place():
-    assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", plab.__version__)
-    assert f"## [{plab.__version__}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 
 
 CLIENT = """

@@ -1,4 +1,4 @@
-"""The oracle itself: conservation laws, hand-computed values, and autograd against central differences."""
+"""The oracle itself: conservation laws and hand-computed values."""
 
 from __future__ import annotations
 
@@ -58,10 +58,6 @@ def deformed_state(scene: Scene, strain: float = 0.05) -> ref.State:
     return replace(state, v=v, C=random_matrices((count, 3, 3), 5.0, seed=2), F=F)
 
 
-def pose_of(manipulator: Manipulator) -> Tensor:
-    return torch.tensor((*manipulator.position, *manipulator.rotation, manipulator.gap), dtype=torch.float64)
-
-
 NO_ACTION = torch.zeros(0, dtype=torch.float64)
 
 
@@ -97,19 +93,6 @@ def test_stress_is_the_derivative_of_the_fixed_corotated_energy() -> None:
     torch.testing.assert_close(ref.kirchhoff_stress(scene, F, U @ Vt), P @ F.mT, rtol=1e-10, atol=1e-9)
 
 
-@pytest.mark.parametrize("shape", MANIPULATORS)
-def test_normal_is_the_gradient_of_the_distance(shape: str) -> None:
-    manipulator = MANIPULATORS[shape]
-    points = (torch.tensor(manipulator.position) + random_matrices((200, 3), 0.1)).requires_grad_()
-    d, normal = ref.signed_distance(manipulator, pose_of(manipulator), points)
-    (gradient,) = torch.autograd.grad(d.sum(), points)
-    assert (d > 0).any() and (d < 0).any()
-    torch.testing.assert_close(normal, gradient, rtol=0, atol=1e-12)
-    torch.testing.assert_close(normal.norm(dim=-1), torch.ones_like(d), rtol=0, atol=1e-12)
-    on_surface, _ = ref.signed_distance(manipulator, pose_of(manipulator), points - d[:, None] * normal)
-    assert on_surface[d > 0].abs().max() < 1e-12
-
-
 H = math.sqrt(0.5)
 # A pin along z, turned by 90 degrees about x.
 PIN = Manipulator("RollingPin", (0.3, 0.03), (0.5, 0.2, 0.5), (H, H, 0.0, 0.0), (0.6, 0.09, 0.003))
@@ -137,21 +120,6 @@ def test_motion_by_hand(manipulator: Manipulator, action, position, turn, gap: f
     torch.testing.assert_close(torch.cat([moved[:3], moved[7:]]), expected, rtol=0, atol=1e-14)
     axes = ref.rotate(start[3:7], IDENTITY) @ torch.tensor(Rotation.from_rotvec(turn).as_matrix().T)
     torch.testing.assert_close(ref.rotate(moved[3:7], IDENTITY), axes, rtol=0, atol=1e-14)
-
-
-def test_rigid_velocity_is_translation_plus_rotation() -> None:
-    dt = 1e-6
-    omega, speed = random_matrices((3,), 2.0, seed=1), random_matrices((3,), 1.0, seed=2)
-    pose = pose_of(MANIPULATORS["Box"])
-    q = ref.quaternion_product(ref.rotation_quaternion(dt * omega), pose[3:7])
-    end = torch.cat([pose[:3] + dt * speed, q, pose[7:]])
-    points = random_matrices((20, 3), 0.5)
-    expected = speed + torch.linalg.cross(omega.expand(20, 3), points - pose[:3])
-    torch.testing.assert_close(ref.rigid_velocity(pose, end, points, dt), expected, rtol=0, atol=1e-4)
-    rough = torch.tensor([0.5, 0.123, 0.5, 0.7071, 0.7071, 0.0, 0.0, 0.06], dtype=torch.float64)
-    assert (
-        ref.rigid_velocity(rough, rough, points, 1e-4).abs().max() < 1e-10
-    )  # at rest, if not of unit length
 
 
 def test_hard_and_soft_contact_by_hand() -> None:
@@ -193,27 +161,3 @@ def test_floor_and_walls_by_hand() -> None:
         rows = {0: sliding, 2: [0, 0, 0], 5: [0, 0, 0], **untouched}
         for row, expected in rows.items():
             assert result[row].tolist() == pytest.approx(expected, abs=1e-14), (friction, row)
-
-
-@pytest.mark.parametrize(("shapes", "alpha"), [(tuple(MANIPULATORS), 60.0), (("Sphere",), 0.0)])
-def test_autograd_matches_central_differences(shapes: tuple[str, ...], alpha: float) -> None:
-    """By actions and each part of the state, with soft and with hard contact."""
-    scene = make_scene(*shapes)
-    start = deformed_state(scene)
-    target_mass = ref.mass_tensor(scene, start.x + 0.03)
-    target_sdf = random_matrices((16, 16, 16), 1.0).abs()
-    inputs = {"actions": random_matrices((2, scene.action_dim), 0.4, seed=5), **vars(start)}
-    for varied in ("actions", "x", "v", "F"):
-        direction = random_matrices(inputs[varied].shape, 1.0, seed=6)
-
-        def loss(step: float | Tensor, varied: str = varied, direction: Tensor = direction) -> Tensor:
-            values = {**inputs, varied: inputs[varied] + step * direction}
-            actions = values.pop("actions")
-            return ref.rollout_loss(scene, ref.State(**values), actions, alpha, target_mass, target_sdf)[0]
-
-        step = torch.zeros((), dtype=torch.float64, requires_grad=True)
-        (slope,) = torch.autograd.grad(loss(step), step)
-        with torch.no_grad():
-            difference = (loss(1e-7) - loss(-1e-7)) / 2e-7
-        assert abs(slope) > 1e-4
-        assert math.isclose(slope, difference, rel_tol=1e-5), (varied, slope, difference)

@@ -338,7 +338,7 @@ def replayed(monkeypatch, recording) -> list:
 
 
 def test_the_best_actions_of_a_result_are_replayed_as_a_strip(capsys, replayed, told):
-    cfg = load_config(["task=Rope", "variant=2", *COARSE])
+    cfg = load_config(["task=Rope", "variant=2", "seed_particles=3", *COARSE])
     found = results.RunResult(results.config_dict(cfg), cfg.hash)
     results.write(found, Path("run.h5"))
     assert "run.h5 has no actions" in told("run.h5")
@@ -351,7 +351,7 @@ def test_the_best_actions_of_a_result_are_replayed_as_a_strip(capsys, replayed, 
         assert np.asarray(image).std() > 10
     ((replay, given),) = replayed
     assert np.array_equal(given, found.best_actions)
-    assert (replay.task, replay.sim, replay.variant) == (cfg.task, cfg.sim, "2")
+    assert (replay.task, replay.sim, replay.variant, replay.seed_particles) == (cfg.task, cfg.sim, "2", 3)
 
 
 def test_known_demonstrations_are_replayed_and_others_are_of_zeros(monkeypatch, replayed, capsys, told):

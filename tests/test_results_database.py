@@ -234,11 +234,13 @@ def test_scores(folder: Path, told, capsys) -> None:
         "Rope        1  adam       1  plab               finished   0.75        0.1           4\n"
         "Rope        1  adam       0  plab               finished    0.5        0.1           4\n"
     )
-    assert main(["scores", str(folder), "status=all", "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)
-    assert [row["status"] for row in listed] == ["finished"] * 3 + ["running"]
-    assert [row["score"] for row in listed[:3]] == pytest.approx([0.5, 0.75, 0.25])
-    assert listed[0]["targets"] is None and listed[0]["seed"] == 0
+    words = ["status=all", "--json", "--sort", "status", "--descending"]
+    assert main(["scores", str(folder), *words]) == 0
+    _, *listed = json.loads(capsys.readouterr().out)
+    # Runs that are equal in what they are sorted by are in their usual order.
+    assert [(row["status"], row["seed"]) for row in listed] == [("finished", seed) for seed in range(3)]
+    assert [row["score"] for row in listed] == pytest.approx([0.5, 0.75, 0.25])
+    assert listed[0]["targets"] is None
     for words in (["--keys", "method.lt"], ["--sort", "iou"]):
         assert words[-1] in told(["scores", str(folder), *words], main)
 

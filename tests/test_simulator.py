@@ -121,6 +121,10 @@ def test_other_scenes_in_the_same_simulator_are_as_if_built_anew(sim: Simulator)
     got = sim.rollout(ACTIONS[turned])
     np.testing.assert_allclose(got.step_terms, want.step_terms[turned], rtol=1e-5)
     np.testing.assert_allclose(got.gradient, want.gradient[turned], rtol=1e-3, atol=1e-9)
+    # An environment whose manipulators touch nothing does not cut off the others' gradients.
+    far = tuple(replace(m, position=(0.2, 0.8, 0.2)) for m in SCENES[1].manipulators)
+    sim.set_scenes([SCENES[0], replace(SCENES[1], manipulators=far), SCENES[2]])
+    assert_same(sim.rollout(ACTIONS).gradient[::2], want.gradient[::2])
     with pytest.raises(SceneError, match="2 scenes"):
         sim.set_scenes(SCENES[:2])
     with pytest.raises(SceneError, match="substeps"):

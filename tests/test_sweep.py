@@ -215,6 +215,8 @@ def test_full_size_batches_fit_the_memory(device: str) -> None:
     scene = build_scene(load_config(["task=Rope"]))
     limits = [batch_limit(scene, "float32", device, memory) for memory in (1.0, 4000.0, 8000.0, 40000.0)]
     assert limits[0] == 1 and limits == sorted(limits) and limits[1] >= 3 and limits[-1] > limits[1]
+    # 2 steps of 3 states and their start, one state more, and the starts of 3 segments.
+    assert kept_states(5, 3, 2, 2) == 11
     lengths = range(1, scene.horizon + 1)
     fewest = min(kept_states(scene.horizon, scene.substeps, length, length) for length in lengths)
     particles = -(-scene.particle_count // 32) * 32
@@ -245,7 +247,9 @@ def test_a_launcher_that_breaks_off_loses_its_runs_only(sweep, monkeypatch) -> N
     queue = SimpleNamespace(launch=launch)
     launchers = SimpleNamespace(instantiate_launcher=lambda **settings: queue)
     monkeypatch.setattr("plab.sweep.running.Plugins", SimpleNamespace(instance=lambda: launchers))
-    code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:2}")
+    # As joblib counts: all of three processors but one.
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    code, counts, lines = sweep("seed=range(6)", "hydra.launcher.inner={_target_:queue,n_jobs:-2}")
     assert (code, counts) == (1, {"runs": 6, "not under way": 6})
     assert asked == [2] and "RuntimeError: nobody is there" in lines[0]
 
@@ -255,7 +259,7 @@ JOBS = [
     [["task=Move", "method=gd", "method.lr=0.1"], ["task=Rope", "method=gd", "method.lr=0.2"]],
     [["method=sac", "method.profile=paper"], ["method=sac", "method.profile=release"]],
     [["+experiment=yield_ablation", "task.yield_stress=10"], ["+experiment=yield_ablation"]],
-    [["task.manipulators.left.size=[0.05]"], ["task.manipulators.left.size=[0.06]", "sim=reference"]],
+    [["sim=reference", "task.manipulators.left.size=[0.05]"], ["sim=reference", "sim.grid_size=32"]],
 ]
 
 

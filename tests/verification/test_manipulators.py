@@ -36,6 +36,7 @@ TOUCHING = {kind: (kind,) for kind in KINDS if kind != "Cylinder"} | {"Cylinder"
 """Cases: a manipulator at the block; the static one together with one that moves."""
 
 X = sample_particles(SCENE)
+X_MAX = 1.0 - 3.0 * SCENE.dx
 COUNT = len(X)
 MATERIAL = (SCENE.youngs_modulus, SCENE.poisson_ratio, SCENE.yield_stress)
 ELASTIC = (*MATERIAL[:2], math.inf)
@@ -284,6 +285,7 @@ REGIMES: dict[str, tuple[str, dict[str, np.ndarray], tuple[float, float, float]]
     "on the yield surface": ("hard", {"F": at_yield()}, MATERIAL),
     "deep plastic flow": ("soft", FLOWING, MATERIAL),
     "no shear strength": ("hard", FLOWING, (*MATERIAL[:2], 0.0)),
+    "at the domain's face": ("soft", FLOWING | {"x": np.minimum(X + 0.31 * np.eye(3)[0], X_MAX)}, MATERIAL),
     "inverted, flowing": ("soft", {"F": turned(1.1, 1.05, -0.9)}, MATERIAL),
     "inverted, elastic": ("hard", {"F": turned(1.1, 1.05, -0.9)}, ELASTIC),
     "nearly singular, flowing": ("hard", {"F": turned(1.1, 0.95, 1e-4)}, MATERIAL),
