@@ -13,7 +13,7 @@ import pytest
 
 from plab.config import Config
 from plab.results import RunResult, read
-from plab.results.run_file import RunFile
+from plab.results.running import RunFile
 from plab.runners.runner import SimulatorCache
 
 TIMES = ["seconds"]

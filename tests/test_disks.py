@@ -19,7 +19,7 @@ from plab.cli import status
 from plab.cli.run import main
 from plab.config import ConfigError
 from plab.results import SCHEMA_VERSION, RunFile, read
-from plab.results.locks import acquire, held, lock_path
+from plab.results.running import acquire, held, lock_path
 from plab.runners import run_batch
 from refusals import snapshot
 from same_runs import raising
@@ -175,7 +175,7 @@ def test_a_lock_has_one_holder_until_it_is_released_or_forgotten() -> None:
 
 
 def test_a_killed_process_holds_nothing() -> None:
-    code = "import plab.results.locks as m; lock = m.acquire('run.h5'); print('ready', flush=True); input()"
+    code = "import plab.results.running as m; lock = m.acquire('run.h5'); print('ready', flush=True); input()"
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )

@@ -80,7 +80,6 @@ def test_rows_are_those_of_the_files_to_the_last_bit(tmp_path: Path) -> None:
     for seed, message in enumerate(["", "a\nb", "\u00e9t\u00e9", 'in "quotes"']):
         made = synthetic.run(tmp_path, seed=seed)
         made.config["task"]["limit"], made.config["seed_scene"] = float("inf"), 2**70
-        made.config["results_dir"] = f"{tmp_path}/\udce9"
         made.status, made.message = ("failed" if message else "finished"), message
         made.evaluation |= {"loss_odd name": float("nan"), "reward": -0.0}
         path = tmp_path / f"seed{seed}{'.partial' if message else ''}.h5"

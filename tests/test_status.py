@@ -19,7 +19,7 @@ import synthetic
 from plab.cli.status import main
 from plab.config.selection import select
 from plab.results import pack
-from plab.results.locks import acquire
+from plab.results.running import acquire
 from plab.status import NAMES, STATES, survey, view
 from plab.status.view import duration, watch
 

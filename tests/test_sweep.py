@@ -15,7 +15,7 @@ import toy_runner
 from plab.cli.run import main
 from plab.config import Config, build_scene, load_config
 from plab.results import RunFile, read
-from plab.results.locks import acquire
+from plab.results.running import acquire
 from plab.runners.tracks import Outcome, TogetherError
 from plab.sim.memory import batch_limit, kept_states
 from plab.sweep.plan import plan

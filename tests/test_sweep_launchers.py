@@ -20,7 +20,7 @@ import toy_runner
 from plab.cli.run import main
 from plab.config import load_config
 from plab.results import read
-from plab.results.locks import lock_path
+from plab.results.running import lock_path
 from plab.runners import run_batch
 from plab.sweep.gpus import _Worker, choose
 from same_runs import assert_same_numbers

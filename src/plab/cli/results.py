@@ -129,8 +129,9 @@ def _check(options: argparse.Namespace) -> int:
             count += 1
             if fault is not None:
                 wrong += 1
-                print(f"{fault.path}: {fault.reason}: {fault.advice}", flush=True)
-    print(f"{count} run(s) checked, {f'{wrong} with something wrong' if wrong else 'all well'}")
+                print(f"{fault.path}: {fault.reason}", flush=True)
+    advice = "; delete these files and run them again, or run them with force=true" if wrong else ""
+    print(f"{count} run(s) checked, {wrong} faulty{advice}")
     return 1 if wrong else 0
 
 

@@ -18,7 +18,7 @@ from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_t
 from plab.errors import PlabError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, lookup, rows
-from plab.results.locks import held
+from plab.results.running import held
 from plab.results.table import readable_rows, sources_of
 
 NAMES = ("task", "variant", "method", "seed")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from plab.config.identity import config_dict, config_hash
 from plab.config.selection import lookup
-from plab.results.run_file import RunFile, read, write
+from plab.results.running import RunFile, read, write
 from plab.results.schema import (
     BUDGETS,
     SCHEMA_VERSION,

@@ -23,9 +23,6 @@ from plab.results.run_file import encode, read, replace_file
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult
 from plab.results.table import Row, readable_rows, rows
 
-_ALL_DIGITS = 17
-"""Significant decimal digits that identify any float64."""
-
 
 @dataclass(frozen=True)
 class Packed:
@@ -56,8 +53,7 @@ def pack(
     """Write runs into an archive, in one atomic step.
 
     Runs that are in archives below ``source`` are taken over; so packing once more adds what is new, also
-    where the archive itself lies there. Numbers keep all their digits, unless ``digits`` says otherwise; only
-    ``results_dir`` is no longer the folder that the run was computed in.
+    where the archive itself lies there. ``results_dir`` becomes ``results``.
 
     Args:
         source: Folder of results, archive, result file, or several of them.
@@ -85,25 +81,20 @@ def pack(
             )
         chosen[name] = row
     if not chosen:
-        hidden = f"; {len(unreadable)} cannot be read: {unreadable[0]}" if unreadable else ""
-        raise ResultsError(f"there is nothing to pack: no run fits{hidden}")
+        raise ResultsError(
+            "there is nothing to pack: no run fits" + (f"; {unreadable[0]}" if unreadable else "")
+        )
     members = []
     for name, row in sorted(chosen.items()):
-        try:
-            run = read(row.path)
-        except ResultsError as error:
-            unreadable.append(error)
-            continue
+        run = read(row.path)
         run = replace(
-            run if digits is None or digits >= _ALL_DIGITS else _rounded(run, digits),
+            run if digits is None else _rounded(run, digits),
             # A path of the computer that made it means nothing elsewhere.
             config=run.config | {"results_dir": "results"},
             masses=run.masses if keep_masses else {},
             resume=run.resume if keep_resume else None,
         )
         members.append((name, encode(run, compress=False)))
-    if not members:
-        raise unreadable[-1]
     size = sum(row.path.stat().st_size for row in chosen.values() if row.path.is_file())
     content = lzma.compress(zipped(members, zipfile.ZIP_STORED), preset=9)
     replace_file(archive, content, sync=True, folders=True)
@@ -125,7 +116,7 @@ def zipped(members: Iterable[tuple[str, bytes]], method: int) -> bytes:
 def _rounded(run: RunResult, digits: int) -> RunResult:
     """Round a run's iterations, and the lowest loss with them."""
     # An error of at most half of the last digit of 1.00...: 2^-bits <= 0.5 * 10^(1 - digits).
-    bits = math.ceil(1.0 + (digits - 1) * math.log2(10.0))
+    bits = min(math.ceil(1.0 + (digits - 1) * math.log2(10.0)), 53)
 
     def nearest(values: Any) -> Any:
         mantissa, exponent = np.frexp(values)

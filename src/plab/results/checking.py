@@ -10,11 +10,10 @@ import h5py
 import numpy as np
 
 from plab.config.families import SOLVED, known_family
-from plab.config.identity import SUFFIX, config_hash
+from plab.config.identity import config_hash
 from plab.objective import scores_from_iou
-from plab.results.run_file import opened_archive, read
+from plab.results.run_file import run_of
 from plab.results.schema import (
-    ARCHIVE_SUFFIX,
     BUDGETS,
     COLUMNS,
     EVALUATION,
@@ -25,23 +24,20 @@ from plab.results.schema import (
     loss_columns,
     row_count,
 )
-from plab.results.table import members, run_files
+from plab.results.table import read_each, run_files
 
 _IN_UNIT_INTERVAL = ("iou", "score", "iou_initial", "iou_target_self")
 
 _TOLERANCE = 1e-9
 """Relative error allowed between a score and the IoUs that it is computed from."""
 
-_GET_RIGHTS = "ask whom it belongs to for the right to read it"
-
 
 @dataclass(frozen=True)
 class Fault:
-    """Fault of a file, or of a run in an archive: reason and advice, a line each."""
+    """Fault of a file, or of a run in an archive, and its reason in a line."""
 
     path: Path
     reason: str
-    advice: str
 
 
 def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
@@ -51,53 +47,23 @@ def check(source: str | Path) -> Iterator[tuple[Path, Fault | None]]:
         source: Folder of results, archive or result file.
 
     Yields:
-        Each file, or place in an archive, with its fault, or None.
+        Each file, or place in an archive, with its fault, or None. What cannot be read in an archive goes by
+        the archive's path.
 
     Raises:
         ResultsError: If there is nothing at ``source``.
     """
     for path, _ in run_files(Path(source)):
-        if not path.name.endswith(ARCHIVE_SUFFIX):
-            yield path, _check_file(path)
-            continue
-        try:
-            with opened_archive(path) as archive:
-                names = members(archive)
-        except ResultsError as error:
-            reason = _reason(error, path)
-            hidden = reason.startswith("may not be read")
-            yield path, Fault(path, reason, _GET_RIGHTS if hidden else "get it again, or pack it again")
-            continue
-        for name in names:
-            yield path / name, _check_file(path / name)
+        for entry in read_each(path, _checked):
+            if isinstance(entry, ResultsError):
+                yield path, Fault(path, str(entry).removeprefix(str(path)).lstrip(" /"))
+            else:
+                yield entry
 
 
-def _check_file(path: Path) -> Fault | None:
-    try:
-        run = read(path)
-        found = faults(run)
-    except ResultsError as error:
-        reason = _reason(error, path)
-        return Fault(path, reason, _advice(path, reason))
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
-        found = [f"its layout is not the schema's ({type(error).__name__}: {error})"]
-    return Fault(path, "; ".join(found), "run it again with force=true, or delete it") if found else None
-
-
-def _reason(error: ResultsError, path: Path) -> str:
-    return str(error).removeprefix(str(path)).strip()
-
-
-def _advice(path: Path, reason: str) -> str:
-    if reason.startswith("may not be read"):
-        return _GET_RIGHTS
-    if reason.startswith(("was written by a newer plab", "has schema version")):
-        return "read it with the plab that wrote it"
-    if path.suffix != SUFFIX or "not a plab" in reason or reason.startswith("cannot be read: it is"):
-        return "move it out of the results"
-    if path.name.endswith(PARTIAL_SUFFIX) and not (path.is_file() and h5py.is_hdf5(path)):
-        return "delete it; the run starts afresh"
-    return "delete it and run it again"
+def _checked(file: h5py.File, place: Path) -> tuple[Path, Fault | None]:
+    found = faults(run_of(file, place))
+    return place, Fault(place, "; ".join(found)) if found else None
 
 
 def faults(run: RunResult) -> list[str]:

@@ -56,7 +56,6 @@ def query(
     """
     import duckdb
 
-    sources = sources_of(source)
     try:
         statements = duckdb.extract_statements(sql)
         kinds = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
@@ -64,17 +63,15 @@ def query(
             raise QueryError(
                 'write one select, such as "select task, score from runs": results are only read'
             )
-        try:
-            return _answer(sources, sql, iterations=False)
-        except duckdb.CatalogException as error:
-            # Opening every file takes long: only for a query that names the table.
-            if "name iterations " not in str(error):
-                raise
-            return _answer(sources, sql, iterations=True)
-    except duckdb.CatalogException as error:
-        raise QueryError(f"{_one_line(error)}; there are {', '.join(_TABLES)}") from None
+        # Opening every file takes long: only for a query that names the table.
+        connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
+        with connection:
+            answer = connection.execute(sql)
+            return [column[0] for column in answer.description], answer.fetchall(), unreadable
     except duckdb.Error as error:
-        raise QueryError(_one_line(error)) from None
+        # Without hints and the drawing of the place in the query.
+        first = " ".join(str(error).partition("\n")[0].split())
+        raise QueryError(f"{first}; there are the tables {', '.join(_TABLES)}") from None
 
 
 def scores(
@@ -142,15 +139,6 @@ _NO_EVALUATION = frozenset(COLUMNS) - {"iou", "loss"}
 """Columns of a table of runs that are no scalars of the final evaluation."""
 
 
-def _answer(
-    sources: Sequence[Path], sql: str, *, iterations: bool
-) -> tuple[list[str], list[tuple[Any, ...]], list[ResultsError]]:
-    connection, unreadable = _connected(sources, iterations)
-    with connection:
-        answer = connection.execute(sql)
-        return [column[0] for column in answer.description], answer.fetchall(), unreadable
-
-
 def _connected(
     sources: Sequence[Path], iterations: bool
 ) -> tuple[duckdb.DuckDBPyConnection, list[ResultsError]]:
@@ -190,19 +178,11 @@ def _tables(found: Sequence[Row], sources: Sequence[Path]) -> dict[str, pd.DataF
                 rows["times"].append((run, name.removeprefix("seconds_"), value))
             elif value == value and name not in _NO_EVALUATION:
                 rows["evaluations"].append((run, "score" if name == "score_best" else name, value))
-    tables = {
-        name: pd.DataFrame([tuple(map(_encodable, row)) for row in table], columns=_TABLES[name])
-        for name, table in rows.items()
-    }
+    tables = {name: pd.DataFrame(table, columns=_TABLES[name]) for name, table in rows.items()}
     types = dict.fromkeys(_TEXTS, "string") | dict.fromkeys(_NUMBERS, "float64")
     tables["runs"] = tables["runs"].astype(types)
     tables["config"] = tables["config"].astype({"number": "float64"})
     return tables
-
-
-def _encodable(value: Any) -> Any:
-    # File names may hold bytes that are no UTF-8, which DuckDB refuses.
-    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
 def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
@@ -212,11 +192,6 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
         return
     for name, value in node.items():
         yield from _leaves(value, f"{key}.{name}" if key else name)
-
-
-def _one_line(error: Exception) -> str:
-    """Return DuckDB's message without its hints and its drawing of the place in the query."""
-    return " ".join(str(error).partition("\n")[0].split())
 
 
 def _value(row: Row, name: str) -> Any:

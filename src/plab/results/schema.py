@@ -24,9 +24,10 @@ SCHEMA_VERSION = 2
 STATUSES = ("running", "finished", "failed", "stopped")
 
 PARTIAL_SUFFIX = ".partial.h5"
+PROGRESS_SUFFIX = ".progress"
 REPLAY_SUFFIX = ".replay"
 ARCHIVE_SUFFIX = ".plab.zip.xz"
-"""Ends of the names of files of runs under way, of their replay buffers, and of archives."""
+"""Ends of the names of files of runs under way, of their progress and replay buffers, and of archives."""
 
 _MEASURES = ("loss", "reward", "iou", "score")
 

@@ -9,12 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import stat
 import time
 import warnings
-import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +28,6 @@ from plab.files import cache_dir
 from plab.results.examples import resolve
 from plab.results.run_file import (
     actions_of,
-    config_of,
     curves_of,
     opened,
     opened_archive,
@@ -46,6 +43,7 @@ from plab.results.schema import (
     counts_last,
     last_score,
     row_count,
+    stored_config,
 )
 
 T = TypeVar("T")
@@ -63,20 +61,10 @@ COLUMNS = (
 )
 """Columns that every table of runs has."""
 
-_ATTEMPTS = 3
-"""Maximum number of times that a folder is listed while runs end in it."""
-
 _INDEX = f".plab-index-{SCHEMA_VERSION}.parquet"
-
-_FIELDS = ("file", "identity", "member", "row", "config")
-"""Columns of the index: path below the folder, identity of the file, name in an archive (empty for a file of
-its own), and the two parts of :class:`Row` as JSON."""
 
 _SETTLED = 2.0
 """Age from which on a file's times identify its contents [s]: file systems round them."""
-
-File = tuple[Path, os.stat_result]
-"""A result file or an archive, and its status in the file system."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +86,8 @@ class Row:
 
 
 Index = dict[str, tuple[str, list[tuple[str, str, str]]]]
-"""Identity of each file, and member, row and configuration of each of its runs."""
-
-Entries = list[Row | ResultsError]
-"""Rows of a file or an archive, and what is wrong where there is none."""
+"""By the path below the folder: identity of the file, and of each of its runs the name in an archive (empty
+for a file of its own) and the two parts of :class:`Row` as JSON."""
 
 
 def load(
@@ -205,39 +191,29 @@ def read_curves(paths: Iterable[str | Path]) -> list[dict[str, np.ndarray]]:
     return [found[path] for path in wanted]
 
 
-def run_files(root: Path) -> Iterator[File]:
-    """Yield result files and archives of a folder, in the order of their names; of a file, the file itself.
-
-    Links that lead in a circle, folders named like a file, and folders that may not be searched are among
-    them: reading says what is wrong.
+def run_files(root: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Yield result files and archives of a folder with their status, in the order of their names, and folders
+    in it that may not be read; of a file, the file itself.
 
     Raises:
         ResultsError: If there is nothing at ``root``.
     """
-    try:
-        found = os.stat(root)
-    except OSError as error:
-        why = "does not exist" if not os.path.lexists(root) else f"cannot be read ({error.strerror})"
-        raise ResultsError(f"there are no results: {root} {why}") from None
-    if not stat.S_ISDIR(found.st_mode):
-        yield root, found
+    if not root.is_dir():
+        try:
+            yield root, root.stat()
+        except OSError as error:
+            why = "does not exist" if not os.path.lexists(root) else f"cannot be read ({error.strerror})"
+            raise ResultsError(f"there are no results: {root} {why}") from None
         return
     closed: list[Path] = []
     for folder, subfolders, names in os.walk(root, onerror=lambda error: closed.append(Path(error.filename))):
         subfolders.sort()
-        wrong = {name for name in subfolders if name.endswith(SUFFIX)}
-        for name in sorted(name for name in (*names, *wrong) if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
+        for name in sorted(name for name in names if name.endswith((SUFFIX, ARCHIVE_SUFFIX))):
             # By text: pathlib takes longer than the file system. A run that ends removes its partial file.
             path = os.path.join(folder, name)
             with suppress(FileNotFoundError):
-                try:
-                    status = os.stat(path)
-                except OSError:
-                    status = os.lstat(path)
-                yield Path(path), status
-    if root in closed:
-        raise ResultsError(f"there are no results: {root} may not be read")
-    yield from ((path, os.lstat(path)) for path in sorted(closed))
+                yield Path(path), os.stat(path)
+    yield from ((path, path.lstat()) for path in closed)
 
 
 def read_rows(path: Path) -> Iterator[Row | ResultsError]:
@@ -261,7 +237,8 @@ def read_each(
                 yield extract(file, path)
             return
         with opened_archive(path) as archive:
-            for name in members(archive):
+            # Other programs add folders.
+            for name in (info.filename for info in archive.infolist() if not info.is_dir()):
                 place = path / name
                 if wanted is not None and str(place) not in wanted:
                     continue
@@ -274,35 +251,30 @@ def read_each(
         yield error
 
 
-def members(archive: zipfile.ZipFile) -> list[str]:
-    """Return the names of the runs in an archive, without folders, which other programs add."""
-    return [info.filename for info in archive.infolist() if not info.is_dir()]
-
-
 def _all_rows(root: Path, index: bool) -> Iterator[Row | ResultsError]:
     """Yield the rows of all files below a folder, or of one file, from the index where it has them."""
-    for left in reversed(range(_ATTEMPTS)):
-        files = list(run_files(root))
-        present = {str(path) for path, _ in files}
-        # A finished file takes the place of its partial one.
-        files = [
-            (path, status)
-            for path, status in files
-            if not path.name.endswith(PARTIAL_SUFFIX)
-            or str(path).removesuffix(PARTIAL_SUFFIX) + SUFFIX not in present
-        ]
-        entries = _indexed(root, files) if index else [_read(path) for path, _ in files]
-        # A run that ended meanwhile has a final file in place of its partial one.
-        if None not in entries or not left:
-            break
-    for found in entries:
-        yield from found or ()
+    files = dict(run_files(root))
+    # A finished file takes the place of its partial one.
+    for path in [path for path in files if path.name.endswith(PARTIAL_SUFFIX)]:
+        if _final(path) in files:
+            del files[path]
+    if index:
+        yield from _indexed(root, files)
+    else:
+        for path in files:
+            yield from _read(path)
 
 
-def _read(path: Path) -> Entries | None:
-    """Return the rows of a file, None if it is gone: a run that ends removes its partial file."""
+def _final(partial: Path) -> Path:
+    return partial.with_name(partial.name.removesuffix(PARTIAL_SUFFIX) + SUFFIX)
+
+
+def _read(path: Path) -> list[Row | ResultsError]:
+    """Return the rows of a file, of a partial one that has been replaced meanwhile those of the final one."""
     entries = list(read_rows(path))
-    return entries if os.path.lexists(path) else None
+    if not path.exists():
+        return list(read_rows(_final(path))) if _final(path).exists() else []
+    return entries
 
 
 def _without_repetitions(found: list[Row]) -> list[Row]:
@@ -327,7 +299,7 @@ def _without_repetitions(found: list[Row]) -> list[Row]:
 
 def _row(file: h5py.File, path: Path) -> Row:
     """Return the row of an open file, all of whose columns and actions can be read."""
-    config, summary, columns = config_of(file), summary_of(file), curves_of(file)
+    config, summary, columns = stored_config(file.attrs["config"]), summary_of(file), curves_of(file)
     actions_of(file)
     # A method's section that cannot be counted is named here, not where a table is made.
     row_count(config["method"])
@@ -357,38 +329,38 @@ def _row(file: h5py.File, path: Path) -> Row:
 # ------------------------------------------------------------------------------------------------------ index
 
 
-def _indexed(root: Path, files: Sequence[File]) -> list[Entries | None]:
-    """Return the rows of each file below a folder, from the index where the file has not changed."""
+def _indexed(root: Path, files: Mapping[Path, os.stat_result]) -> Iterator[Row | ResultsError]:
+    """Yield the rows of files below a folder, from the index where a file has not changed."""
     place = _index_place(root)
     known = _stored(place)
     now, changed = time.time(), False
-    found: list[Entries | None] = []
     kept: Index = {}
-    for path, status in files:
-        name, identity = os.path.relpath(path, root), _identity(status)
+    for path, status in files.items():
+        name = os.path.relpath(path, root)
+        # The time of the last change of the inode cannot be set back, unlike the modification time.
+        identity = f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
         entry = known.get(name)
         if entry is not None and entry[0] == identity:
             kept[name] = entry
-            found.append([_restored(path, *parts) for parts in entry[1]])
+            for member, values, config in entry[1]:
+                # The same folder may have another path in the next call.
+                own_path = str(path / member) if member else str(path)
+                yield Row(json.loads(values) | {"path": own_path}, json.loads(config))
             continue
-        found.append(own := _read(path))
+        own = _read(path)
+        yield from own
+        found = [row for row in own if isinstance(row, Row) and row.path.is_relative_to(path)]
         # Damaged files are read again: the message is part of the result.
-        if own and now - status.st_mtime >= _SETTLED and all(isinstance(row, Row) for row in own):
-            kept[name] = identity, [_stored_parts(path, row) for row in own if isinstance(row, Row)]
+        if own and len(found) == len(own) and now - status.st_mtime >= _SETTLED:
+            kept[name] = identity, [_index_entry(path, row) for row in found]
             changed = True
     if changed or len(kept) < len(known):
         _write(place, kept)
-    return found
 
 
-def _stored_parts(path: Path, row: Row) -> tuple[str, str, str]:
+def _index_entry(path: Path, row: Row) -> tuple[str, str, str]:
     member = row.path.relative_to(path).as_posix() if row.path != path else ""
     return member, json.dumps(row.values | {"path": ""}), json.dumps(row.config)
-
-
-def _identity(status: os.stat_result) -> str:
-    # The time of the last change of the inode cannot be set back, unlike the modification time.
-    return f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns} {status.st_ino}"
 
 
 def _index_place(root: Path) -> Path:
@@ -400,24 +372,17 @@ def _index_place(root: Path) -> Path:
 
 
 def _stored(place: Path) -> Index:
-    """Return identity and runs of each file in the index; nothing if it is missing or damaged."""
+    """Return the index; nothing if it is missing or damaged."""
     if not place.exists():
         return {}
     import duckdb
 
     known: Index = {}
     with suppress(duckdb.Error), duckdb.connect() as connection:
-        query = f"SELECT {', '.join(_FIELDS)} FROM read_parquet(?)"
+        query = "SELECT file, identity, member, row, config FROM read_parquet(?)"
         for file, identity, *parts in connection.execute(query, [str(place)]).fetchall():
             known.setdefault(file, (identity, []))[1].append(tuple(parts))
     return known
-
-
-def _restored(path: Path, member: str, row: str, config: str) -> Row:
-    values = json.loads(row)
-    # The same folder may have another path in the next call.
-    values["path"] = str(path / member) if member else str(path)
-    return Row(values, json.loads(config))
 
 
 def _write(place: Path, entries: Index) -> None:
@@ -429,7 +394,8 @@ def _write(place: Path, entries: Index) -> None:
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         with duckdb.connect() as connection:
-            connection.register("entries", pd.DataFrame(table, columns=list(_FIELDS), dtype=object))
+            columns = ["file", "identity", "member", "row", "config"]
+            connection.register("entries", pd.DataFrame(table, columns=columns, dtype=object))
             target = str(temporary).replace("'", "''")
             connection.execute(f"COPY entries TO '{target}' (FORMAT parquet, COMPRESSION zstd)")
         os.replace(temporary, place)

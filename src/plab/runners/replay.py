@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from plab.results import ResultsError
-from plab.results.run_file import cause
 from plab.runners.libraries import torch
 
 if TYPE_CHECKING:
@@ -130,8 +129,7 @@ class ReplayBuffer:
                     for part in self._parts(agent, episode):
                         file.write(part.cpu().numpy().data)
         except OSError as error:
-            size = 4 * (last - since) * self._sizes.entries
-            raise ResultsError(f"cannot write the replay buffer {path}: {cause(error, size)}") from error
+            raise ResultsError(f"cannot write the replay buffer {path}: {error.strerror or error}") from error
         self._written[agent] = last
 
     def read(self, paths: Sequence[Path], added: int) -> None:

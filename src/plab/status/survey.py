@@ -15,8 +15,8 @@ from typing import Any, TypeAlias, cast
 from plab.config.selection import Selection, SelectionError, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.results import ResultsError, Row, row_count
-from plab.results.locks import held
 from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
+from plab.results.running import held
 from plab.results.schema import parse_member
 from plab.results.table import readable_rows, sources_of
 

@@ -21,8 +21,8 @@ import plab
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
 from plab.files import DAMAGE, one_line
-from plab.results.provenance import now
 from plab.results.run_file import replace_file
+from plab.results.running import now
 from plab.scenes import PRECISIONS
 from plab.submissions.submission import (
     SUFFIX,

@@ -23,7 +23,7 @@ from plab.config.words import combinations, parse
 from plab.errors import tell
 from plab.plugins import passed_on
 from plab.results import ResultsError, RunFile, read
-from plab.results.locks import held, lock_path
+from plab.results.running import held, lock_path
 from plab.results.schema import PARTIAL_SUFFIX
 from plab.runners.runner import SimulatorCache
 from plab.runners.tracks import Outcome, report

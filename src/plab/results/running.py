@@ -1,0 +1,459 @@
+"""Run under way: its file, checkpoints, resumption, lock and provenance.
+
+A lock is the operating system's (``flock``, on Windows ``msvcrt``) on ``<run>.lock`` beside the run's files.
+It ends with its process, so a lock file that is left behind is not locked. On a network file system it holds
+among all machines where the file system has locks, as NFS, Lustre (mounted with ``flock``) and GPFS do; where
+it has none, no run is computed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import functools
+import itertools
+import json
+import logging
+import math
+import os
+import platform
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filelock import FileLock, SoftFileLock, Timeout
+
+from plab.config.identity import config_dict, config_hash, member_name
+from plab.results.run_file import read, replace_file, write
+from plab.results.schema import (
+    PARTIAL_SUFFIX,
+    PROGRESS_SUFFIX,
+    REPLAY_SUFFIX,
+    NewerSchemaError,
+    ResultsError,
+    RunBusyError,
+    RunResult,
+)
+
+_PROGRESS_EVERY = 1.0
+"""Interval at which a run writes its progress beside its file [s]."""
+
+_PROBE_BYTES = 4 << 20
+"""Room demanded in the results folder before a run starts: a partial, its successor and the final file."""
+
+_log = logging.getLogger(__name__)
+
+
+class RunFile:
+    """Result file of one run while it runs: resumes an earlier process's state, records, finishes.
+
+    Unless the run is complete already, it holds the run's lock until it is closed, finished or released.
+
+    Attributes:
+        path: Final file.
+        partial_path: File that carries the state of the run while it is under way.
+    """
+
+    def __init__(self, cfg: Any) -> None:
+        """Open the file of a configuration's run.
+
+        Raises:
+            RunBusyError: If somebody else computes the run.
+            NewerSchemaError: If a later plab has written a file of the run.
+            ResultsError: If the folder cannot be written or has no room, before anything is computed.
+        """
+        config = config_dict(cfg)
+        digest = config_hash(config)
+        self.path = Path(config["results_dir"]) / member_name(config, digest)
+        self.partial_path = self.path.with_suffix(PARTIAL_SUFFIX)
+        # Result and rows that are not yet in its columns. One object: an interrupt may arrive between any two
+        # assignments.
+        known = RunResult(config, digest, provenance=provenance(config))
+        self._state: tuple[RunResult, tuple[Mapping[str, float], ...]] = known, ()
+        self._every, self._written = config["checkpoint_seconds"], -math.inf
+        self._progress, self._reported = self.path.with_suffix(PROGRESS_SUFFIX), time.monotonic()
+        self._lock: Lock | None = None
+        # Files and number of iterations of earlier processes.
+        self._found: set[Path] = set()
+        self._known = 0
+        earlier = self._finished_earlier()
+        if earlier is not None and not config["force"]:
+            self._state = earlier, ()
+            if lock_path(self.path).exists() or self.partial_path.exists():
+                self._clear_up()
+            return
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # A file without a name, of which a process that is killed leaves nothing.
+            with tempfile.TemporaryFile(dir=self.path.parent) as probe:
+                probe.write(bytes(_PROBE_BYTES))
+            self._lock_and_resume(config["force"])
+        except OSError as error:
+            self._let_go()
+            why = error.strerror or error
+            raise ResultsError(f"cannot write results to {self.path.parent}: {why}") from error
+        except BaseException:
+            self._let_go()
+            raise
+
+    def _lock_and_resume(self, force: bool) -> None:
+        # Files are looked at under the lock: its last holder may have changed everything.
+        self._lock = acquire(self.path)
+        if self._lock is None:
+            raise RunBusyError(f"{self.path} is being computed by another process")
+        # With force the replay buffer of a partial file is about to be replaced.
+        self._remove(*([PARTIAL_SUFFIX] if force else []))
+        if not force:
+            self._take_up_earlier()
+        if self.finished:
+            self.release()
+            return
+        self._found = set(self._files())
+        self._known = self._state[0].rows
+
+    def _clear_up(self) -> None:
+        """Remove files left by a process that was killed just after it had finished the run."""
+        # Where nothing can be removed it stays. A held lock means that the run is being computed again.
+        with suppress(OSError):
+            if (lock := acquire(self.path)) is not None:
+                self._remove(REPLAY_SUFFIX, PARTIAL_SUFFIX)
+                lock.release()
+
+    def _files(self) -> list[Path]:
+        """Return the files of the run beside its lock, whoever has made them."""
+        stem, lock = f"{self.path.stem}.", lock_path(self.path)
+        return [path for path in self.path.parent.iterdir() if path.name.startswith(stem) and path != lock]
+
+    def _remove(self, *suffixes: str) -> None:
+        """Remove temporary files of the run, and those with the given suffixes."""
+        for path in self._files():
+            if path.name.endswith((".tmp", PROGRESS_SUFFIX, *suffixes)):
+                path.unlink(missing_ok=True)
+
+    def withdraw(self) -> None:
+        """Let go of a run that is refused, and remove its files, unless it can resume from them.
+
+        Files of an earlier process stay.
+        """
+        if self._lock is not None and not self.partial_path.exists():
+            for path in set(self._files()) - self._found:
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    with suppress(OSError):
+                        path.unlink(missing_ok=True)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self.release()
+        with suppress(OSError):
+            # Of method, task and results, up to one that is not empty.
+            for folder in self.path.parents[:3]:
+                folder.rmdir()
+
+    @property
+    def result(self) -> RunResult:
+        """Result so far; from an earlier process where there was one."""
+        known, rows = self._state
+        if rows:
+            self._state = dataclasses.replace(known, columns=_extended(known.columns, rows)), ()
+        return self._state[0]
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run is complete, by this process or an earlier one."""
+        return self._state[0].status == "finished"
+
+    @property
+    def advanced(self) -> bool:
+        """Whether this process has computed an iteration of the run."""
+        return self.result.rows > self._known
+
+    def release(self) -> None:
+        """Let go of the run's lock, so that another process may resume it; nothing may be written after."""
+        if self._lock is not None:
+            with suppress(OSError):
+                self._progress.unlink(missing_ok=True)
+            self._lock.release()
+
+    def spend(self, name: str, seconds: float) -> None:
+        """Add to the wall time of a phase."""
+        times = self._state[0].wall_time
+        times[name] = times.get(name, 0.0) + seconds
+
+    def record(
+        self, row: Mapping[str, float], resume: Mapping[str, Any], *, keep: bool = False, **changes: Any
+    ) -> None:
+        """Append a row to the iterations, and rewrite the partial file if ``checkpoint_seconds`` are over.
+
+        Args:
+            row: Column name to number; the same columns in every call.
+            resume: State from which the next iteration starts: nested dictionaries of arrays, numbers and
+                strings.
+            keep: Write the partial file in any case.
+            changes: Other fields of :class:`RunResult` to set, such as ``best_actions``.
+        """
+        known, rows = self._state
+        self._state = dataclasses.replace(known, resume=dict(resume), **changes), (*rows, dict(row))
+        now = time.monotonic()
+        if keep or now - self._written >= self._every:
+            self._write()
+        if now - self._reported >= _PROGRESS_EVERY:
+            self._reported = now
+            self._report(row)
+
+    def _report(self, row: Mapping[str, float]) -> None:
+        """Write the progress for ``plab status``: rows, episodes, and the score of the best row."""
+        known = self.result
+        score = known.columns.get("score", np.full(known.rows, math.nan))[known.best_iteration]
+        content = {"rows": known.rows, "episodes": row.get("episodes", 0), "score": score}
+        # A full disk ends a run at its next checkpoint, not here.
+        with suppress(ResultsError):
+            replace_file(self._progress, json.dumps(content, default=float).encode(), sync=False)
+
+    def close(self, status: str, message: str) -> None:
+        """Mark an unfinished run ``failed`` or ``stopped``, and keep its state in the partial file."""
+        self._state = dataclasses.replace(self.result, status=status, message=message), ()
+        try:
+            self._write()
+        finally:
+            self.release()
+
+    def _write(self) -> None:
+        write(self.result, self.partial_path)
+        self._written = time.monotonic()
+
+    def finish(self, evaluation: Mapping[str, float], masses: Mapping[str, np.ndarray]) -> None:
+        """Write the final file, with the scalars of the evaluation and more mass tensors, each of shape
+        [n, n, n], and remove the partial one."""
+        result = dataclasses.replace(
+            self.result,
+            status="finished",
+            message="",
+            evaluation={name: float(value) for name, value in evaluation.items()},
+            masses={**self.result.masses, **masses},
+            resume=None,
+            path=self.path,
+        )
+        write(result, self.path, compress=True)
+        self._state = result, ()
+        # What cannot be removed is left to the next process.
+        with suppress(OSError):
+            self.partial_path.unlink(missing_ok=True)
+        self.release()
+
+    def _finished_earlier(self) -> RunResult | None:
+        try:
+            earlier = read(self.path)
+        except NewerSchemaError:
+            raise
+        except ResultsError:
+            # Missing or damaged files are dealt with under the lock.
+            return None
+        same = earlier.config_hash == self._state[0].config_hash
+        return earlier if same and earlier.status == "finished" else None
+
+    def _take_up_earlier(self) -> None:
+        """Continue from an earlier process's state; files that cannot be used are moved aside."""
+        if (done := self._finished_earlier()) is not None:
+            self._state = done, ()
+            return
+        for path in (self.path, self.partial_path):
+            if not path.exists():
+                continue
+            try:
+                earlier = read(path)
+                if earlier.config_hash != self.result.config_hash:
+                    raise ResultsError(f"{path} belongs to another configuration")
+            except NewerSchemaError:
+                raise
+            except ResultsError as error:
+                _move_aside(path, error)
+                continue
+            if earlier.resume is None:
+                continue
+            before, now = earlier.provenance, self.result.provenance
+            versions = (*(name.removesuffix("-core") for name in _PACKAGES), "python", "git_commit")
+            if changed := [name for name in versions if before.get(name) != now[name]]:
+                listed = ", ".join(f"{name} {before.get(name)} -> {now[name]}" for name in changed)
+                _log.warning("resuming %s, begun with other versions: %s", self.partial_path, listed)
+            origin = before | {"resumed": int(before.get("resumed", 0)) + 1}
+            known = dataclasses.replace(earlier, status="running", message="", provenance=origin, path=None)
+            self._state = known, ()
+
+
+def _extended(
+    columns: Mapping[str, np.ndarray], rows: Sequence[Mapping[str, float]]
+) -> dict[str, np.ndarray]:
+    """Return columns, shape [iteration] each, with more rows; missing values are NaN."""
+    known = len(next(iter(columns.values()), ()))
+    extended = {}
+    for name in dict.fromkeys((*columns, *rows[0])):
+        new = [row.get(name, math.nan) for row in rows]
+        # Counts stay integers, all else is float64, whatever type of number a method gives.
+        counts = all(isinstance(number, int | np.integer) for number in new)
+        added = np.array(new, np.int64 if counts else np.float64)
+        before = columns.get(name, np.full(known, math.nan))
+        extended[name] = np.concatenate([before, added]) if known else added
+    return extended
+
+
+def _move_aside(path: Path, reason: ResultsError) -> None:
+    names = (f"{path.name}.bad{number or ''}" for number in itertools.count())
+    aside = next(aside for name in names if not (aside := path.with_name(name)).exists())
+    os.replace(path, aside)
+    _log.warning("%s; moved to %s, starting afresh", reason, aside.name)
+
+
+# ------------------------------------------------------------------------------------------------------ locks
+
+_PATIENCE = 0.2
+"""Time that :func:`acquire` tries [s]: longer than :func:`held` holds a lock."""
+
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of file systems without locks."""
+
+
+class Lock:
+    """A lock that this process holds until :meth:`release`, or until nothing refers to this object."""
+
+    def __init__(self, lock: FileLock) -> None:
+        self._lock = lock
+
+    def release(self) -> None:
+        """Let go of the lock and remove its file; does nothing the second time."""
+        if self._lock.is_locked:
+            # Windows does not remove open files, and a disk may have become read-only: an empty file stays.
+            with suppress(OSError):
+                Path(self._lock.lock_file).unlink(missing_ok=True)
+            self._lock.release()
+
+
+def lock_path(path: str | Path) -> Path:
+    """Return the lock file of a run, by its final or partial result file."""
+    path = Path(path)
+    return path.with_name(path.name.removesuffix(".h5").removesuffix(".partial") + ".lock")
+
+
+def acquire(path: str | Path) -> Lock | None:
+    """Take the lock of a run, by its final or partial result file, whose folder exists.
+
+    Returns:
+        The lock, or None if another process, or another lock object of this process, holds it.
+
+    Raises:
+        OSError: If the lock file cannot be made, or its file system has no locks.
+    """
+    try:
+        return _locked(lock_path(path), _PATIENCE)
+    except Timeout:
+        return None
+
+
+def held(path: str | Path) -> bool:
+    """Return whether somebody computes a run at this moment, by its final or partial result file."""
+    file = lock_path(path)
+    if not file.exists():
+        return False
+    try:
+        # Nobody's: a killed process has left it, or its holder has removed it just before it was opened.
+        _locked(file, 0.0).release()
+    except Timeout:
+        return True
+    except OSError as error:
+        # Without locks nobody computes. A file that may not even be opened is somebody else's.
+        return error.errno not in (*_NO_LOCKS, errno.EROFS)
+    return False
+
+
+def _locked(file: Path, timeout: float) -> Lock:
+    lock = FileLock(file, timeout=timeout, poll_interval=_PATIENCE / 8, thread_local=False)
+    with warnings.catch_warnings():
+        # About the soft lock that is used where there are no locks.
+        warnings.simplefilter("ignore")
+        lock.acquire()
+    if isinstance(lock, SoftFileLock):
+        # A soft lock that a killed process leaves is never free.
+        lock.release()
+        raise OSError(errno.ENOSYS, "its file system has no locks: choose another results_dir")
+    return Lock(lock)
+
+
+# ------------------------------------------------------------------------------------------------- provenance
+
+_PACKAGES = ("plab", "taichi", "torch", "numpy", "gymnasium", "stable_baselines3", "h5py", "hydra-core")
+"""Distributions whose versions are recorded. They are not imported: torch alone takes seconds."""
+
+
+def provenance(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe the run that starts now.
+
+    Args:
+        config: Resolved configuration; gives device, precision and seed.
+
+    Returns:
+        Flat scalars: versions, platform, commit, device, precision, seed, start time. ``git_commit`` is empty
+        where plab does not run from its repository.
+    """
+    commit, dirty = _git()
+    return {
+        **{name.removesuffix("-core"): _version(name) for name in _PACKAGES},
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "processor": _processor() or platform.processor(),
+        "cpu_count": os.cpu_count() or 0,
+        "git_commit": commit,
+        "git_dirty": dirty,
+        "device": config["sim"]["device"],
+        "precision": config["sim"]["precision"],
+        "seed": config["seed"],
+        "start_time": now(),
+        "resumed": 0,
+    }
+
+
+def now() -> str:
+    """Return the time as results state it: UTC, ISO 8601, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _processor() -> str:
+    """Return the CPU's model name on Linux, an empty text elsewhere."""
+    with suppress(OSError):
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        return found[1].strip() if found else ""
+    return ""
+
+
+@functools.cache
+def _git() -> tuple[str, bool]:
+    """Return the commit of plab's own repository ("" outside one), and whether tracked files differ."""
+    here = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        # An installed plab may lie inside somebody else's repository, whose commit says nothing about it.
+        git("ls-files", "--error-unmatch", here.name)
+        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.SubprocessError):
+        return "", False
