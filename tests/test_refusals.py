@@ -61,7 +61,7 @@ COMPOSED = {
     "variant=random7": "did you mean random?",
     "method=sac method.profile=papr": "did you mean paper?",
     "method.family=nofamily": "method.family 'nofamily'",
-    "method=sac method.algorithm=ppo": "PpoConfig",
+    "method=sac method.algorithm=ppo": "method.buffer_size",
     # keys
     "tsk=Move": "did you mean task?",
     "lr=0.1": "did you mean method.lr?",
@@ -88,7 +88,7 @@ COMPOSED = {
     "task.random.ranges.pillar.low=[0,0,0]": "task.random.ranges.pillar.low",
     "task.manipulators.pillar.position=[0,0,0]": "task.variants.1.manipulators.pillar.position",
     "variant=random task.variants.1.manipulators.pillar.position=[0.4,0,0.5]": "variant=random",
-    "task.release.yield_stress=3": "protocol.numbers=release",
+    "task.release.yield_stress=3": "protocol.numbers=plab",
     "variant=random targets.source=.": "targets.source",
     "targets.source=files task.target.radius=0.2": "task.target.radius=0.2",
 }

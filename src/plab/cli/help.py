@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from plab.config import EXPERIMENT, GROUPS, choices, conf_folder
-from plab.config.families import schemas
 
 _USAGE = """\
 plab run [KEY=VALUE ...] [-m]
@@ -87,18 +86,10 @@ def full_help_text(config_dir: str | None = None) -> str:
             title = next(line for line in lines if not line.startswith("# @package")).lstrip("# ")
             parts.append(f"  {sign}{group}={name:<10} {title}")
         parts.append("")
-    methods = choices("method", config_dir)
-    own = [name for name in methods if name not in choices("method")]
     folder = conf_folder()
     files = {"KEYS, with their defaults": folder / "config.yaml"}
-    files |= {
-        f"  of {name}": folder / f"{name}.yaml" for name in ("protocol/plab", "sim/fast", "method/adam")
-    }
-    named = [name for name, _ in schemas() if name in methods]
-    files |= {
-        f"  of method={name}; what has no value here takes the profile's": methods[name] for name in named
-    }
-    files |= {f"  of method={name}": methods[name] for name in own}
+    files |= {f"  of {name}": folder / f"{name}.yaml" for name in ("protocol/plab", "sim/fast")}
+    files |= {f"  of method={name}": path for name, path in choices("method", config_dir).items()}
     files["  of the task; here of Rope"] = folder / "task" / "Rope.yaml"
     for heading, path in files.items():
         parts += [f"{heading}:", *(line for _, line in _keys(path, _LONG))]

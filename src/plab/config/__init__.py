@@ -11,7 +11,6 @@ from plab.errors import ConfigError
 
 if TYPE_CHECKING:
     from plab.config.compose import *
-    from plab.config.method import *
     from plab.config.run import *
     from plab.config.suite import conf_folder
     from plab.config.task import *
@@ -44,7 +43,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import a part of the configuration when it is asked for."""
     # The types first: composing needs them while it is imported.
-    for part in ("method", "task", "run", "suite", "compose") if name in __all__ else ():
+    for part in ("task", "run", "suite", "compose") if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")
         if name in module.__all__:
             return getattr(module, name)

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra import version
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -24,15 +24,14 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import Override, OverrideType
-from hydra.errors import MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config.families import family, schema
+from plab.config.families import family
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.config.variants import RANDOM, draw_variant, merge_variant, undone_key, variant_changes
+from plab.config.variants import RANDOM, draw_variant, merge_variant, variant_changes
 from plab.config.words import COMPOSE_ERRORS, explain, parse, prepared, quoted
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
@@ -65,7 +64,7 @@ EXPERIMENT = "experiment"
 
 @dataclasses.dataclass
 class _Composed(Config):
-    """A configuration as Hydra composes it: of which type the method is, its YAML says."""
+    """A configuration as Hydra composes it, with a method that has no type yet."""
 
     method: Any
 
@@ -134,15 +133,11 @@ def load_config(
     return finish(compose(words, config_dir), words, alone=alone)
 
 
-_KEPT: dict[tuple[str, ...], bytes] = {}
-"""Configurations composed of plab's own files, which do not change, by the overrides that choose files."""
+_KEPT: dict[tuple[Any, ...], bytes] = {}
+"""Composed configurations by the overrides that choose files and the state of the user's files."""
 
 
-def compose(
-    words: Sequence[str],
-    config_dir: str | Path | None = None,
-    kept: dict[tuple[str, ...], bytes] | None = None,
-) -> DictConfig:
+def compose(words: Sequence[str], config_dir: str | Path | None = None) -> DictConfig:
     """Return what Hydra composes of prepared overrides, without Hydra's own section.
 
     Hydra takes a tenth of a second. What differs in values only is composed once, and the values are set
@@ -151,19 +146,18 @@ def compose(
     Args:
         words: Prepared overrides.
         config_dir: Folder with files of the user's own.
-        kept: What was composed before; None: of plab's own files what this process has composed.
 
     Raises:
         ConfigError: If an override or a file does not fit.
     """
-    if kept is None:
-        kept = _KEPT if config_dir is None else {}
     parsed = parse(words)
     values = [one for one in parsed if _sets_a_value(one)]
-    files = tuple(str(one.input_line) for one in parsed if one not in values)
-    if files not in kept:
-        kept[files] = pickle.dumps(_without_hydra(compose_with_hydra(files, config_dir)))
-    config: DictConfig = pickle.loads(kept[files])
+    files = [str(one.input_line) for one in parsed if one not in values]
+    own = [] if config_dir is None else Path(config_dir).expanduser().glob("*/*.yaml")
+    state = *files, config_dir, *((path, path.stat().st_mtime_ns) for path in own)
+    if state not in _KEPT:
+        _KEPT[state] = pickle.dumps(_without_hydra(compose_with_hydra(files, config_dir)))
+    config: DictConfig = pickle.loads(_KEPT[state])
     try:
         for override in values:
             OmegaConf.update(config, override.key_or_group, override.value(), merge=True)
@@ -184,21 +178,8 @@ def compose_with_hydra(words: Sequence[str], config_dir: str | Path | None = Non
             from_shell=False,
             with_log_configuration=False,
         )
-    except MissingConfigException as error:
-        # Types of methods are imported when a file asks for them: all of them take half a second.
-        group, _, name = str(error.missing_cfg_file).rpartition("/")
-        node = schema(name) if group == "schema/method" else None
-        if node is None or name in _SCHEMAS:
-            raise ConfigError(explain(error)) from None
-        _SCHEMAS.add(name)
-        ConfigStore.instance().store(group=group, name=name, node=node)
-        return compose_with_hydra(words, config_dir)
     except COMPOSE_ERRORS as error:
         raise ConfigError(explain(error)) from None
-
-
-_SCHEMAS: set[str] = set()
-"""Types of methods that Hydra knows; a group of their own, so that ``method=`` offers real methods only."""
 
 
 def hydra_app() -> Hydra:
@@ -284,17 +265,17 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
         ConfigError: If a value is missing, of the wrong type or out of range.
     """
     try:
-        composed.method = _typed_method(composed.method)
+        composed.method = _typed_method(composed.method, "method")
         _reject_unknown(composed, "")
         # Hydra closes every dictionary; a variant may add a body. Keys of dataclasses stay closed.
         OmegaConf.set_struct(composed, None)
-        _require_effect(composed, parse(words), alone)
+        overrides = parse(words)
+        _require_effect(composed, overrides, alone)
         _choose_profile(composed.method)
         if "lr_by_task" in composed.method:
             _resolve(composed.method, TABLES)
-        _choose_numbers(composed, words)
-        _choose_variant(composed, words)
-        merge_variant(composed.task, composed.variant)
+        _choose_numbers(composed, overrides)
+        _choose_variant(composed, overrides)
         parts = vars(OmegaConf.to_object(composed))
     except OmegaConfBaseException as error:
         raise ConfigError(explain(error)) from None
@@ -411,33 +392,31 @@ def cuda_devices() -> int:
 # ---------------------------------------------------------------------------------------------------- details
 
 
-def _typed_method(method: DictConfig) -> DictConfig:
-    """Return the section ``method`` with the types of its family, unless its YAML has chosen them.
-    ConfigError if there is no such family, or the section is of another one's type; an
+def _typed_method(method: DictConfig, path: str) -> DictConfig:
+    """Return a section ``method`` with the types of its family; ConfigError if there is no such family, an
     OmegaConfBaseException if a key or a value does not fit."""
     if not isinstance(method, DictConfig) or "family" not in method:
-        raise ConfigError("method.family has no value: name the family, or its module:NAME")
-    record, rule = family(str(method.family)), method.get("algorithm")
-    wanted, chosen = record.config_type(rule), OmegaConf.get_type(method)
-    if not dataclasses.is_dataclass(chosen):
-        # Below a root, so that what is wrong is named method.<key>.
-        root = OmegaConf.create({"method": OmegaConf.structured(wanted)})
-        root.merge_with({"method": method})
-        return root.method
-    if not issubclass(cast(type, chosen), wanted):
-        has, needs = cast(type, chosen).__name__, wanted.__name__
-        raise ConfigError(f"method has the keys of {has}: with its family or algorithm go those of {needs}")
-    return method
+        raise ConfigError(f"{path}.family has no value: name the family, or its module:NAME")
+    if isinstance(stages := method.get("stages"), DictConfig):
+        for name in stages:
+            stages[name] = _typed_method(stages[name], f"{path}.stages.{name}")
+    kind = family(str(method.family)).config_type(method.get("algorithm"))
+    # Below a root, so that what is wrong is named by its whole key.
+    root = OmegaConf.create({})
+    OmegaConf.update(root, path, OmegaConf.structured(kind))
+    OmegaConf.select(root, path).merge_with(method)
+    return OmegaConf.select(root, path)
 
 
 def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: bool) -> None:
-    """Refuse overrides of what goes with another variant, profile or task than the chosen ones."""
-    task, method, variant = composed.task, composed.method, composed.variant
+    """Refuse overrides of what goes with another variant, profile, protocol or task than the chosen ones."""
+    task, method, variant, protocol = composed.task, composed.method, composed.variant, composed.protocol
+    # By section: the choice that it goes with, and which of its entries counts, if any does.
     used: dict[str, tuple[str, str | None]] = {}
     if alone:
         used["method.profiles."] = f"method.profile={method.get('profile')}", method.get("profile")
         for table, key in TABLES.items():
-            chosen, tasks = composed.protocol[key], method.get(table, {}).get(composed.protocol[key])
+            chosen, tasks = protocol[key], method.get(table, {}).get(protocol[key])
             used[f"method.{table}."] = f"protocol.{key}={chosen}", chosen
             if isinstance(tasks, DictConfig):
                 own = "other" if "other" in tasks and task.name not in tasks else task.name
@@ -446,13 +425,27 @@ def _require_effect(composed: DictConfig, overrides: Sequence[Override], alone: 
         # Of the variants a random one uses that which gives what is not drawn, if any.
         chosen = task.random.get("variant") if variant == RANDOM else variant
         used |= dict.fromkeys(("task.variants.", "task.release.variants."), (f"variant={variant}", chosen))
+    if variant != RANDOM:
+        used |= dict.fromkeys(("task.random.", "seed_scene."), (f"variant={variant}", None))
+    if protocol.numbers != "release":
+        used["task.release."] = f"protocol.numbers={protocol.numbers}", None
+    if composed.targets.source is not None:
+        used["task.target."] = "targets.source", None
     for override in overrides:
-        key = override.key_or_group
+        key = f"{override.key_or_group}."
         for section, (choice, name) in used.items():
             if key.startswith(section) and key.removeprefix(section).partition(".")[0] != name:
                 raise ConfigError(f"'{override.input_line}' has no effect with {choice}")
-        if composed.targets.source is not None and f"{key}.".startswith("task.target."):
-            raise ConfigError(f"'{override.input_line}' has no effect with targets.source")
+
+
+def _refuse_undone(
+    overrides: Sequence[Override], changes: DictConfig, choice: str, place: str = "task.random"
+) -> None:
+    """Refuse overrides of keys of the task that ``changes`` set again."""
+    for override in overrides:
+        group, _, key = override.key_or_group.partition(".")
+        if group == "task" and key and OmegaConf.select(changes, key) is not None:
+            raise ConfigError(f"task.{key} is set by {choice}: override {place}.{key}")
 
 
 def _choose_profile(method: DictConfig) -> None:
@@ -476,34 +469,26 @@ def _resolve(section: DictConfig, tables: Iterable[str]) -> None:
         section[table] = {}
 
 
-def _choose_numbers(composed: DictConfig, overrides: Sequence[str]) -> None:
+def _choose_numbers(composed: DictConfig, overrides: Sequence[Override]) -> None:
     """Put the release's numbers into the task if they are asked for, and forget them otherwise."""
-    changes = composed.task.release
     if composed.protocol.numbers == "release":
-        if key := undone_key(changes, overrides):
-            raise ConfigError(f"task.{key} is set by protocol.numbers=release: override task.release.{key}")
-        composed.task.merge_with(changes)
-    elif unused := [o for o in overrides if o.lstrip("+").startswith("task.release.")]:
-        raise ConfigError(f"'{unused[0]}' has no effect without protocol.numbers=release")
+        _refuse_undone(overrides, composed.task.release, "protocol.numbers=release", "task.release")
+        composed.task.merge_with(composed.task.release)
     composed.task.release = {}
 
 
-def _choose_variant(composed: DictConfig, overrides: Sequence[str]) -> None:
-    """Draw the variant if it is to be random, and refuse overrides that have no effect with this one."""
+def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None:
+    """Put the variant into the task, drawn if it is to be random, and forget the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
         drawn = draw_variant(task, composed.seed_scene)
-        if key := undone_key(drawn, overrides):
-            raise ConfigError(f"task.{key} is set by variant=random: override what task.random says")
+        _refuse_undone(overrides, drawn, "variant=random")
         composed.variant = f"{RANDOM}{composed.seed_scene}"
         task.variants = {composed.variant: drawn}
-        return
-    if key := undone_key(variant_changes(task, name), overrides):
-        raise ConfigError(f"task.{key} is set by variant {name}: override task.variants.{name}.{key}")
-    for override in parse(overrides):
-        if override.key_or_group == "seed_scene" or f"{override.key_or_group}.".startswith("task.random."):
-            raise ConfigError(f"'{override.input_line}' has no effect without variant=random")
-    composed.seed_scene = None
+    else:
+        _refuse_undone(overrides, variant_changes(task, name), f"variant={name}", f"task.variants.{name}")
+        composed.seed_scene = None
+    merge_variant(task, composed.variant)
 
 
 def _reject_unknown(node: Any, path: str) -> None:

@@ -8,7 +8,8 @@ These files import no large library before they need it, so that looking up a re
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections import UserDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -25,7 +26,6 @@ __all__ = [
     "Rule",
     "family",
     "known_family",
-    "schemas",
 ]
 
 RL, GRADIENT = "RL", "gradient"
@@ -114,23 +114,13 @@ class Family:
         return load_object(self.runner, type) if isinstance(self.runner, str) else self.runner
 
 
-class _Registry(dict[str, Any]):
+class _Registry(UserDict[str, Any]):
     """Records by name, each imported when it is first asked for."""
 
     def __getitem__(self, name: str) -> Family:
-        record = super().__getitem__(name)
-        if isinstance(record, str):
-            self[name] = record = load_object(record, Family)
-        return record
-
-    def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self else default
-
-    def values(self) -> Iterator[Family]:  # type: ignore[override]
-        return (self[name] for name in self)
-
-    def items(self) -> Iterator[tuple[str, Family]]:  # type: ignore[override]
-        return ((name, self[name]) for name in self)
+        if isinstance(self.data[name], str):
+            self.data[name] = load_object(self.data[name], Family)
+        return self.data[name]
 
 
 FAMILIES: Mapping[str, Family] = _Registry(
@@ -170,15 +160,3 @@ def known_family(name: str) -> Family | None:
         except ConfigError:
             return None
     return None
-
-
-def schema(name: str) -> type | None:
-    """Return the type that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``, if there is one."""
-    return next((type_ for other, type_ in schemas() if other == name), None)
-
-
-def schemas() -> Iterator[tuple[str, type]]:
-    """Yield names and types that ``conf/method/*.yaml`` refers to as ``/schema/method/<name>``."""
-    for name, record in FAMILIES.items():
-        own = [rule for rule, it in record.rules.items() if it.config is not None]
-        yield from ((rule, record.config_type(rule)) for rule in own or [name])

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from plab.config.suite import SUITE_VARIANTS, group_names
 from plab.errors import PlabError, pick
@@ -19,16 +19,6 @@ OBSERVED = ("observe_particles", "observe_target")
 
 class SelectionError(PlabError, ValueError):
     """Words that select nothing meaningful; the message is one line that says what would do."""
-
-
-class _Run(Protocol):
-    """Facts about a run of the results: see :class:`plab.results.Row`."""
-
-    @property
-    def values(self) -> dict[str, Any]: ...
-
-    @property
-    def config(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)
@@ -110,10 +100,9 @@ def _same(value: Any, text: str) -> bool:
         return False
 
 
-def require_possible(chosen: Selection, found: Iterable[_Run]) -> None:
-    """Raise SelectionError for a value that no run has and none of the suite could have, such as a misspelt
-    task: it is a mistake, not an empty table."""
-    runs = list(found) if chosen.choices or chosen.keys else []
+def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
+    """Raise SelectionError for a value that none of the :class:`plab.results.Row` has and no run of the suite
+    could have, such as a misspelt task: it is a mistake, not an empty table."""
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
         known = list(SUITE_VARIANTS) if name == "variant" else group_names(name)

@@ -8,7 +8,6 @@ particles.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
-from plab.config.words import explain, parse
+from plab.config.words import explain
 from plab.errors import ConfigError, pick
 from plab.scenes import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
@@ -60,16 +59,6 @@ def merge_variant(task: DictConfig, name: str) -> None:
     except OmegaConfBaseException as error:
         raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
     task.variants, task.random = {name: changes}, {}
-
-
-def undone_key(changes: DictConfig, overrides: Sequence[str]) -> str | None:
-    """Return the first key below ``task`` that an override sets and the variant's changes set again, if
-    any: the override has no effect."""
-    for override in parse(overrides):
-        group, _, key = override.key_or_group.partition(".")
-        if group == "task" and key and OmegaConf.select(changes, key) is not None:
-            return key
-    return None
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:

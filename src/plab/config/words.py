@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, IntervalSweep, Override, QuotedString, Sweep
+from hydra.core.override_parser.types import Glob, IntervalSweep, Override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
-    KeyValidationError,
-    MissingMandatoryValue,
     OmegaConfBaseException,
 )
 from yaml import MarkedYAMLError, YAMLError
@@ -24,25 +21,21 @@ from yaml import MarkedYAMLError, YAMLError
 from plab.errors import ConfigError, pick
 
 FOLDERS = ("results_dir", "targets.source")
-"""Keys whose values are names of folders, with any letters."""
+"""Keys whose values are names of folders."""
 
 _YAML_NUMBER = re.compile(r"(?<=[=,:\[ ])([-+]?)\.(inf|nan)(?=$|[,\]} ])", re.IGNORECASE)
 """Infinity and NaN as YAML writes them."""
 
 
 def prepared(words: Sequence[str]) -> list[str]:
-    """Return overrides as Hydra takes them.
-
-    Names of folders and files are quoted, so that they may have any letters; ``.inf`` becomes ``inf``.
+    """Return overrides as Hydra takes them: names of folders and files quoted, ``.inf`` as ``inf``.
 
     Raises:
         ConfigError: If they are no list of texts.
     """
-    if isinstance(words, str) or not isinstance(words, Iterable):
+    given = list(words) if isinstance(words, Iterable) and not isinstance(words, str) else [None]
+    if not all(isinstance(word, str) for word in given):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
-    given = list(words)
-    if wrong := [word for word in given if not isinstance(word, str)]:
-        raise ConfigError(f"overrides are texts, such as 'seed=3', not {wrong[0]!r}")
     return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in given]
 
 
@@ -50,16 +43,10 @@ def _quote_path(word: str) -> str:
     key, _, text = word.partition("=")
     own = key.lstrip("+")
     is_path = own in FOLDERS or (own.startswith("task.") and own.endswith(".file"))
-    if not is_path or not text.strip() or "${" in text:
+    # Quoted texts, null, interpolations, and several values for a sweep stay.
+    if not is_path or text == "null" or not text.strip() or re.search(r"[,'\"]|\$\{|^\w+\(", text):
         return word
-    try:
-        value = _parsed(word)._value
-    except HydraException:
-        return f"{key}={quoted(text)}"
-    # Quoted texts, null, and several values for a sweep stay.
-    return (
-        word if value is None or isinstance(value, QuotedString | Sweep | Glob) else f"{key}={quoted(text)}"
-    )
+    return f"{key}={quoted(text)}"
 
 
 def quoted(text: str) -> str:
@@ -111,12 +98,6 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
     return found
 
 
-def combinations(overrides: Iterable[tuple[Override, Iterable[str]]]) -> list[list[str]]:
-    """Return the overrides of each run of a sweep, given its own and what a glob in each chooses from."""
-    each = [[f"{one.get_key_element()}={value}" for value in swept(one, names)] for one, names in overrides]
-    return [list(words) for words in itertools.product(*each)]
-
-
 def require_effect(words: Sequence[str], idle: Sequence[str], what: str) -> None:
     """Raise ConfigError for an override of an idle key or section, which has no effect on ``what``."""
     for override in parse(prepared(words)):
@@ -130,12 +111,10 @@ COMPOSE_ERRORS = (HydraException, OmegaConfBaseException, YAMLError, RecursionEr
 """Exceptions raised for a wrong configuration."""
 
 
-def explain(error: HydraException | OmegaConfBaseException | YAMLError | RecursionError) -> str:
-    """Return one line, without a full stop, on an error of Hydra's, OmegaConf's or YAML's."""
+def explain(error: Exception) -> str:
+    """Return one line, without a full stop, on one of :data:`COMPOSE_ERRORS`."""
     if isinstance(error, RecursionError):
-        return (
-            "the configuration refers to itself, or is nested too deeply: look at defaults, ${...}, brackets"
-        )
+        return "the configuration refers to itself: look at defaults and ${...}"
     if launcher := re.search(r"Could not (?:load|find) 'hydra/launcher/(joblib|ray|submitit)", str(error)):
         return f"this launcher is not installed: pip install 'plab[{launcher[1]}]'"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
@@ -152,15 +131,10 @@ def explain(error: HydraException | OmegaConfBaseException | YAMLError | Recursi
         return f"{file[1]}.yaml: {explain(cause)}"
     if isinstance(cause, ConfigAttributeError | ConfigKeyError):
         return _unknown_key(cause)
-    if isinstance(cause, KeyValidationError):
-        return f"{cause.full_key}: put the name into quotes"
-    if isinstance(cause, MissingMandatoryValue):
-        return f"{cause.full_key} has no value: give one"
     if cause is not None:
         place = f"{cause.full_key}: " if cause.full_key else ""
         return place + (cause.msg or str(cause)).strip().splitlines()[0]
-    message = str(error)
-    return "; ".join(line.strip() for line in message.splitlines() if line.strip())
+    return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
 def _omegaconf_cause(error: BaseException | None) -> OmegaConfBaseException | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from plab import runners
 from plab.config import Config, ConfigError
 from plab.config.compose import check_sources, choices, compose, finish, hydra_app, require_runnable
-from plab.config.words import combinations, parse
+from plab.config.words import parse, swept
 from plab.errors import tell
 from plab.plugins import passed_on
 from plab.results import ResultsError, RunFile, read
@@ -111,7 +112,9 @@ def jobs_of(
     parsed = parse([*(f"{key}={value}" for key, value in parameters.items()), *words])
     # The last value of a key counts.
     given = {one.get_key_element(): one for one in parsed if not one.is_hydra_override()}
-    return combinations((one, choices(one.key_or_group, config_dir)) for one in given.values())
+    values = ((one, swept(one, choices(one.key_or_group, config_dir))) for one in given.values())
+    each = [[f"{one.get_key_element()}={value}" for value in own] for one, own in values]
+    return [list(job) for job in itertools.product(*each)]
 
 
 def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -> list[Config | Outcome]:
@@ -124,7 +127,6 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
     Returns:
         Configuration of each job, or why there is none.
     """
-    kept: dict[tuple[str, ...], bytes] = {}
     finished: dict[tuple[str, ...], Config | str] = {}
     entries: list[Config | Outcome] = []
     for job in jobs:
@@ -132,7 +134,7 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
         seeds = [word for word in job if re.fullmatch(r"seed=\d{1,9}", word)]
         words = tuple(word for word in job if word not in seeds)
         if words not in finished:
-            finished[words] = _checked(words, config_dir, kept)
+            finished[words] = _checked(words, config_dir)
         made = finished[words]
         if isinstance(made, str):
             entries.append(Outcome(" ".join(job), "", "refused", message=made))
@@ -141,12 +143,10 @@ def compose_jobs(jobs: Sequence[Sequence[str]], config_dir: str | None = None) -
     return entries
 
 
-def _checked(
-    words: Sequence[str], config_dir: str | None, kept: dict[tuple[str, ...], bytes]
-) -> Config | str:
+def _checked(words: Sequence[str], config_dir: str | None) -> Config | str:
     """Return the configuration of some overrides, or what is wrong with it, its scene or its target."""
     try:
-        cfg = finish(compose(words, config_dir, kept), words, alone=False)
+        cfg = finish(compose(words, config_dir), words, alone=False)
         check_sources(cfg)
     except (ConfigError, SceneError, TargetError) as error:
         return str(error)
