@@ -36,6 +36,7 @@ from plab.envs.tensors import TensorEnv
 from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, RlConfig
 from plab.runners.ppo import PpoConfig
 from plab.runners.rl import Population, population_settings
+from plab.runners.training import evaluate
 
 __all__ = ["COLUMNS", "PARTS", "measure", "rows"]
 
@@ -79,16 +80,16 @@ def measure(cfg: Config, agents: int, batches: int) -> dict[str, object]:
         torch.cuda.reset_peak_memory_stats()
     with population_settings(method):
         own = [one for one in cfgs for _ in range(method.num_envs)]
-        training = TensorEnv(EpisodeBatch(own, contact=method.contact))
-        evaluation = TensorEnv(EpisodeBatch(cfgs))
-        population = Population(cfgs, training, evaluation, [None] * agents)
-        population.evaluate()
+        training, judge = EpisodeBatch(own, contact=method.contact), TensorEnv(EpisodeBatch(cfgs))
+        population = Population(cfgs, training)
+        evaluation = partial(evaluate, judge, population.decide)
+        evaluation()
         population.train(2 * method.num_envs)
         more = batches * method.num_envs
         trained = _seconds(lambda: population.train(population.episodes + more))
-        evaluated, stated = _seconds(population.evaluate), _seconds(population.states)
+        evaluated, stated = _seconds(evaluation), _seconds(population.states)
         parts: dict[str, float] = defaultdict(float)
-        simulator = training.batch.problem.simulator
+        simulator = training.problem.simulator
         timed: list[tuple[Any, str, str]] = [(simulator, name, part) for name, part in SIMULATOR_PARTS]
         learning = ("act", "policy"), ("learn", "update")
         timed += [(stack, name, part) for stack in population.stacks for name, part in learning]

@@ -22,8 +22,9 @@ from plab.config.selection import OBSERVED
 from plab.errors import ArgumentError
 from plab.problem import fits
 from plab.results import read
-from plab.runners.policy import Policy, load_policy, shared_batches
+from plab.runners.policy import Policy, load_policy
 from plab.runners.runner import SimulatorCache
+from plab.runners.training import shared_batches
 
 COLUMNS = ("policy", "task", "trained_on", "scenes", "score", "lower", "upper", "median", "at_least_0.9")
 
@@ -37,7 +38,8 @@ def scores_of(policy: Policy, cfgs: Sequence[Config], together: int, cache: Simu
     found: list[float] = []
     for first in range(0, len(cfgs), together):
         own = cfgs[first : first + together]
-        (batch,) = shared_batches(cache, (own, min(together, len(cfgs)), "hard"))
+        size = min(together, len(cfgs))
+        (batch,) = shared_batches(cache, ([own[k % len(own)] for k in range(size)], "hard"))
         observation, info = batch.reset()
         for _ in range(batch.horizon):
             step = batch.step(policy(observation), strict=False)

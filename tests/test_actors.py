@@ -14,15 +14,16 @@ import torch
 import unseen
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
+from plab.envs.tensors import TensorEnv
 from plab.problem import Trials
 from plab.results import RunResult, read
-from plab.runners import actors, run_config
-from plab.runners.actor_networks import ActorPolicy, ShacPolicy
+from plab.runners import run_config
 from plab.runners.actors import DEVIATION_MIN, training_scenes
 from plab.runners.pods import PodsTraining
-from plab.runners.policy import evaluation, load_policy, policy_path, shared_batches
+from plab.runners.policy import load_policy, policy_path
 from plab.runners.runner import SimulatorCache
 from plab.runners.shac import ShacTraining, td_lambda
+from plab.runners.training import evaluate, shared_batches
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
@@ -60,7 +61,7 @@ def make_config(folder: Path | str, name: str = "shac", *overrides: str) -> Conf
 
 def environments(cfg: Config) -> tuple[EpisodeBatch, EpisodeBatch]:
     """Environments of a training and of the evaluation, all of them of the same scene."""
-    training, judge = shared_batches(CACHE, ([cfg], ENVS, cfg.method.contact), ([cfg], 1, "hard"))
+    training, judge = shared_batches(CACHE, ([cfg] * ENVS, cfg.method.contact), ([cfg], "hard"))
     return training, judge
 
 
@@ -95,7 +96,7 @@ def test_rows_policy_and_budgets(finished: RunResult) -> None:
     if name == "pods":
         assert (rows["plan_reward"] > rows["train_reward"]).tolist() == [False, True, True]
     policy = load_policy(finished.path)
-    assert type(policy.network) is {"shac": ShacPolicy, "pods": ActorPolicy}[name]
+    assert hasattr(policy.network, "log_std") == (name == "shac")
     kept = np.load(policy_path(finished.path))
     actions = policy(np.stack([kept["mean"]] * 2))
     assert actions.shape == (2, 6) and (np.abs(actions) < 1.0).all()
@@ -133,7 +134,7 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path: Path, finished: RunRe
 def test_an_evaluation_that_breaks_off_ends_nothing(
     tmp_path: Path, finished: RunResult, monkeypatch, caplog
 ) -> None:
-    break_evaluation(monkeypatch, actors, 1)
+    break_evaluation(monkeypatch, 1)
     result = run(make_config(tmp_path, name_of(finished)))
     assert result.provenance["broken_evaluations"] == 1 and result.best_iteration != 1
     rows, whole = result.iterations["loss"], finished.iterations["loss"]
@@ -145,12 +146,12 @@ def test_an_evaluation_that_breaks_off_ends_nothing(
 def test_a_state_of_other_networks_is_refused() -> None:
     def training(hidden: int) -> ShacTraining:
         cfg = make_config("results", "shac", f"method.hidden=[{hidden}]")
-        return ShacTraining(cfg, environments(cfg)[0])
+        return ShacTraining([cfg], environments(cfg)[0])
 
-    state = training(8).state()
-    training(8).restore(state)
-    with pytest.raises(RuntimeError, match=r"mean.0.weight"):
-        training(9).restore(state)
+    (state,) = training(8).states()
+    training(8).restore(0, state)
+    with pytest.raises(RuntimeError, match=r"mu.0.weight"):
+        training(9).restore(0, state)
 
 
 def test_scores_in_scenes_that_a_policy_has_not_seen(finished, tmp_path, capsys, monkeypatch) -> None:
@@ -158,12 +159,11 @@ def test_scores_in_scenes_that_a_policy_has_not_seen(finished, tmp_path, capsys,
     name, table, line = name_of(finished), tmp_path / "unseen.csv", [str(finished.path), "--scenes", "5"]
     cfg, policy = make_config(tmp_path, name), load_policy(finished.path)
 
-    def kept(cache: SimulatorCache, kind: tuple[list[Config], int, str]) -> list[EpisodeBatch]:
+    def kept(cache: SimulatorCache, kind: tuple[list[Config], str]) -> list[EpisodeBatch]:
         """The environments of the training: building others takes longer than the test."""
-        cfgs, size, contact = kind
+        cfgs, contact = kind
         batch, _ = environments(cfg)
-        assert size == batch.size
-        batch.renew([cfgs[k % len(cfgs)] for k in range(size)])
+        batch.renew(cfgs)
         batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
         return [batch]
 
@@ -176,7 +176,11 @@ def test_scores_in_scenes_that_a_policy_has_not_seen(finished, tmp_path, capsys,
     assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", drawn, 4)
     seeds = range(unseen.FIRST + 1, unseen.FIRST + 5)
     alone = (environments(scene)[1] for scene in drawn_configs(cfg, seeds))
-    found = [evaluation(judge, policy).measures["score"] for judge in alone]
+
+    def decide(observations: torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(policy(observations.numpy()))
+
+    found = [evaluate(TensorEnv(judge), decide)[0].measures["score"] for judge in alone]
     # Student's t with three degrees of freedom; the table has three digits.
     mean, half = np.mean(found), 3.182446 * np.std(found, ddof=1) / 2.0
     expected = mean, mean - half, mean + half, np.median(found)
@@ -223,14 +227,14 @@ def test_the_scenes_of_a_training_are_drawn(tmp_path: Path, monkeypatch) -> None
     # Those that do not fit are left out; if none does, a run says why.
     monkeypatch.setattr("plab.problem.fits", lambda one: one.seed_scene % 2)
     cfg = make_config("results", "pods", "method.scenes=4")
-    assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003]
+    assert [one.seed_scene for one in training_scenes(cfg, cfg.method, 4)] == [1001, 1003] * 2
     monkeypatch.undo()
     with pytest.raises(SceneError, match=r"dt 0\.01 is above the stability limit"):
         run_config(make_config(tmp_path, "pods", "sim.dt=1e-2"), CACHE)
 
 
 def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("plab.runners.policy.PolicyRunner.require_torch_device", lambda self: None)
+    monkeypatch.setattr("plab.runners.training.PolicyRunner.require_torch_device", lambda self: None)
     cfg = make_config(tmp_path, "pods", "method.torch_device=cuda")
     with pytest.raises(ConfigError, match=r"method.torch_device=cpu"):
         run_config(cfg, CACHE)
@@ -240,9 +244,9 @@ def test_networks_have_to_be_where_the_simulator_is(tmp_path: Path, monkeypatch)
 def test_rounds_take_the_drawn_scenes_in_turn() -> None:
     cfg = make_config("results", "pods", "method.epochs=1")
     batch, _ = environments(cfg)
-    training, taken = PodsTraining(cfg, batch), []
+    training, taken = PodsTraining([cfg], batch), []
     for _ in range(3):
-        training.train()
+        training.cycle()
         taken.append([one.seed_scene for one in batch.configs])
     assert taken == [[1000, 1001, 1002], [1003, 1004, 1000], [1001, 1002, 1003]]
     # Whoever shares the environments next has those it asks for, and the same again as they are.
@@ -259,11 +263,11 @@ def test_rounds_take_the_drawn_scenes_in_turn() -> None:
 def training() -> PodsTraining:
     """One of pods, in three environments."""
     cfg = make_config("results", "pods", "method.epochs=200", "method.lr=0.01", "method.scenes=0")
-    return PodsTraining(cfg, environments(cfg)[0])
+    return PodsTraining([cfg], environments(cfg)[0])
 
 
 def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monkeypatch) -> None:
-    plans, tried, problem = [], [], training._batch.problem
+    plans, tried, problem = [], [], training.batch.problem
     improve, simulate = training._improved, problem.try_out
 
     def try_out(actions: np.ndarray, gradient: bool) -> Trials:
@@ -272,12 +276,12 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monk
 
     monkeypatch.setattr(training, "_improved", lambda *args: plans.append(improve(*args)) or plans[-1])
     monkeypatch.setattr(problem, "try_out", try_out)
-    training.train()
+    training.cycle()
     # Begun as the policy's own, and each update of the method's rate at most.
     assert len(tried) == 3
     np.testing.assert_allclose(tried[1], tried[0], atol=0.05 + 1e-6)
     assert (tried[1] != tried[0]).any()
-    own = training.take_statistics(["train_reward", "plan_reward"])
+    own = training.take()[0].measures
     assert own["plan_reward"] > own["train_reward"]
     # The policy does now what the plan was, far from what it did before.
     _, actions = training._episode(None, "train")
@@ -285,17 +289,16 @@ def test_a_round_improves_actions_and_imitates_them(training: PodsTraining, monk
     assert distance < 0.2 * np.abs(tried[0] - plans[0].numpy()).mean()
 
 
-def test_what_is_observed_is_moved_together(monkeypatch) -> None:
+def test_what_is_observed_is_moved_together() -> None:
     words = "method.shift=0.1", "method.observation_noise=0", "method.scenes=0"
     cfg = make_config("results", "pods", *words)
     batch, _ = environments(cfg)
-    training, given = PodsTraining(cfg, batch), []
+    training, given = PodsTraining([cfg], batch), []
     training.statistics.var = np.linspace(0.25, 4.0, batch.observation_space.shape[0])
-    training._hold_moments()
-    act = ActorPolicy.forward
-    monkeypatch.setattr(ActorPolicy, "forward", lambda self, seen: given.append(seen) or act(self, seen))
+    training.hold_moments()
+    training.network.register_forward_pre_hook(lambda _, seen: given.extend(seen))
     start = torch.as_tensor(batch.reset()[0])
-    seen = training._scaled(torch.cat([start] * 50)[:100])
+    seen = training.scaled(torch.cat([start] * 50)[:100])
     training._imitate(seen, torch.zeros((len(seen), 6)), 50)
     # In the order of the rows: all are alike.
     moved = (torch.cat(given) - seen[:1]) * training._deviation
@@ -314,8 +317,8 @@ def test_what_is_observed_is_moved_together(monkeypatch) -> None:
 def test_environments_that_break_off_teach_nothing(
     training: PodsTraining, broken: list[int], monkeypatch
 ) -> None:
-    before = [parameter.clone() for parameter in training.policy.parameters()]
-    batch, learned = training._batch, []
+    before = [parameter.clone() for parameter in training.network.parameters()]
+    batch, learned = training.batch, []
     try_out, imitate = batch.problem.try_out, training._imitate
 
     def breaking(actions: np.ndarray, gradient: bool) -> Trials:
@@ -325,12 +328,12 @@ def test_environments_that_break_off_teach_nothing(
 
     monkeypatch.setattr(batch.problem, "try_out", breaking)
     monkeypatch.setattr(training, "_imitate", lambda *rows: learned.append(len(rows[0])) or imitate(*rows))
-    training.train()
+    training.cycle()
     # Each of the three episodes with gradient.
     assert len(training.broken) == 3 * len(broken)
     # Two ways of each of the others.
     assert learned == ([4 * HORIZON] if len(broken) == 1 else [])
-    after = list(training.policy.parameters())
+    after = list(training.network.parameters())
     assert all(parameter.isfinite().all() for parameter in after)
     assert all(map(torch.equal, before, after)) == (len(broken) == 3)
     assert training.episodes == 15

@@ -314,7 +314,8 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
             check(replay, step + 1)
     assert {path.stat().st_size for path in paths} == {9 * 4 * sizes.entries}
     again = empty()
-    again.read(paths, 36)
+    for agent, path in enumerate(paths):
+        again.read(agent, path, 36)
     check(again, 36)
     add(again, 36)
     check(again, 37)

@@ -24,12 +24,13 @@ from plab.envs.sb3 import PlabVecEnv
 from plab.envs.tensors import TensorEnv
 from plab.objective import scores
 from plab.results import ResultsError, RunFile, RunResult, read
-from plab.runners import RunError, actors, run_batch, run_config, sb3
-from plab.runners.policy import Spaces, evaluation, first_policy, load_policy, policy_path, shared_batches
+from plab.runners import RunError, run_batch, run_config, sb3, training
+from plab.runners.policy import Spaces, first_policy, load_policy, policy_path
 from plab.runners.rl import Population, agents_of
 from plab.runners.runner import episode_columns
 from plab.runners.sb3 import Sb3Runner
 from plab.runners.tracks import Outcome
+from plab.runners.training import evaluate, shared_batches
 from same_runs import KeepsAll, finished_as, stopped_at
 from suite import make_not_finite
 
@@ -127,7 +128,7 @@ def assert_nothing_else_is_left(*results: RunResult) -> None:
 def batches_of(*cfgs: Config) -> list[EpisodeBatch]:
     """Environments of a training, two for each run, and of the evaluation."""
     own = [cfg for cfg in cfgs for _ in range(2)]
-    return shared_batches(CACHE, (own, len(own), cfgs[0].method.contact), (cfgs, len(cfgs), "hard"))
+    return shared_batches(CACHE, (own, cfgs[0].method.contact), (cfgs, "hard"))
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +169,8 @@ def test_rows_evaluation_and_policy_of_a_whole_run(lone, method: str) -> None:
         assert result.evaluation[name] == pytest.approx(rows[name][best], rel=1e-5, abs=1e-6), name
     # The kept policy's episode is that of the last row, but for rounding: the library multiplies otherwise.
     _, judge = batches_of(make_config(result.path.parents[2], method))
-    done, last = evaluation(judge, load_policy(result.path)), rows.iloc[-1]
+    policy, last = load_policy(result.path), rows.iloc[-1]
+    (done,) = evaluate(TensorEnv(judge), lambda seen: torch.as_tensor(policy(seen.numpy())))
     for name, value in done.measures.items():
         assert value == pytest.approx(last[name], rel=1e-4, abs=1e-6), name
 
@@ -346,29 +348,29 @@ def test_a_broken_episode_is_counted_and_ends_nothing(tmp_path, monkeypatch, cap
     assert len(caplog.records) == 1
 
 
-def break_evaluation(monkeypatch: pytest.MonkeyPatch, module: Any, number: int) -> None:
-    """Let an evaluation break off in its third step."""
-    intact, calls = module.evaluation, itertools.count()
+def break_evaluation(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """Let an evaluation of the first run break off in its third step."""
+    intact, calls = training.evaluate, itertools.count()
 
-    def evaluated(batch: EpisodeBatch, policy: Any) -> Any:
+    def evaluated(env: TensorEnv, decide: Any) -> Any:
         steps, breaks = itertools.count(), next(calls) == number
 
-        def act(observation: np.ndarray) -> np.ndarray:
+        def act(observations: torch.Tensor) -> torch.Tensor:
             if breaks and next(steps) == 2:
-                make_not_finite(batch.problem.simulator, 0)
-            return policy(observation)
+                make_not_finite(env.batch.problem.simulator, 0)
+            return decide(observations)
 
-        return intact(batch, act)
+        return intact(env, act)
 
-    monkeypatch.setattr(module, "evaluation", evaluated)
+    monkeypatch.setattr(training, "evaluate", evaluated)
 
 
 def test_a_broken_evaluation_ends_only_a_run_that_has_no_other(tmp_path, lone, monkeypatch) -> None:
     with monkeypatch.context() as patch:
-        break_evaluation(patch, actors, 0)
+        break_evaluation(patch, 0)
         with pytest.raises(RunError, match="iteration 0: environment step 1, substep 1"):
             run_config(make_config(tmp_path / "first", "tqc"), CACHE)
-    break_evaluation(monkeypatch, actors, 2)
+    break_evaluation(monkeypatch, 2)
     result = run(make_config(tmp_path, "tqc"))
     assert result.provenance["broken_evaluations"] == 1
     assert np.isfinite(result.iterations[1:].to_numpy()).all()
@@ -384,7 +386,7 @@ def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None
     def step(self: Population) -> None:
         if next(calls) in steps:
             for env in (2, 3):
-                make_not_finite(self._training.batch.problem.simulator, env)
+                make_not_finite(self.batch.problem.simulator, env)
         intact(self)
 
     monkeypatch.setattr(Population, "_step", step)
@@ -394,16 +396,8 @@ def break_steps(monkeypatch: pytest.MonkeyPatch, steps: Collection[int]) -> None
 def test_broken_episodes_and_evaluations_of_a_population(tmp_path, lone, method, monkeypatch, caplog) -> None:
     """They are counted and end nothing: episodes of the second run, and an evaluation of the first run."""
     cfgs, alone = configs(tmp_path, method), lone[method]
-    intact, calls = Population._advance, itertools.count()
-
-    def advance(self: Population, env: TensorEnv, actions: torch.Tensor) -> Any:
-        # In the third step of the second evaluation.
-        if env is self._evaluation and next(calls) == HORIZON + 2:
-            make_not_finite(env.batch.problem.simulator, 0)
-        return intact(self, env, actions)
-
     break_steps(monkeypatch, {9})
-    monkeypatch.setattr(Population, "_advance", advance)
+    break_evaluation(monkeypatch, 1)
     assert statuses(cfgs) == ["finished"] * 3
     assert_same_run(cfgs[2], alone[2])
     judged, taught, other = (read(cfg.path) for cfg in cfgs)
@@ -422,8 +416,8 @@ def test_a_run_that_cannot_go_on_leaves_the_others_alone(tmp_path, lone, monkeyp
     cfgs = configs(tmp_path, "sac")
     intact = Population.train
 
-    def train(self: Population, episodes: int, report: Any) -> None:
-        intact(self, episodes, report)
+    def train(self: Population, episodes: int) -> None:
+        intact(self, episodes)
         if self.episodes == 12:
             with torch.no_grad():
                 for parameter in self.stacks[-1].networks.parameters():

@@ -20,10 +20,10 @@ from plab.config import Config, ConfigError, MethodConfig, build_scene, load_con
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read
-from plab.runners import RunError, apg, run_config, trajectory
+from plab.runners import RunError, run_config, trajectory
 from plab.runners.loggers import RunLog
-from plab.runners.policy import shared_batches
 from plab.runners.runner import SimulatorCache, measures, shared_problem, simulator_key
+from plab.runners.training import shared_batches
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
 from same_runs import assert_same_numbers, finished_as, stopped_at
@@ -371,9 +371,11 @@ def test_apg_descends_by_the_gradient_of_its_episodes(trained: RunResult, tmp_pa
     assert rows["steps"].tolist() == [3 * i for i in range(ITERATIONS)]
     assert not rows["steps_forward"].any()
     assert rows["steps_gradient"].tolist() == [3 * (i + 1) for i in range(ITERATIONS)]
-    (batch,) = shared_batches(CACHE, ([cfg], 1, cfg.method.contact))
-    sizes = *batch.observation_space.shape, 6
-    policy = apg.PolicyTraining(cfg.method, *sizes, cfg.seed, torch.device("cpu")).policy
+    (batch,) = shared_batches(CACHE, ([cfg], cfg.method.contact))
+    torch.manual_seed(cfg.seed)
+    layers = [torch.nn.Linear(*sizes) for sizes in ((*batch.observation_space.shape, 16), (16, 16), (16, 6))]
+    relu = torch.nn.ReLU()
+    policy = torch.nn.Sequential(layers[0], relu, layers[1], relu, layers[2], torch.nn.Tanh())
     adam = torch.optim.Adam(policy.parameters(), 0.01)
     for _, row in rows.iterrows():
         first = batch.reset()[1]["loss"][0]

@@ -7,9 +7,9 @@ tensors stay on the device.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -221,9 +221,10 @@ class Stretch(NamedTuple):
 
 def policy_gradient(
     batch: EpisodeBatch,
-    policy: torch.nn.Module,
+    policy: Callable[[torch.Tensor], torch.Tensor],
     steps: int,
     *,
+    parameters: Iterable[torch.Tensor] | None = None,
     discount: float = 1.0,
     value: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> Stretch:
@@ -240,6 +241,7 @@ def policy_gradient(
         policy: Maps observations, shape [batch, entry], to actions, shape [batch, A], which are clipped to
             [-1, 1]; on the simulator's device. Observations have the type of its parameters.
         steps: Steps T.
+        parameters: Parameters of the policy; None: those of a module.
         discount: The loss of step t weighs so much to the power of t, the value to the power of T.
         value: Maps observations to values, shape [batch]; its parameters get no gradient.
 
@@ -252,7 +254,8 @@ def policy_gradient(
         plab.sim.SimulationError: If a state, loss or gradient stops being finite.
         MemoryError: If the gradient does not fit the memory budget.
     """
-    parameters = [one for one in policy.parameters() if one.requires_grad]
+    own = cast(torch.nn.Module, policy).parameters() if parameters is None else parameters
+    parameters = [one for one in own if one.requires_grad]
     like = parameters[0].detach()
     seen: list[torch.Tensor] = []
     done: list[torch.Tensor] = []

@@ -7,7 +7,6 @@ that Stable-Baselines3 would give it, and does what Stable-Baselines3 does, upda
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,13 +19,12 @@ from plab.runners.libraries import torch
 from plab.runners.networks import CapturedUpdate, Networks, fill, flat
 from plab.runners.policy import PolicyConfig, Spaces, first_policy
 from plab.runners.replay import ReplayBuffer, Sizes
+from plab.runners.training import whole_cycles
 
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import BasePolicy
     from torch import Tensor
     from torch.optim import Adam
-
-__all__ = ["Agents", "Block", "Draws", "OffPolicyAgents", "OffPolicyConfig", "RlConfig"]
 
 BLOCK = 50
 """Entries that are drawn at once."""
@@ -109,10 +107,9 @@ class Draws:
         """Return the state of each generator."""
         return [generator.get_state().numpy() for generator in self._generators]
 
-    def restore(self, states: Sequence[np.ndarray]) -> None:
-        """Return to :meth:`states`."""
-        for generator, state in zip(self._generators, states, strict=True):
-            generator.set_state(torch.from_numpy(np.array(state, np.uint8)))
+    def restore(self, agent: int, state: np.ndarray) -> None:
+        """Return an agent's generator to one of :meth:`states`."""
+        self._generators[agent].set_state(torch.from_numpy(np.array(state, np.uint8)))
 
 
 class Block:
@@ -166,8 +163,9 @@ class Agents:
         self.method, self.device, self.count = cfgs[0].method_as(RlConfig), device, len(cfgs)
         horizon = cfgs[0].sim.horizon
         first = [first_policy(cfg.method_as(RlConfig), spaces, cfg.seed) for cfg in cfgs]
-        self.sizes = Sizes(self.method.num_envs, horizon, *spaces.sizes)
-        self.total_steps = self.training_steps(self.method, horizon)
+        self.sizes, self._spaces = Sizes(self.method.num_envs, horizon, *spaces.sizes), spaces
+        cycle = self.cycle_steps(self.method, horizon)
+        self.total_steps = whole_cycles(self.method.episodes * horizon, cycle)
         self.steps = self.updates = 0
         self.draws = Draws([cfg.seed for cfg in cfgs], device)
         self.networks = Networks(first, self.PARTS, device)
@@ -181,29 +179,20 @@ class Agents:
     def make_policy(method: Any, spaces: Spaces) -> BasePolicy:
         """Return Stable-Baselines3's policy with the first weights, on the CPU."""
 
-    @classmethod
-    def trained_policy(cls, cfg: Config, spaces: Spaces, state: Mapping[str, Any]) -> BasePolicy:
-        """Return Stable-Baselines3's policy with the networks of one of :meth:`states`; ValueError if
-        they are others."""
-        policy = first_policy(cfg.method_as(RlConfig), spaces, cfg.seed)
-        networks = Networks([policy], cls.PARTS, torch.device("cpu"))
-        row = torch.from_numpy(state["networks"])[None]
-        if row.shape != flat(networks.parameters(), 1).shape:
-            raise ValueError(f"its networks have {row.numel()} parameters")
-        fill(networks.parameters(), row)
-        networks.write_to(policy, 0)
+    def policy(self, agent: int) -> BasePolicy:
+        """Return Stable-Baselines3's policy with an agent's networks."""
+        policy = first_policy(self.method, self._spaces)
+        self.networks.write_to(policy, agent)
         return policy
+
+    def moments(self, agent: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return means and variances that scale an agent's observations, shape [entry] each, if any do."""
+        return None
 
     @classmethod
     def cycle_steps(cls, method: Any, horizon: int) -> int:
         """Return after how many transitions training can pause: a batch of episodes, or an update."""
         return method.num_envs * horizon
-
-    @classmethod
-    def training_steps(cls, method: Any, horizon: int) -> int:
-        """Return the transitions of the whole training, ``method.episodes`` in whole cycles."""
-        cycle = cls.cycle_steps(method, horizon)
-        return math.ceil(method.episodes * horizon / cycle) * cycle
 
     def begin(self, observations: Tensor) -> None:
         """Take the observations with which the training begins, shape [agent, env, entry]."""
@@ -223,17 +212,21 @@ class Agents:
         shape [agent, env, entry]; make the updates that are due. The next step starts from
         ``observations``, which are the last ones unless the episodes are ``over``."""
 
+    def _tables(self) -> dict[str, list[Tensor]]:
+        """Return the stacked tensors of which an agent's state has a row each, by their names in it."""
+        tables = {"networks": self.networks.parameters()}
+        tables |= {name: [tensor] for name, tensor in self.tensors.items()}
+        for name, optimizer in self.optimizers.items():
+            kept = [optimizer.state[p] for p in optimizer.param_groups[0]["params"]]
+            for moment in ("exp_avg", "exp_avg_sq"):
+                tables[f"{name}_{moment}"] = [own[moment] for own in kept]
+        return tables
+
     def states(self) -> list[dict[str, Any]]:
         """Return each agent's state: all that further training depends on, except a replay buffer."""
         for block in self._blocks:
             block.drop()
-        tables: dict[str, Any] = {"networks": flat(self.networks.parameters(), self.count)}
-        tables |= {name: tensor.reshape(self.count, -1) for name, tensor in self.tensors.items()}
-        for name, optimizer in self.optimizers.items():
-            for moment in ("exp_avg", "exp_avg_sq"):
-                own = [optimizer.state[p][moment] for p in optimizer.param_groups[0]["params"]]
-                tables[f"{name}_{moment}"] = flat(own, self.count)
-        rows = {name: table.detach().cpu().numpy() for name, table in tables.items()}
+        rows = {name: flat(tensors, self.count).cpu().numpy() for name, tensors in self._tables().items()}
         shared = {"steps": self.steps, "updates": self.updates}
         for name, optimizer in self.optimizers.items():
             shared[f"{name}_steps"] = int(optimizer.state[optimizer.param_groups[0]["params"][0]]["step"])
@@ -242,32 +235,16 @@ class Agents:
             for k, random in enumerate(self.draws.states())
         ]
 
-    def restore(self, states: Sequence[Mapping[str, Any]]) -> None:
-        """Return to :meth:`states`, of agents that stand at the same step; ValueError if one is another
-        agent's."""
-        for state, own in zip(states, self.states(), strict=True):
-            for name, value in own.items():
-                if (shape := np.asarray(state[name]).shape) != np.shape(value):
-                    raise ValueError(f"its {name} has shape {list(shape)}, not {list(np.shape(value))}")
-        first = states[0]
-        self.steps, self.updates = int(first["steps"]), int(first["updates"])
-
-        def table(name: str) -> Tensor:
-            return torch.from_numpy(np.stack([state[name] for state in states])).to(self.device)
-
-        fill(self.networks.parameters(), table("networks"))
-        for name, tensor in self.tensors.items():
-            fill([tensor], table(name))
+    def restore(self, agent: int, state: Mapping[str, Any]) -> None:
+        """Return an agent to one of :meth:`states`; the others have to be returned to the same step. Raise
+        RuntimeError if it is another agent's."""
+        for name, tensors in self._tables().items():
+            fill(tensors, self.count, agent, torch.from_numpy(state[name]))
+        self.steps, self.updates = int(state["steps"]), int(state["updates"])
         for name, optimizer in self.optimizers.items():
-            parameters = optimizer.param_groups[0]["params"]
-            for moment in ("exp_avg", "exp_avg_sq"):
-                fill([optimizer.state[p][moment] for p in parameters], table(f"{name}_{moment}"))
-            for parameter in parameters:
-                optimizer.state[parameter]["step"].fill_(int(first[f"{name}_steps"]))
-        try:
-            self.draws.restore([state["random"] for state in states])
-        except RuntimeError as error:
-            raise ValueError(f"its random numbers are none ({error})") from error
+            for parameter in optimizer.param_groups[0]["params"]:
+                optimizer.state[parameter]["step"].fill_(int(state[f"{name}_steps"]))
+        self.draws.restore(agent, state["random"])
 
     def take_losses(self) -> list[dict[str, float]]:
         """Return each agent's means over the updates since the last call, by :attr:`LOSSES`."""

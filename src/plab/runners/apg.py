@@ -9,7 +9,8 @@ reproduce a result:
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,17 +18,15 @@ from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family
 from plab.runners.libraries import torch
 from plab.runners.policy import (
-    PolicyRunner,
     Spaces,
     module_arrays,
     optimizer_arrays,
     restore_module,
     restore_optimizer,
-    shared_batches,
+    torch_settings,
 )
-from plab.runners.runner import Step, Track
-
-__all__ = ["FAMILY", "ApgConfig", "ApgRunner", "PolicyTraining"]
+from plab.runners.runner import Runner, Step, Track
+from plab.runners.training import shared_batches
 
 
 @dataclass
@@ -47,86 +46,63 @@ class ApgConfig(MethodConfig):
     torch_threads: int = field(metadata=ranges.THREADS)
 
 
-class ApgRunner(PolicyRunner):
+class ApgRunner(Runner):
     """Trains a policy network; each iteration is an episode of it, with gradient."""
 
-    kind = ApgConfig
+    @property
+    def method(self) -> ApgConfig:
+        """The section ``method`` of the run, which is alone."""
+        return self.tracks[0].cfg.method_as(ApgConfig)
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self.method.torch_threads)
 
     def build(self) -> None:
         """Make the environment."""
-        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], 1, self.method.contact))
+        (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], self.method.contact))
         self.problem = self._episode.problem
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the network, or take that of the file."""
-        device = torch.device(track.cfg.sim.device)
-        sizes = Spaces.of(self._episode).sizes
-        self._training = PolicyTraining(self.method, *sizes, track.cfg.seed, device)
+        """Make network and optimiser, with torch's own initial weights, or take those of the file."""
+        entries, action_dim = Spaces.of(self._episode).sizes
+        widths, layers = [entries, *self.method.hidden], list[torch.nn.Module]()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(track.cfg.seed)
+            for inputs, outputs in itertools.pairwise(widths):
+                layers += [torch.nn.Linear(inputs, outputs), torch.nn.ReLU()]
+            layers += [torch.nn.Linear(widths[-1], action_dim), torch.nn.Tanh()]
+        self._policy = torch.nn.Sequential(*layers).to(track.cfg.sim.device)
+        self._optimizer = torch.optim.Adam(self._policy.parameters(), lr=self.method.lr)
         if state is not None:
-            self._training.restore(state)
+            restore_module(self._policy, state["policy"])
+            restore_optimizer(self._optimizer, state["optimizer"])
 
     def step(self, track: Track) -> Step:
         """Run an episode of the policy, and improve the policy by the gradient of its loss."""
         from plab.autograd import policy_gradient
 
-        episode, training = self._episode, self._training
+        episode, problem = self._episode, self.problem
         _, before = episode.reset()
-        done = policy_gradient(episode, training.policy, episode.horizon)
+        done = policy_gradient(episode, self._policy, episode.horizon)
         actions = done.actions[:, 0].cpu().double().numpy()
         rewards = before["loss"][0] - done.loss[:, 0].double()
-        problem, last = episode.problem, episode.problem.simulator.measure()
+        last = problem.simulator.measure()
         sums = zip(problem.term_names, done.terms[:, 0].double().sum(0).tolist(), strict=True)
+        gradients = [parameter.grad for parameter in self._policy.parameters()]
+        norm = torch.cat([part.flatten() for part in gradients if part is not None]).norm()
+        self._optimizer.step()
+        self._optimizer.zero_grad()
         measured = {
             "loss": float(done.loss.double().sum()),
             **{f"loss_{name}": total for name, total in sums},
             "reward": float(rewards.sum()),
             "iou": float(last.iou[0]),
             "score": float(problem.scores_of(last.iou)[0][0]),
-            "gradient_norm": training.improve(),
+            "gradient_norm": float(norm),
         }
-        state, steps = training.state(), len(actions)
-        return Step(measured, actions, state, track.iteration, steps_forward=0, steps_gradient=steps)
-
-
-class PolicyTraining:
-    """A policy network and the optimiser that improves it.
-
-    Attributes:
-        policy: Maps observations, shape [..., entry], to actions in (-1, 1), shape [..., A].
-    """
-
-    def __init__(
-        self, method: ApgConfig, observation_size: int, action_dim: int, seed: int, device: torch.device
-    ) -> None:
-        """Make the network, with torch's own initial weights, drawn by the seed."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            self.policy = _network([observation_size, *method.hidden, action_dim]).to(device)
-        self._optimizer = torch.optim.Adam(self.policy.parameters(), lr=method.lr)
-
-    def improve(self) -> float:
-        """Improve the policy by the gradient that its parameters hold, and clear that; return its norm."""
-        gradients = [parameter.grad for parameter in self.policy.parameters()]
-        norm = torch.cat([part.flatten() for part in gradients if part is not None]).norm()
-        self._optimizer.step()
-        self._optimizer.zero_grad()
-        return float(norm)
-
-    def state(self) -> dict[str, Any]:
-        """Return everything that the next steps depend on, as arrays."""
-        return {"policy": module_arrays(self.policy), "optimizer": optimizer_arrays(self._optimizer)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; RuntimeError if it is that of another network."""
-        restore_module(self.policy, state["policy"])
-        restore_optimizer(self._optimizer, state["optimizer"])
-
-
-def _network(widths: Sequence[int]) -> torch.nn.Sequential:
-    layers: list[torch.nn.Module] = []
-    for inputs, outputs in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(inputs, outputs), torch.nn.ReLU()]
-    return torch.nn.Sequential(*layers[:-1], torch.nn.Tanh())
+        state = {"policy": module_arrays(self._policy), "optimizer": optimizer_arrays(self._optimizer)}
+        return Step(measured, actions, state, steps_forward=0, steps_gradient=len(actions))
 
 
 FAMILY = Family(

@@ -15,22 +15,6 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
     from torch.optim import Adam, Optimizer
 
-
-__all__ = [
-    "CapturedUpdate",
-    "Networks",
-    "Part",
-    "adam",
-    "descend",
-    "fill",
-    "flat",
-    "follow",
-    "linear",
-    "mlp",
-    "require_capturable",
-    "twin_values",
-]
-
 Part: TypeAlias = "dict[str, Tensor]"
 """Parameters by their names in the module that they come from, each of shape [stack, ...]; weights are
 transposed, [stack, in, out], so that neither products nor gradients have to be."""
@@ -88,12 +72,11 @@ def flat(tensors: Sequence[Tensor], agents: int) -> Tensor:
     return torch.cat([tensor.detach().reshape(agents, -1) for tensor in tensors], dim=1)
 
 
-def fill(tensors: Sequence[Tensor], rows: Tensor) -> None:
-    """Write rows, as :func:`flat` returns them, back into stacked tensors."""
-    with torch.no_grad():
-        sizes = [tensor.numel() // len(rows) for tensor in tensors]
-        for tensor, part in zip(tensors, rows.split(sizes, dim=1), strict=True):
-            tensor.copy_(part.reshape(tensor.shape))
+def fill(tensors: Sequence[Tensor], agents: int, agent: int, row: Tensor) -> None:
+    """Write an agent's row of :func:`flat` back into stacked tensors."""
+    own = [tensor.detach().view(agents, -1)[agent] for tensor in tensors]
+    for part, numbers in zip(own, row.split([part.numel() for part in own]), strict=True):
+        part.copy_(numbers)
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

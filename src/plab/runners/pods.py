@@ -16,7 +16,7 @@ take them in turn, and the policy imitates what each scene gave the last time. T
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -30,15 +30,12 @@ from plab.runners.libraries import torch
 if TYPE_CHECKING:
     from plab.envs.core import EpisodeBatch
 
-__all__ = ["FAMILY", "PodsConfig", "PodsRunner", "PodsTraining"]
-
 
 @dataclass
 class PodsConfig(ActorConfig):
     """Policy optimization via differentiable simulation.
 
     Attributes:
-        num_envs: Scenes of a round, at most; more are taken in turn, round by round.
         updates: Updates of the actions by their gradient in a round.
         action_lr: Learning rate of these, in units of an action.
         epochs: How often, after a round, the policy sees as many actions as the round has.
@@ -48,7 +45,6 @@ class PodsConfig(ActorConfig):
             [domain units].
     """
 
-    num_envs: int = field(metadata=ranges.COUNT)
     updates: int = field(metadata=ranges.COUNT)
     action_lr: float = field(metadata=ranges.POSITIVE)
     epochs: int = field(metadata=ranges.COUNT)
@@ -60,60 +56,61 @@ class PodsConfig(ActorConfig):
 class PodsTraining(ActorTraining):
     """A policy and the rounds of episodes from which it learns."""
 
-    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
+    columns = ("train_reward", "train_score", "plan_reward", "plan_score")
+
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
         from plab.envs.observations import level_entries
 
+        cfg = cfgs[0]
         updates = cfg.method_as(PodsConfig).updates
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
-        super().__init__(cfg, batch)
+        super().__init__(cfgs, batch)
         self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
 
-    def train(self) -> None:
+    def learn(self, rate_left: float) -> None:
         """Run a round: act, improve the actions, and imitate them."""
-        method, left, self._failed = self._method, self._rate_left(), set[int]()
+        method, batch, self._failed = self._method, self.batch, set[int]()
         if self._turns > 1:
-            turn = self.episodes // (self.round_episodes[0] * self._batch.size)
-            scenes = training_scenes(self._cfg, method, self._batch.size, turn)
-            self._batch.renew([scenes[k % len(scenes)] for k in range(self._batch.size)])
-        self._hold_moments()
+            turn = self.episodes // (self.round_episodes[0] * batch.size)
+            batch.renew(training_scenes(self._cfg, method, batch.size, turn))
+        self.hold_moments()
         before, actions = self._episode(None, "train")
-        improved = self._improved(actions, method.action_lr * left)
+        improved = self._improved(actions, method.action_lr * rate_left)
         after, _ = self._episode(improved, "plan")
-        if whole := [e for e in range(self._batch.size) if e not in self._failed]:
+        if whole := [e for e in range(batch.size) if e not in self._failed]:
             # Also where it came without them: what comes off its way is led back to it.
             seen = torch.cat([before[whole], after[whole]]).flatten(0, 1)
             wanted = torch.cat([improved[whole]] * 2).flatten(0, 1)
             self.statistics.update(seen.double().cpu().numpy())
-            self._hold_moments()
-            set_rate(self._optimizer, method.lr * left)
+            self.hold_moments()
+            set_rate(self._optimizer, method.lr * rate_left)
             # Of each scene the last time that it was its turn.
             self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]
             every, given = map(torch.cat, zip(*self._rounds, strict=True))
             count = math.ceil(method.epochs * len(seen) / method.batch_size)
-            self._imitate(self._scaled(every), given, count)
-        self.episodes += self.round_episodes[0] * self._batch.size
+            self._imitate(self.scaled(every), given, count)
 
     def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
         """Run an episode of given actions, shape [env, T, A], or of the policy, and note reward and score
         under a name; return observations before each step, shape [env, T, entry], and actions."""
-        batch = self._batch
+        batch = self.batch
         like = torch.empty(0, device=self._device) if self._device.type == "cuda" else None
         observed, taken, total = [], [], 0.0
         observation, _ = batch.reset(like)
         for t in range(batch.horizon):
             seen = torch.as_tensor(observation, dtype=torch.float32)
             with torch.no_grad():
-                chosen = self.policy(self._scaled(seen)) if actions is None else actions[:, t]
+                chosen = self.network(self.scaled(seen)) if actions is None else actions[:, t]
             step = batch.step(chosen if like is not None else chosen.numpy(), strict=False)
             observed.append(seen)
             taken.append(chosen)
             observation, total = step.observation, total + torch.as_tensor(step.reward)
         self._note_failures(step.failures)
-        self._note(**{f"{name}_reward": total, f"{name}_score": step.info["score"]})
+        self.note(**{f"{name}_reward": total, f"{name}_score": step.info["score"]})
         return torch.stack(observed, 1), torch.stack(taken, 1)
 
     def _improved(self, actions: torch.Tensor, rate: float) -> torch.Tensor:
@@ -123,7 +120,7 @@ class PodsTraining(ActorTraining):
         optimizer = torch.optim.Adam([plan], lr=rate)
         for _ in range(self._method.updates):
             given = plan.detach()
-            tried = self._batch.problem.try_out(
+            tried = self.batch.problem.try_out(
                 given if given.is_cuda else given.double().numpy(), gradient=True
             )
             self._note_failures(tried.failures)
@@ -154,18 +151,21 @@ class PodsTraining(ActorTraining):
                 for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
                     noisy[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
             self._optimizer.zero_grad()
-            torch.nn.functional.mse_loss(self.policy(noisy), wanted[rows]).backward()
+            torch.nn.functional.mse_loss(self.network(noisy), wanted[rows]).backward()
             self._optimizer.step()
 
-    def state(self) -> dict[str, Any]:
+    def states(self) -> list[dict[str, Any]]:
         """Return everything that the next episodes depend on, as arrays and numbers."""
-        kept = {str(k): (seen.cpu(), wanted.cpu()) for k, (seen, wanted) in enumerate(self._rounds)}
-        rounds = {k: {"seen": seen.numpy(), "wanted": wanted.numpy()} for k, (seen, wanted) in kept.items()}
-        return super().state() | {"rounds": rounds}
+        (state,) = super().states()
+        rounds = {
+            str(k): {"seen": seen.cpu().numpy(), "wanted": wanted.cpu().numpy()}
+            for k, (seen, wanted) in enumerate(self._rounds)
+        }
+        return [state | {"rounds": rounds}]
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`; RuntimeError if it is that of other networks."""
-        super().restore(state)
+    def restore(self, run: int, state: Mapping[str, Any]) -> None:
+        """Return to a state; RuntimeError if it is that of other networks."""
+        super().restore(run, state)
         kept = [state["rounds"][str(k)] for k in range(len(state["rounds"]))]
         parts = [[torch.from_numpy(np.array(one[name])) for name in ("seen", "wanted")] for one in kept]
         self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in parts]
@@ -174,21 +174,20 @@ class PodsTraining(ActorTraining):
 class PodsRunner(ActorRunner):
     """Trains a policy; each iteration is some rounds, then one episode of the policy."""
 
-    kind = PodsConfig
     training = PodsTraining
-    columns = ("train_reward", "train_score", "plan_reward", "plan_score")
 
-    def environments(self, method: PodsConfig) -> int:
-        """Return how many environments are trained in together, one for each scene."""
-        return min(max(1, method.scenes), method.num_envs)
+    def training_configs(self) -> list[Config]:
+        """Return a scene for each environment, at most ``num_envs``."""
+        method = self.method
+        return training_scenes(self.tracks[0].cfg, method, min(max(1, method.scenes), method.num_envs))
 
 
 FAMILY = Family(
     label="a policy that imitates its own episodes, improved by the simulator's gradient",
     config=PodsConfig,
     runner=PodsRunner,
-    columns=PodsRunner.columns,
-    may_be_nan=PodsRunner.columns,
+    columns=PodsTraining.columns,
+    may_be_nan=PodsTraining.columns,
     rules={"pods": Rule(PodsTraining, PodsConfig)},
     contact="hard",
     kind=GRADIENT,

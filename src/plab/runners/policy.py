@@ -1,4 +1,4 @@
-"""Policies: runners that train them in environments, episodes of a policy, and the file that keeps one.
+"""Trained policies: their keys, their states as arrays, and the file that keeps one.
 
 The file beside a result, ``<name>.policy.npz``, is arrays alone: the networks' parameters by their names, the
 bounds of observations and actions, and a header in JSON with the section ``method`` of the run, from which
@@ -10,27 +10,24 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import logging
 import math
 import sys
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from plab.config import Config, ConfigError, MethodConfig, ranges
+from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import FAMILIES, family
-from plab.config.selection import OBSERVED
 from plab.files import DAMAGE, one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.run_file import replace_file
 from plab.runners.libraries import torch
-from plab.runners.runner import LAST, Runner, SimulatorCache, Track, episode_columns, simulator_key
 from plab.scenes import DEVICES
 
 if TYPE_CHECKING:
@@ -39,26 +36,6 @@ if TYPE_CHECKING:
     from torch.optim import Optimizer
 
     from plab.envs.core import EpisodeBatch
-
-__all__ = [
-    "CLIP",
-    "Evaluation",
-    "Policy",
-    "PolicyConfig",
-    "PolicyRunner",
-    "Spaces",
-    "evaluation",
-    "first_policy",
-    "load_policy",
-    "module_arrays",
-    "optimizer_arrays",
-    "policy_path",
-    "restore_module",
-    "restore_optimizer",
-    "save_policy",
-    "shared_batches",
-    "torch_settings",
-]
 
 CLIP = 10.0
 """Largest observation and reward, in units of their running standard deviations."""
@@ -70,8 +47,6 @@ _FORMAT = "plab-policy 1"
 
 _PARAMETER = "policy/"
 """Prefix of the names of the networks' parameters."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -119,114 +94,6 @@ class Spaces(NamedTuple):
         return self.observation_space.shape[0], self.action_space.shape[0]
 
 
-# ------------------------------------------------------------------------------------- runners, episodes
-
-
-class PolicyRunner(Runner):
-    """Trains policies; a subclass says of which ``kind`` the section ``method`` is."""
-
-    kind: ClassVar[type[MethodConfig]]
-
-    @property
-    def method(self) -> Any:
-        """The section ``method`` that the runs have in common."""
-        return self.tracks[0].cfg.method_as(self.kind)
-
-    def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
-        return torch_settings(self.method.torch_threads)
-
-    def require_torch_device(self) -> None:
-        """Raise ConfigError, before anything is built, if torch does not have the device."""
-        if self.method.torch_device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError(
-                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
-            )
-
-    def unusable(self, track: Track, broken: Sequence[str], episodes: int, failure: str) -> str:
-        """Count episodes that broke off in the result's provenance, and warn of them.
-
-        Args:
-            track: The run.
-            broken: When and why episodes of training broke off; their environments rested until their end.
-            episodes: Episodes of training that ended meanwhile.
-            failure: When and why the evaluation broke off, which is the best of none; empty if it did not.
-
-        Returns:
-            Why the run cannot go on: all episodes of training broke off, or the evaluation did and the run
-            has no other actions yet. Otherwise an empty text.
-        """
-        if broken and len(broken) >= episodes:
-            return f"all {episodes} episodes of training broke off, the first in {broken[0]}"
-        if failure and track.best_actions is None:
-            return failure
-        provenance = track.run.result.provenance
-        for name, texts in (("episodes", broken), ("evaluations", [failure] if failure else [])):
-            if texts:
-                provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
-                _log.warning(
-                    "%s: iteration %d: %d %s broke off and rested until their end, the first in %s",
-                    *(track.run.path, track.iteration, len(texts), name, texts[0]),
-                )
-        return ""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Result of an episode of a deterministic policy: values of
-    :func:`plab.runners.runner.episode_columns`, actions, shape [T, A], and why it broke off, empty if it did
-    not; from then on it rests as :meth:`plab.envs.core.EpisodeBatch.step` has it."""
-
-    measures: dict[str, float]
-    actions: np.ndarray
-    failure: str
-
-
-def evaluation(batch: EpisodeBatch, policy: Callable[[np.ndarray], np.ndarray]) -> Evaluation:
-    """Run an episode of a policy, observations, shape [1, entry], to actions, shape [1, A], in a batch of
-    one."""
-    observation, _ = batch.reset()
-    sums = dict.fromkeys(episode_columns(batch.problem.term_names), 0.0)
-    actions, failure = [], ""
-    for _ in range(batch.horizon):
-        actions.append(policy(observation))
-        step = batch.step(actions[-1], strict=False)
-        failure = failure or step.failures.get(0, "")
-        observation, values = step.observation, step.info | {"reward": step.reward}
-        for name in sums:
-            sums[name] += float(values[name][0])
-    last = {name: float(values[name][0]) for name in LAST}
-    return Evaluation(sums | last, np.concatenate(actions), failure)
-
-
-def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], int, str]) -> list[EpisodeBatch]:
-    """Return batches of environments, in their initial states, those kept from the last run if they can be
-    of these scenes; each is of some configurations, which the environments have in turn, a number of
-    environments and a contact model."""
-
-    # Imported here, as all that brings the simulator along.
-    from plab.config import build_scene
-    from plab.envs.core import EpisodeBatch
-
-    def build() -> list[EpisodeBatch]:
-        return [
-            EpisodeBatch([cfgs[k % len(cfgs)] for k in range(size)], contact=contact)
-            for cfgs, size, contact in kinds
-        ]
-
-    def start_again(batches: list[EpisodeBatch]) -> None:
-        for batch, (cfgs, _, contact) in zip(batches, kinds, strict=True):
-            batch.renew([cfgs[k % len(cfgs)] for k in range(batch.size)])
-            batch.reset()
-            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
-
-    key: list[Hashable] = []
-    for (cfg, *_), size, contact in kinds:
-        key += [simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, size, contact]
-        key += [getattr(cfg, name) for name in OBSERVED]
-    return cache.get(tuple(key), build, check=start_again)
-
-
 @contextmanager
 def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
     """Let torch use some CPU threads, on CUDA TF32's products, of factors with 11 significant bits, if
@@ -244,9 +111,6 @@ def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
         torch.set_num_threads(before)
         torch.set_float32_matmul_precision(precision)
         torch.distributions.Distribution.set_default_validate_args(checks)
-
-
-# ------------------------------------------------------------------------------------- states as arrays
 
 
 def module_arrays(module: torch.nn.Module) -> dict[str, np.ndarray]:
@@ -271,9 +135,6 @@ def restore_optimizer(optimizer: Optimizer, arrays: Mapping[str, Mapping[str, np
         int(k): {name: torch.tensor(np.asarray(v)) for name, v in own.items()} for k, own in arrays.items()
     }
     optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
-
-
-# ------------------------------------------------------------------------------------- policies and files
 
 
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, cast
 
+import numpy as np
+
 from plab.config import Config, ConfigError, ranges
 from plab.runners.agents import Agents, RlConfig
 from plab.runners.libraries import torch
@@ -16,8 +18,6 @@ from plab.runners.policy import CLIP, EPSILON, Spaces
 if TYPE_CHECKING:
     from stable_baselines3.common.policies import ActorCriticPolicy
     from torch import Tensor
-
-__all__ = ["PpoAgents", "PpoConfig", "Statistics"]
 
 ACTION_GAIN = 0.01
 """Stable-Baselines3's gain of the last layer of PPO's policy; that of the value function is 1."""
@@ -155,6 +155,12 @@ class PpoAgents(Agents):
         for layer, gain in last:
             cast("torch.nn.Linear", layer).weight.data.mul_(gain)
         return policy
+
+    def moments(self, agent: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return means and variances that scale an agent's observations, if any do."""
+        if not self.method.normalise:
+            return None
+        return self._seen.mean[agent].cpu().numpy(), self._seen.var[agent].cpu().numpy()
 
     @classmethod
     def cycle_steps(cls, method: PpoConfig, horizon: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from plab.runners.agents import OffPolicyConfig
-
-__all__ = ["ReplayBuffer", "Samples", "Sizes", "require_file"]
 
 
 class Sizes(NamedTuple):
@@ -132,33 +129,26 @@ class ReplayBuffer:
             raise ResultsError(f"cannot write the replay buffer {path}: {error.strerror or error}") from error
         self._written[agent] = last
 
-    def read(self, paths: Sequence[Path], added: int) -> None:
-        """Take what the agents' files hold of steps of N environments, in whole episodes; ResultsError if
-        that fails."""
+    def read(self, agent: int, path: Path, added: int) -> None:
+        """Take what an agent's file holds of steps of N environments, in whole episodes, as many for all
+        agents; ResultsError if that fails."""
         self._count_to(added)
-        last = added // self._sizes.horizon
-        self._written = [last] * self._agents
-        for agent, path in enumerate(paths):
-            try:
-                self._read(agent, path, range(max(0, last - self._capacity), last))
-            except (OSError, ValueError) as error:
-                raise ResultsError(f"cannot read the replay buffer {path}: {error}") from error
-
-    def _read(self, agent: int, path: Path, episodes: range) -> None:
-        with path.open("rb") as file:
-            file.seek(episodes.start * self._sizes.entries * 4)
-            for episode in episodes:
-                for part in self._parts(agent, episode):
-                    numbers = np.fromfile(file, np.float32, part.numel())
-                    part.copy_(torch.from_numpy(numbers).view(part.shape))
+        self._written[agent] = last = added // self._sizes.horizon
+        first = max(0, last - self._capacity)
+        try:
+            with path.open("rb") as file:
+                file.seek(4 * first * self._sizes.entries)
+                for episode in range(first, last):
+                    for part in self._parts(agent, episode):
+                        numbers = np.fromfile(file, np.float32, part.numel())
+                        part.copy_(torch.from_numpy(numbers).view(part.shape))
+        except (OSError, RuntimeError) as error:
+            # Gone, or shorter than the checkpoint says.
+            raise ResultsError(
+                f"cannot read the replay buffer {path}: {error}; start afresh with force=true"
+            ) from error
 
     def _parts(self, agent: int, episode: int) -> list[Tensor]:
         """Return an episode's places in the buffers, in the order in which they are in the file."""
         tables = self._observations, self._actions, self._rewards
         return [table[agent, episode % self._capacity] for table in tables]
-
-
-def require_file(path: Path, sizes: Sizes, episodes: int) -> None:
-    """Raise ResultsError unless an agent's file holds some episodes of N environments."""
-    if episodes and (not path.exists() or path.stat().st_size < episodes * sizes.entries * 4):
-        raise ResultsError(f"{path}, the replay buffer of the run, is gone: start afresh with force=true")

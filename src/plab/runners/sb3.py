@@ -21,7 +21,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer as LibraryBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecMonitor
@@ -30,15 +30,10 @@ from plab.config import Config
 from plab.config.families import family
 from plab.envs.core import EpisodeBatch
 from plab.envs.sb3 import PlabVecEnv
-from plab.results.schema import REPLAY_SUFFIX
-from plab.runners.actors import ActorRunner
-from plab.runners.agents import LARGEST, OffPolicyConfig, RlConfig
-from plab.runners.loggers import RunLog
-from plab.runners.policy import Policy, PolicyRunner, Spaces
-from plab.runners.replay import ReplayBuffer, Sizes, require_file
-from plab.runners.tracks import Track
-
-__all__ = ["ModelKind", "Sb3Runner", "Sb3Training", "off_policy"]
+from plab.runners.agents import LARGEST, OffPolicyConfig
+from plab.runners.policy import Policy, Spaces
+from plab.runners.replay import ReplayBuffer, Sizes
+from plab.runners.training import Learned, PolicyRunner, Training
 
 
 @dataclass(frozen=True)
@@ -83,96 +78,76 @@ def off_policy(method: OffPolicyConfig) -> dict[str, Any]:
     }
 
 
-class Sb3Training:
-    """A model in training, between episodes or, without a replay buffer, updates; as
-    :class:`plab.runners.actors.ActorTraining`.
+class Sb3Training(Training):
+    """A model in training, between episodes or, without a replay buffer, updates.
 
     Attributes:
         model: The model.
-        broken: When and why episodes broke off since they were last asked for.
         episode_actions: Actions of the episodes under way, each of shape [env, A].
-        replay_path: File of the replay buffer.
-        report: Takes a short text when episodes have ended.
     """
 
-    round_episodes = 1, 0
-    replay_path: Path
-    report: Callable[[str], None]
-
-    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Make the environments and an untrained model."""
+        (cfg,) = cfgs
         method: Any = cfg.method
         self._kind: ModelKind = family(method.family).rules[method.algorithm].what
-        horizon, rollout = batch.horizon, self._kind.rollout_steps
-        self._cycle = method.num_envs * (horizon if rollout is None else rollout(method))
-        self._total = math.ceil(method.episodes * horizon / self._cycle) * self._cycle
-        self._sizes = Sizes(method.num_envs, horizon, *Spaces.of(batch).sizes)
+        rollout = self._kind.rollout_steps
+        self._cycle_steps = method.num_envs * (batch.horizon if rollout is None else rollout(method))
+        super().__init__(cfgs, batch, self._cycle_steps)
+        self._sizes = Sizes(method.num_envs, batch.horizon, *Spaces.of(batch).sizes)
         envs = PlabVecEnv(batch)
         envs.strict = False
         self._env = VecMonitor(envs)
         arguments = self._kind.arguments(method, self._env)
         if isinstance(method, OffPolicyConfig):
-            kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(method, self._total)}
+            kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(method, self.total_steps)}
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
-        self.broken: list[str] = []
         self.episode_actions: list[np.ndarray] = []
-        self._ended: dict[str, list[float]] = {}
+        self._ended: list[Mapping[str, Any]] = []
         self._watch = _Watch(self)
+        self._set_logger()
+
+    def _set_logger(self) -> None:
+        self.model.set_logger(Logger(folder=None, output_formats=[]))
 
     @property
     def steps(self) -> int:
         """Transitions of training so far."""
         return self.model.num_timesteps
 
-    @property
-    def episodes(self) -> int:
-        """Episodes of training so far."""
-        return self.steps // self._sizes.horizon
-
-    @property
-    def total_episodes(self) -> int:
-        """Episodes of the whole training, in whole cycles."""
-        return self._total // self._sizes.horizon
-
-    @property
-    def policy(self) -> BasePolicy:
-        """The policy."""
-        return self.model.policy
-
-    def train(self) -> None:
-        """Train for one cycle: a batch of episodes, or an update."""
-        self.model.learn(self._cycle, callback=self._watch, reset_num_timesteps=False)
+    def cycle(self) -> None:
+        """Train for a batch of episodes, or an update."""
+        # What the library would log stays with its logger.
+        self.model.learn(
+            self._cycle_steps, callback=self._watch, log_interval=None, reset_num_timesteps=False
+        )
 
     def note(self, actions: np.ndarray, infos: Sequence[Mapping[str, Any]]) -> None:
         """Note a step of training: actions, shape [env, A], and infos."""
-        if "episode" not in infos[0]:
+        if "episode" in infos[0]:
+            self.episode_actions.clear()
+            self._ended += infos
+            self.report()
+        else:
             self.episode_actions.append(np.array(actions))
-            return
-        self.episode_actions.clear()
-        self.broken += [info["broken"] for info in infos if "broken" in info]
-        rewards = [float(info["episode"]["r"]) for info in infos]
-        self._ended.setdefault("train_reward", []).extend(rewards)
-        self._ended.setdefault("train_score", []).extend(info["score"] for info in infos)
-        self.report(f"reward {np.mean(rewards):.4g} in training")
 
-    def predictor(self) -> Policy:
-        """Return the deterministic policy."""
-        return Policy(self.policy, None, None)
+    def decide(self, observations: torch.Tensor) -> torch.Tensor:
+        """Return the deterministic policy's action for an observation, shape [1, entry]."""
+        return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
 
-    def moments(self) -> None:
-        """Return None: observations are not scaled."""
+    def take(self) -> list[Learned]:
+        """Return the training since the last call."""
+        ended, self._ended = self._ended, []
+        values = [float(info["episode"]["r"]) for info in ended], [info["score"] for info in ended]
+        means = {n: float(np.mean(v)) if v else math.nan for n, v in zip(self.columns, values, strict=True)}
+        logged = self.model.logger.name_to_value.items()
+        losses = {n.removeprefix("train/"): float(v) for n, v in logged if n.startswith("train/")}
+        return [Learned(means, len(ended), [i["broken"] for i in ended if "broken" in i], losses)]
 
-    def take_statistics(self, names: Sequence[str]) -> dict[str, float]:
-        """Return means over the episodes that ended since the last time; NaN without any."""
-        ended, self._ended = self._ended, {}
-        return {name: float(np.mean(ended[name])) if name in ended else math.nan for name in names}
-
-    def state(self) -> dict[str, Any]:
-        """Return everything that further training depends on; the replay buffer is written to its file."""
-        if self._replay is not None:
-            self._replay.kept.write(0, self.replay_path)
+    def states(self) -> list[dict[str, Any]]:
+        """Return everything that further training depends on, except a replay buffer."""
         model, written = self.model, io.BytesIO()
         model.save(written)
         random = {
@@ -182,63 +157,53 @@ class Sb3Training:
             "actions": model.action_space.np_random.bit_generator.state,
         }
         shape = -1, self._sizes.envs, self._sizes.actions
-        return {
-            "model": np.frombuffer(written.getvalue(), np.uint8),
-            "random": np.frombuffer(pickle.dumps(random), np.uint8),
-            "episode_actions": np.array(self.episode_actions, np.float32).reshape(shape),
-        }
+        return [
+            {
+                "model": np.frombuffer(written.getvalue(), np.uint8),
+                "random": np.frombuffer(pickle.dumps(random), np.uint8),
+                "episode_actions": np.array(self.episode_actions, np.float32).reshape(shape),
+            }
+        ]
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`: the model, its random numbers, and the episodes that were under way.
-
-        Raises:
-            plab.results.ResultsError: If the training goes on and its replay buffer is gone.
-        """
+    def restore(self, run: int, state: Mapping[str, Any]) -> None:
+        """Return to a state: the model, its random numbers, and the episodes that were under way."""
         self._env.reset()
         for actions in state["episode_actions"]:
             self._env.step(actions)
             self.episode_actions.append(actions)
         written = io.BytesIO(state["model"].tobytes())
         self.model = self._kind.model.load(written, self._env, self._device, force_reset=False)
+        self._set_logger()
         random = pickle.loads(state["random"].tobytes())
         np.random.set_state(random["numpy"])  # noqa: NPY002
         torch.set_rng_state(random["torch"])
         if random["cuda"] is not None:
             torch.cuda.set_rng_state(random["cuda"])
         self.model.action_space.np_random.bit_generator.state = random["actions"]
-        if self._replay is not None and self.steps < self._total:
-            require_file(self.replay_path, self._sizes, self.episodes // self._sizes.envs)
-            self._replay.kept.read([self.replay_path], self.steps // self._sizes.envs)
+
+    def write(self, run: int, path: Path) -> None:
+        """Write the replay buffer, if there is one."""
+        if self._replay is not None:
+            self._replay.kept.write(0, path)
+
+    def read(self, run: int, path: Path) -> None:
+        """Read the replay buffer, if there is one."""
+        if self._replay is not None:
+            self._replay.kept.read(0, path, self.steps // self._sizes.envs)
+
+    def policy(self, run: int) -> BasePolicy:
+        """Return the policy."""
+        return self.model.policy
 
     @property
     def _replay(self) -> _Replay | None:
         return getattr(self.model, "replay_buffer", None)
 
 
-class Sb3Runner(ActorRunner):
-    """Trains a model; each iteration is some episodes of training, then one of the deterministic policy."""
+class Sb3Runner(PolicyRunner):
+    """Trains a model."""
 
-    kind = RlConfig
     training = Sb3Training
-
-    def require_torch_device(self) -> None:
-        """Raise ConfigError if torch does not have the device; the simulator may be on another."""
-        PolicyRunner.require_torch_device(self)
-
-    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the model, or take that of the file."""
-        self._training = training = Sb3Training(track.cfg, self._training_batch)
-        training.replay_path = track.run.path.with_suffix(REPLAY_SUFFIX)
-        training.report = lambda text: self.report(training.episodes, text)
-        if state is not None:
-            training.restore(state)
-        outputs: list[KVWriter] = [_Diagnostics(track.log)] if track.log.wanted else []
-        training.model.set_logger(Logger(folder=None, output_formats=outputs))
-
-    def conclude(self, track: Track) -> None:
-        """Keep the policy, and no replay buffer."""
-        super().conclude(track)
-        self._training.replay_path.unlink(missing_ok=True)
 
 
 class _Replay(LibraryBuffer):
@@ -302,24 +267,3 @@ class _Watch(BaseCallback):
         # Algorithms without a replay buffer keep the actions as drawn, and step with clipped ones.
         self._training.note(self.locals.get("clipped_actions", self.locals["actions"]), self.locals["infos"])
         return True
-
-
-class _Diagnostics(KVWriter):
-    """Passes on what Stable-Baselines3 logs of the training."""
-
-    def __init__(self, log: RunLog) -> None:
-        self._log = log
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        """Pass on the numbers, at some transitions of training."""
-        numbers = {
-            name: float(value)
-            for name, value in key_values.items()
-            if isinstance(value, int | float | np.number) and "tensorboard" not in key_excluded[name]
-        }
-        self._log.write(numbers, step)
-
-    def close(self) -> None:
-        """Leave the log to the run."""

@@ -12,21 +12,27 @@ policy. Then the value function learns from the window, by TD(lambda). To reprod
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
-from plab.runners.actors import ActorConfig, ActorRunner, ActorTraining, set_rate
+from plab.runners.actors import (
+    ActorConfig,
+    ActorRunner,
+    ActorTraining,
+    actor_network,
+    actor_policy,
+    set_rate,
+)
 from plab.runners.libraries import torch
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
     from plab.autograd import Stretch
     from plab.envs.core import EpisodeBatch
-    from plab.runners.actor_networks import ShacPolicy
-
-__all__ = ["FAMILY", "ShacConfig", "ShacRunner", "ShacTraining", "td_lambda"]
 
 
 @dataclass
@@ -34,7 +40,6 @@ class ShacConfig(ActorConfig):
     """Short-horizon actor-critic.
 
     Attributes:
-        num_envs: Environments simulated together.
         gamma: Discount factor.
         window: Steps through which the gradient goes.
         value_lr: Learning rate of the value function.
@@ -47,7 +52,6 @@ class ShacConfig(ActorConfig):
         max_gradient_norm: Longer gradients are scaled down to this norm.
     """
 
-    num_envs: int = field(metadata=ranges.COUNT)
     gamma: float = field(metadata=ranges.SHARE)
     window: int = field(metadata=ranges.COUNT)
     value_lr: float = field(metadata=ranges.POSITIVE)
@@ -63,51 +67,58 @@ class ShacConfig(ActorConfig):
 class ShacTraining(ActorTraining):
     """Policy, value function, their optimisers, and the episodes from which they learn."""
 
-    def __init__(self, cfg: Config, batch: EpisodeBatch) -> None:
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights, of the actions' noise and of the minibatches."""
-        from plab.runners.actor_networks import actor_network
-
-        super().__init__(cfg, batch)
-        method = cfg.method_as(ShacConfig)
+        super().__init__(cfgs, batch)
+        method = cfgs[0].method_as(ShacConfig)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(cfg.seed + 1)
+            torch.manual_seed(cfgs[0].seed + 1)
             self._value = actor_network(self._spaces, 1, method.hidden).to(self._device)
         self._target = copy.deepcopy(self._value).requires_grad_(False)
         self._value_optimizer = torch.optim.Adam(self._value.parameters(), lr=method.value_lr)
 
     @staticmethod
-    def make_policy(method: ShacConfig, spaces: Spaces) -> ShacPolicy:
-        """Return the policy that training begins with, on the CPU."""
-        from plab.runners.actor_networks import ShacPolicy
+    def make_policy(method: ShacConfig, spaces: Spaces) -> Any:
+        """Return the policy with which training begins, on the CPU. The standard deviation of its actions,
+        before the hyperbolic tangent, is learned, and the same for all observations."""
+        policy = actor_policy(spaces, method.hidden)
+        deviation = torch.full(spaces.action_space.shape, math.log(method.noise))
+        policy.log_std = torch.nn.Parameter(deviation)
+        return policy
 
-        return ShacPolicy(spaces, method)
+    def _draw(self, observations: torch.Tensor) -> torch.Tensor:
+        """Draw actions, shape [env, A], for observations, shape [env, entry]."""
+        # All but the hyperbolic tangent.
+        mean = self.network.mu[:-1](self.scaled(observations))
+        noise = torch.randn(mean.shape, generator=self._generator, device=mean.device, dtype=mean.dtype)
+        return torch.tanh(mean + self.network.log_std.exp() * noise)
 
-    def train(self) -> None:
+    def learn(self, rate_left: float) -> None:
         """Run one episode of all environments, window by window."""
         from plab.autograd import policy_gradient
-        from plab.runners.actor_networks import Drawing
 
-        batch, method = self._batch, self._method
-        drawing = Drawing(self.policy, self._scaled, self._generator)
+        batch, method = self.batch, self._method
+        parameters = list(self.network.parameters())
         initial = torch.as_tensor(batch.reset()[1]["loss"], dtype=torch.float32, device=self._device)
         # Rewards in units of the loss at the start.
         scale = initial.mean().clamp(min=1e-12)
-        left = self._rate_left() if method.lr_decay else 1.0
+        left = rate_left if method.lr_decay else 1.0
         set_rate(self._optimizer, method.lr * left)
         set_rate(self._value_optimizer, method.value_lr * left)
         total = torch.zeros(batch.size, device=self._device)
         for first in range(0, batch.horizon, method.window):
             steps = min(method.window, batch.horizon - first)
-            self._hold_moments()
+            self.hold_moments()
             self._optimizer.zero_grad()
             stretch = policy_gradient(
                 batch,
-                drawing,
+                self._draw,
                 steps,
+                parameters=parameters,
                 discount=method.gamma,
-                value=lambda seen: scale * self._target(self._scaled(seen))[:, 0],
+                value=lambda seen: scale * self._target(self.scaled(seen))[:, 0],
             )
-            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), method.max_gradient_norm)
+            torch.nn.utils.clip_grad_norm_(parameters, method.max_gradient_norm)
             self._optimizer.step()
             rewards = initial - stretch.loss
             total += rewards.sum(0)
@@ -116,12 +127,11 @@ class ShacTraining(ActorTraining):
             self.statistics.update(seen.double().cpu().numpy())
         like = total if total.is_cuda else None
         measured = batch.problem.scores_of(batch.problem.simulator.measure(like).iou)[0]
-        self._note(train_reward=total, train_score=measured)
-        self.episodes += batch.size
+        self.note(train_reward=total, train_score=measured)
 
     def _learn_value(self, stretch: Stretch, rewards: torch.Tensor) -> None:
         method = self._method
-        seen = self._scaled(stretch.observations)
+        seen = self.scaled(stretch.observations)
         with torch.no_grad():
             targets = td_lambda(rewards, self._target(seen)[..., 0], method.gamma, method.td_lambda)
         inputs, outputs = seen[:-1].reshape(-1, seen.shape[-1]), targets.reshape(-1)
@@ -148,7 +158,6 @@ class ShacRunner(ActorRunner):
     """Trains policy and value function; each iteration is some episodes of training, then one of the
     deterministic policy."""
 
-    kind = ShacConfig
     training = ShacTraining
 
 
@@ -167,8 +176,8 @@ FAMILY = Family(
     label="a policy, trained through the simulator's gradient and by a value function",
     config=ShacConfig,
     runner=ShacRunner,
-    columns=("train_reward", "train_score"),
-    may_be_nan=("train_reward", "train_score"),
+    columns=ShacTraining.columns,
+    may_be_nan=ShacTraining.columns,
     rules={"shac": Rule(ShacTraining, ShacConfig)},
     contact="hard",
     kind=GRADIENT,

@@ -1,0 +1,368 @@
+"""Training of policies, one or several in step, and their evaluation in the hard contact model.
+
+A method's :class:`Training` holds the policies of a batch of runs. :class:`PolicyRunner` alternates between
+some episodes of training and one episode of each deterministic policy, which gives a row of the results.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from plab.config import Config, ConfigError
+from plab.config.selection import OBSERVED
+from plab.results import ResultsError
+from plab.results.schema import REPLAY_SUFFIX
+from plab.runners.libraries import torch
+from plab.runners.policy import PolicyConfig, save_policy, torch_settings
+from plab.runners.runner import LAST, Runner, SimulatorCache, Step, Track, episode_columns, simulator_key
+from plab.runners.tracks import TogetherError
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.policies import BasePolicy
+    from torch import Tensor
+
+    from plab.envs.core import EpisodeBatch
+    from plab.envs.tensors import TensorEnv
+
+NOT_FINITE = "the policy's actions are not finite"
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Result of an episode of a deterministic policy.
+
+    Attributes:
+        measures: Values of :func:`plab.runners.runner.episode_columns`.
+        actions: Actions, shape [T, A].
+        failure: Time and reason if it broke off, else empty; from then on it rests as
+            :meth:`plab.envs.core.EpisodeBatch.step` has it.
+    """
+
+    measures: dict[str, float]
+    actions: np.ndarray
+    failure: str
+
+
+def evaluate(env: TensorEnv, decide: Callable[[Tensor], Tensor]) -> list[Evaluation]:
+    """Run an episode of a deterministic policy in each environment of a batch.
+
+    Args:
+        env: The environments.
+        decide: Maps observations, shape [env, entry], to actions, shape [env, A].
+    """
+    columns = episode_columns(env.batch.problem.term_names)
+    observations = env.reset()
+    sums: dict[str, Tensor] = {}
+    actions: list[Tensor] = []
+    failures: dict[int, str] = {}
+    for _ in range(env.batch.horizon):
+        actions.append(decide(observations))
+        done = env.step(actions[-1].double().nan_to_num(), strict=False)
+        failures = dict(done.failures) | failures
+        values = done.info | {"reward": done.reward}
+        sums = {n: values[n] if n in LAST or n not in sums else sums[n] + values[n] for n in columns}
+        observations = done.observation
+    # From the device at once.
+    rows = torch.stack([sums[name] for name in columns]).cpu().numpy().T
+    ran = torch.stack(actions, dim=1).cpu().numpy()
+    return [
+        Evaluation(dict(zip(columns, own.tolist(), strict=True)), ran[e], failures.get(e, ""))
+        for e, own in enumerate(rows)
+    ]
+
+
+def shared_batches(cache: SimulatorCache, *kinds: tuple[Sequence[Config], str]) -> list[EpisodeBatch]:
+    """Return batches of environments, of some configurations and a contact model each, in their initial
+    states: those kept from the last run if they can be of these scenes."""
+
+    # Imported here, as all that brings the simulator along.
+    from plab.config import build_scene
+    from plab.envs.core import EpisodeBatch
+
+    def start_again(batches: list[EpisodeBatch]) -> None:
+        for batch, (cfgs, contact) in zip(batches, kinds, strict=True):
+            batch.renew(cfgs)
+            batch.reset()
+            batch.problem.simulator.set_contact(contact, softness=cfgs[0].method.softness)
+
+    key: list[Hashable] = []
+    for cfgs, contact in kinds:
+        cfg = cfgs[0]
+        key += [simulator_key(cfg, build_scene(cfg)), cfg.sim.horizon, len(cfgs), contact]
+        key += [getattr(cfg, name) for name in OBSERVED]
+    return cache.get(
+        tuple(key),
+        lambda: [EpisodeBatch(cfgs, contact=contact) for cfgs, contact in kinds],
+        check=start_again,
+    )
+
+
+@dataclass
+class Learned:
+    """Training of a policy since its last evaluation.
+
+    Attributes:
+        measures: Means over the episodes that ended, by the training's columns; NaN if none has.
+        ended: Number of these episodes.
+        broken: Times and reasons of those that broke off; their environments rested until their end.
+        losses: Mean losses of the updates, by name.
+    """
+
+    measures: dict[str, float]
+    ended: int
+    broken: Sequence[str] = ()
+    losses: Mapping[str, float] = field(default_factory=dict)
+
+
+class Training(ABC):
+    """Policies in training, one per run, which can pause after each cycle: a batch of episodes, or an update.
+
+    Attributes:
+        batch: Environments of the training.
+        total_steps: Transitions of each policy in the whole training, in whole cycles.
+        watched: Whether losses of the updates are asked for.
+        report: Function to call when episodes have ended.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = ("train_reward", "train_score")
+    """Measures of :class:`Learned`."""
+
+    round_episodes: tuple[int, int] = 1, 0
+    """Episodes of an environment in a cycle, and those of them with gradient."""
+
+    watched = False
+    report: Callable[[], None]
+
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch, cycle: int) -> None:
+        """Begin a training of ``method.episodes``, in cycles of so many transitions of each policy."""
+        self.batch, self._horizon = batch, batch.horizon
+        self.total_steps = whole_cycles(cfgs[0].method_as(PolicyConfig).episodes * self._horizon, cycle)
+        self.report = lambda: None
+
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Transitions of each policy so far."""
+
+    @property
+    def episodes(self) -> int:
+        """Complete episodes of each policy so far."""
+        return self.steps // self._horizon
+
+    def train(self, episodes: int) -> None:
+        """Train until each policy has done some episodes, or all its transitions."""
+        while self.episodes < episodes and self.steps < self.total_steps:
+            self.cycle()
+
+    @abstractmethod
+    def cycle(self) -> None:
+        """Train for one cycle."""
+
+    @abstractmethod
+    def decide(self, observations: Tensor) -> Tensor:
+        """Return the deterministic policies' actions, shape [run, A], for an observation of each, shape [run,
+        entry]."""
+
+    @abstractmethod
+    def take(self) -> list[Learned]:
+        """Return each policy's training since the last call."""
+
+    @abstractmethod
+    def states(self) -> list[dict[str, Any]]:
+        """Return each policy's state: all that further training depends on, except a replay buffer."""
+
+    @abstractmethod
+    def restore(self, run: int, state: Mapping[str, Any]) -> None:
+        """Return a policy to one of :meth:`states`; RuntimeError, ValueError or LookupError if it is of other
+        networks."""
+
+    def write(self, run: int, path: Path) -> None:  # noqa: B027
+        """Write a policy's replay buffer, if it has one; ResultsError if that fails."""
+
+    def read(self, run: int, path: Path) -> None:  # noqa: B027
+        """Read a policy's replay buffer, if it has one; ResultsError if that fails."""
+
+    @abstractmethod
+    def policy(self, run: int) -> BasePolicy:
+        """Return a policy as Stable-Baselines3 has it."""
+
+    def moments(self, run: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return means and variances by which a policy's observations are scaled, shape [entry] each, if they
+        are."""
+        return None
+
+
+def whole_cycles(steps: int, cycle: int) -> int:
+    """Round transitions up to whole cycles."""
+    return math.ceil(steps / cycle) * cycle
+
+
+class PolicyRunner(Runner):
+    """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
+
+    The runs stand at the same evaluation; once one has failed, the others begin again without it.
+
+    Attributes:
+        training: Type of the training.
+        policies: The policies in training.
+    """
+
+    training: ClassVar[type[Training]]
+    policies: Training
+    _pace = 0.0
+    _shown = ""
+
+    @property
+    def method(self) -> Any:
+        """The section ``method`` that the runs have in common."""
+        return self.tracks[0].cfg.method
+
+    def context(self) -> AbstractContextManager[Any]:
+        """Give torch its threads."""
+        return torch_settings(self.method.torch_threads)
+
+    def require_torch_device(self) -> None:
+        """Raise ConfigError, before anything is built, if torch does not have the device."""
+        if self.method.torch_device == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(
+                "method.torch_device=cuda: torch finds no CUDA device; choose method.torch_device=cpu"
+            )
+
+    def training_configs(self) -> list[Config]:
+        """Return the configurations of the training's environments, by default ``num_envs`` per run."""
+        return [track.cfg for track in self.tracks for _ in range(self.method.num_envs)]
+
+    def build(self) -> None:
+        """Make the environments of the training, and those in the hard contact model that judge."""
+        from plab.envs.tensors import TensorEnv
+
+        self.require_torch_device()
+        cfgs = [track.cfg for track in self.tracks]
+        kinds = (self.training_configs(), self.method.contact), (cfgs, "hard")
+        batch, judge = shared_batches(self.cache, *kinds)
+        self._judge, self.problem = TensorEnv(judge), judge.problem
+        self.policies = self.training(cfgs, batch)
+        self.policies.watched = any(track.log.wanted for track in self.tracks)
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Leave the policy as it begins, or take that of the file and its replay buffer."""
+        if state is None:
+            return
+        self.policies.restore(track.number, state)
+        if self.has_more(track):
+            try:
+                self.policies.read(track.number, _replay_path(track))
+            except ResultsError as error:
+                track.fail(error)
+
+    def has_more(self, track: Track) -> bool:
+        """Return whether there are steps to train for, or the untrained policy has not been evaluated."""
+        return track.iteration == 0 or self.policies.steps < self.policies.total_steps
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Train until the next evaluation is due, except before the first, and evaluate all."""
+        if len(tracks) < len(self.tracks):
+            raise TogetherError("a run has failed")
+        training, start = self.policies, time.perf_counter()
+        before = training.steps
+
+        def report() -> None:
+            pace = (training.steps - before) * len(tracks) / (time.perf_counter() - start)
+            self.report(training.episodes, f"{pace:.0f} steps/s {self._shown}")
+
+        training.report = report
+        # The first episode, of the untrained policies, compiles the kernels.
+        if tracks[0].iteration > 0:
+            self.enter("optimise")
+            last = tracks[0].run.result.columns["episodes"][-1]
+            training.train(int(last) + self.method.evaluate_every)
+            self.enter("evaluate")
+        evaluations = evaluate(self._judge, training.decide)
+        learned, states = training.take(), training.states()
+        share = (time.perf_counter() - start) / len(tracks)
+        steps = training.steps - before
+        self._pace = steps / share
+        every, differentiated = training.round_episodes
+        gradient = steps // every * differentiated
+        for track, done, own, state in zip(tracks, evaluations, learned, states, strict=True):
+            start = time.perf_counter()
+            if why := _unusable(track, own, done):
+                track.fail(why)
+                continue
+            try:
+                training.write(track.number, _replay_path(track))
+                track.log.write({f"train/{name}": loss for name, loss in own.losses.items()}, training.steps)
+            except ResultsError as error:
+                track.fail(error)
+                continue
+            yield (
+                track,
+                Step(
+                    done.measures | own.measures,
+                    done.actions,
+                    state,
+                    episodes=training.episodes,
+                    steps=training.steps,
+                    steps_forward=len(done.actions) + steps - gradient,
+                    steps_gradient=gradient,
+                    seconds=share + time.perf_counter() - start,
+                    keep=training.steps >= training.total_steps,
+                    whole=not done.failure,
+                ),
+            )
+
+    def extent(self) -> tuple[int, int, int]:
+        """Return how many episodes of training there are, and after how many there is an evaluation."""
+        total = self.policies.total_steps // self.policies.batch.horizon
+        return self.policies.episodes, total, self.method.evaluate_every
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report how the policies do on average, and the transitions of all per second."""
+        reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
+        mean = "" if len(rows) == 1 else "mean "
+        self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"
+        pace = f"{self._pace:.0f} steps/s " if self._pace else ""
+        self.report(self.policies.episodes, pace + self._shown)
+
+    def conclude(self, track: Track) -> None:
+        """Keep the policy of the last evaluation, after which nothing is sampled any more."""
+        policy, moments = self.policies.policy(track.number), self.policies.moments(track.number)
+        save_policy(track.run.path, self.method, policy, moments)
+        _replay_path(track).unlink(missing_ok=True)
+
+
+def _replay_path(track: Track) -> Path:
+    return track.run.path.with_suffix(REPLAY_SUFFIX)
+
+
+def _unusable(track: Track, learned: Learned, done: Evaluation) -> str:
+    """Return why a run cannot go on, or an empty text; count episodes that broke off in the result's
+    provenance, and warn of them."""
+    broken = learned.broken
+    if not np.isfinite(done.actions).all():
+        return NOT_FINITE
+    if broken and len(broken) >= learned.ended:
+        return f"all {learned.ended} episodes of training broke off, the first in {broken[0]}"
+    if done.failure and track.best_actions is None:
+        return done.failure
+    provenance = track.run.result.provenance
+    for name, texts in (("episodes", broken), ("evaluations", [done.failure] if done.failure else [])):
+        if texts:
+            provenance[f"broken_{name}"] = provenance.get(f"broken_{name}", 0) + len(texts)
+            _log.warning(
+                "%s: iteration %d: %d %s broke off and rested until their end, the first in %s",
+                *(track.run.path, track.iteration, len(texts), name, texts[0]),
+            )
+    return ""
