@@ -26,14 +26,20 @@ COMMAND = "Jupyter"  # what is given as the command that made this
 # %%
 import math
 
-from plab.report.agreement import TOLERANCE
 from plab.report.curves import aggregates, rewards
 from plab.report.figures import Drawing, legend_of_methods, single, style
 from plab.report.formats import number
 from plab.report.methods import method
 from plab.report.notebook_cells import gather, say, show_figure, show_origin, show_table
 from plab.report.series import load_series
-from plab.report.tables import iou_per_configuration, iou_per_task, ordered_tasks, settings_note, solvability
+from plab.report.tables import (
+    TOLERANCE,
+    iou_per_configuration,
+    iou_per_task,
+    ordered_tasks,
+    settings_note,
+    solvability,
+)
 
 # %%
 runs = gather(RESULTS, WORDS)

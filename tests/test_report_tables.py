@@ -18,13 +18,12 @@ import synthetic
 from plab.cli.report import main
 from plab.config import load_config
 from plab.config.selection import SelectionError, select
-from plab.report.agreement import agreement
 from plab.report.collect import NAMES, MixedRunsError, Runs, Setting, changed_settings, collect
 from plab.report.formats import NOTHING, Table, number
 from plab.report.hyperparameters import hyperparameters
 from plab.report.methods import method as look
 from plab.report.statistics import Summary, stratified_difference, summarise
-from plab.report.tables import iou_per_configuration, iou_per_task, solvability, timing
+from plab.report.tables import agreement, iou_per_configuration, iou_per_task, solvability, timing
 from plab.report.writing import write_tables
 from plab.results import check, config_dict, load
 from plab.results.examples import EXAMPLES, example_archive

@@ -34,8 +34,6 @@ from plab.errors import tell
 from plab.progress import show_line
 from plab.report.reference import paper_table
 
-__all__ = ["COLUMNS", "main", "paper_row", "rows"]
-
 COLUMNS = (
     "task", "device", "precision", "batch", "grid", "particles", "what", "first_s", "median_ms", "min_ms",
     "max_ms", "steps_per_s", "ns_per_particle", "memory_mb", "peak_rss_mb",

@@ -25,8 +25,6 @@ from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
 from plab.render.surface import body_slices, body_surfaces
 
-__all__ = ["quantities", "write_ply", "write_vtk"]
-
 Things = Callable[[int], Mapping[str, pv.PolyData]]
 """Gives what there is at a step, by name."""
 

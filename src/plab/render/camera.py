@@ -11,8 +11,6 @@ from plab.objective import TARGET_MASS
 from plab.render.shapes import manipulator_parts, pose_matrix, transform
 from plab.scenes import Camera, Scene, sample_particles
 
-__all__ = ["DEFAULT_VIEW", "VIEWS", "View", "fit_camera", "scene_camera"]
-
 
 @dataclass(frozen=True)
 class View:

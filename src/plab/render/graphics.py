@@ -11,8 +11,6 @@ from importlib.util import find_spec
 
 from plab.errors import PlabError
 
-__all__ = ["RenderError", "missing_graphics", "require_graphics", "require_packages"]
-
 _EGL_PLATFORM_DEVICE = 0x313F
 _WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
 

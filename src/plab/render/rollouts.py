@@ -23,19 +23,6 @@ from plab.scenes import Scene
 from plab.sim import Simulator, State
 from plab.targets import TargetError
 
-__all__ = [
-    "RecordedRollout",
-    "demonstration",
-    "record",
-    "record_all",
-    "record_with_motion",
-    "result",
-    "say",
-    "starts",
-    "stored",
-]
-
-
 Section = TypeVar("Section")
 
 

@@ -15,8 +15,6 @@ from scipy.spatial import cKDTree
 
 from plab.scenes import Camera
 
-__all__ = ["FLOOR_EDGE", "FLOOR_LOW", "AmbientLight", "Cloud", "floor_light", "hidden_share"]
-
 FLOOR_LOW = -0.4
 """Lowest x and z of the floor that can lie in shadow [domain units]."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from plab.scenes import Manipulator
 
-__all__ = ["Part", "manipulator_parts", "pose_matrix", "transform"]
-
 _SIDES = 48  # of a body of revolution, around its axis
 _ARC = 16  # segments of half a circle
 

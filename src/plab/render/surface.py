@@ -17,8 +17,6 @@ from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 
 from plab.scenes import Body, MeshBody, Scene, sample_particles
 
-__all__ = ["BodySurface", "Field", "body_slices", "body_surfaces", "target_field"]
-
 KERNEL_WIDTH = 1.2
 """Standard deviation of the smoothing kernel [mean particle spacings]."""
 

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 
 from plab.config.families import RL
 from plab.config.selection import lookup
-from plab.report.agreement import AGREES, TOLERANCE, compared_cells, in_all
 from plab.report.collect import Runs
 from plab.report.figures import Drawing, draw_band, grid, legend, legend_of_methods, log_axis, single
 from plab.report.formats import number
@@ -23,7 +22,16 @@ from plab.report.methods import method
 from plab.report.reference import paper_table
 from plab.report.series import Rows, Series, at_budgets, band, strata_of
 from plab.report.statistics import improvement, interquartile_mean, performance_profile, shared_strata
-from plab.report.tables import BUDGET_NOTES, demonstration_scores, ordered_tasks, settings_note
+from plab.report.tables import (
+    AGREES,
+    BUDGET_NOTES,
+    TOLERANCE,
+    compared_cells,
+    demonstration_scores,
+    in_all,
+    ordered_tasks,
+    settings_note,
+)
 
 _CLAMPED = "Values below zero count as zero, as in the paper."
 _SHADED = "Lines: mean over the runs; shaded: one standard deviation."

@@ -31,7 +31,7 @@ from plab.report.statistics import (
     performance_profile,
     shared_strata,
 )
-from plab.report.tables import Cells, difference, ordered_tasks, settings_note
+from plab.report.tables import Cell, compare, ordered_tasks, settings_note
 from plab.report.templates import asset, render
 from plab.results.run_file import replace_file
 
@@ -71,14 +71,12 @@ class Page:
         """
         self.shown = best_runs(runs, every_run=every_run)
         self._out, self._under_way = out, runs.under_way > 0
-        ours, theirs = Cells("ours", runs), Cells("paper", runs)
+        cells = compare(runs, "task") | compare(runs, "configuration")
         tasks, with_runs = ordered_tasks(runs.tasks), set(runs.table["task"])
         self._content = {
             "methods": [_look(method(name), k) for k, name in enumerate(runs.methods)],
             "tasks": [
-                {"task": task, "cells": _compared(runs, ours, theirs, (task,))}
-                for task in tasks
-                if task in with_runs
+                {"task": task, "cells": _by_method(cells, runs, task)} for task in tasks if task in with_runs
             ],
             "gallery": _gallery(self.shown),
             "aggregates": _aggregates(runs),
@@ -90,7 +88,7 @@ class Page:
         self._configurations: list[dict[str, Any]] = [
             {"name": f"{task}-v{variant}", "task": task, "variant": variant}
             | {"best": best.get(f"{task}-v{variant}")}
-            | {"cells": _compared(runs, ours, theirs, (task, variant))}
+            | {"cells": _by_method(cells, runs, task, variant)}
             for task in tasks
             for variant in runs.variants
         ]
@@ -169,17 +167,17 @@ def _ends(found: Interval) -> list[float | None]:
     return [_finite(value) for value in (found.value, found.low, found.high)]
 
 
-def _compared(runs: Runs, ours: Cells, theirs: Cells, key: tuple[str, ...]) -> dict[str, Any]:
+def _by_method(cells: Mapping[tuple[str, ...], Cell], runs: Runs, *which: str) -> dict[str, Any]:
     """Return our score of a task, or of one of its variants, the paper's and their difference, by method."""
-    cells = {}
-    for name in runs.methods:
-        mine = ours.cell(key, name)
-        cells[name] = {
-            "ours": _summary(mine.summary) | {"expected": mine.expected},
-            "paper": _summary(theirs.cell(key, name).summary),
-            "difference": _ends(difference(ours, theirs, runs.variants, key, name)),
+    return {
+        name: {
+            "ours": _summary(cell.ours) | {"expected": cell.expected},
+            "paper": _summary(cell.paper),
+            "difference": _ends(cell.difference),
         }
-    return cells
+        for name in runs.methods
+        for cell in [cells[(*which, name)]]
+    }
 
 
 def _listed(texts: Sequence[str]) -> str:

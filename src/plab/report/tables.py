@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -10,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
 from plab.config.families import GRADIENT, RL
 from plab.config.suite import SUITE_VARIANTS
@@ -34,71 +34,42 @@ INTERVAL = f"{CONFIDENCE:.0%} interval"
 
 @dataclass(frozen=True)
 class Cell:
-    """A number of a table.
+    """Scores of a method in a task, or in one of its variants.
 
     Attributes:
-        summary: Mean, spread and number of the runs.
-        expected: How many runs there should be; 0 in the paper's tables.
+        ours: Mean, spread and number of our runs.
+        expected: Number of runs that there should be.
+        paper: The same of the paper; that of the whole method for some of its runs.
+        difference: Ours minus the paper's; of a task the mean over the variants that both have.
     """
 
-    summary: Summary
+    ours: Summary
     expected: int
-
-    @property
-    def complete(self) -> bool:
-        """Whether there are all runs."""
-        return self.summary.count >= self.expected
-
-    @property
-    def text(self) -> str:
-        """Mean and spread, and how many runs there are where some are missing."""
-        count = f"{self.summary.count}/{self.expected}"
-        if not self.summary.count:
-            return count
-        text = mean_and_std(self.summary)
-        return text if self.complete else f"{text} ({count})"
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Values by column of a CSV file."""
-        values = {"mean": self.summary.mean, "std": self.summary.std, "runs": self.summary.count}
-        return values | ({"expected": self.expected} if self.expected else {})
+    paper: Summary
+    difference: Interval
 
 
-class Cells:
-    """Scores by task, variant and method, of our runs or of the paper's.
-
-    Attributes:
-        source: Origin of the numbers, ``ours`` or ``paper``.
-    """
-
-    def __init__(self, source: str, runs: Runs) -> None:
-        """Take the numbers.
-
-        Args:
-            source: ``ours`` or ``paper``.
-            runs: Our runs; also says what is asked for.
-        """
-        self.source, self._runs = source, runs
-        groups = runs.table.groupby(["task", "variant", "method"])["score"] if source == "ours" else ()
-        self._scores = {key: own.to_numpy(float) for key, own in groups}
-
-    def cell(self, key: tuple[str, ...], name: str) -> Cell:
-        """Return the cell of a task and variant, or of a task over all variants, and a method."""
-        if self.source == "paper":
-            return Cell(_printed((*key, name)), 0)
-        task, *variant = key
-        variants = variant or self._runs.variants
-        scores: list[ArrayLike] = [self._scores.get((task, one, name), []) for one in variants]
-        return Cell(summarise(np.concatenate(scores)), len(variants) * len(self._runs.seeds))
+def compare(runs: Runs, unit: str) -> dict[tuple[str, ...], Cell]:
+    """Return cells by task and method, or by task, variant and method if ``unit`` is ``configuration``."""
+    groups = runs.table.groupby(["task", "variant", "method"])["score"]
+    scores = {key: own.to_numpy(float) for key, own in groups}
+    whole, single = _numbers_of_paper("iou_per_task"), _numbers_of_paper("iou_per_configuration")
+    by_task, each = [runs.variants], [[variant] for variant in runs.variants]
+    cells = {}
+    for task in ordered_tasks(runs.tasks):
+        for variants, name in itertools.product(by_task if unit == "task" else each, runs.methods):
+            of = method(name).of or name
+            own = [scores.get((task, variant, name), np.array([])) for variant in variants]
+            theirs = [_printed(single.get((task, variant, of)), 1) for variant in variants]
+            paper = _printed(whole.get((task, of)), len(SUITE_VARIANTS)) if unit == "task" else theirs[0]
+            gap = stratified_difference([summarise(values) for values in own], theirs)
+            key = (task, name) if unit == "task" else (task, *variants, name)
+            cells[key] = Cell(summarise(np.concatenate(own)), len(variants) * len(runs.seeds), paper, gap)
+    return cells
 
 
-def _printed(key: tuple[str, ...]) -> Summary:
-    # Of part of a method's runs, the whole method's.
-    *which, named = key
-    name, count = ("iou_per_task", len(SUITE_VARIANTS)) if len(which) == 1 else ("iou_per_configuration", 1)
-    printed = _numbers_of_paper(name).get((*which, method(named).of or named))
-    return summarise([]) if printed is None else Summary(*printed, count * PAPER_SEED_COUNT)
+def _printed(values: tuple[float, float] | None, variants: int) -> Summary:
+    return summarise([]) if values is None else Summary(*values, variants * PAPER_SEED_COUNT)
 
 
 @functools.cache
@@ -144,99 +115,158 @@ def ends(interval: Interval, decimals: int = 2) -> str:
 
 def iou_per_task(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per task and method: ours, the paper's, and the two compared."""
-    keys: list[tuple[str, ...]] = [(task,) for task in ordered_tasks(runs.tasks)]
-    return _iou_tables(runs, "task", "over variants and seeds", keys)
+    return _iou_tables(runs, "task", "over variants and seeds")
 
 
 def iou_per_configuration(runs: Runs) -> list[Table]:
     """Return normalised incremental IoU per configuration and method: ours, the paper's, the two compared."""
-    return _iou_tables(runs, "configuration", "over seeds", _configurations(runs))
+    return _iou_tables(runs, "configuration", "over seeds")
 
 
-def _configurations(runs: Runs) -> list[tuple[str, ...]]:
-    return [(task, variant) for task in ordered_tasks(runs.tasks) for variant in runs.variants]
-
-
-def difference(
-    ours: Cells, theirs: Cells, variants: Sequence[str], key: tuple[str, ...], name: str
-) -> Interval:
-    """Return the difference of a cell; that of a task is the mean over the variants that both have, see
-    :func:`plab.report.statistics.stratified_difference`."""
-    strata = [key] if len(key) > 1 else [(*key, variant) for variant in variants]
-    return stratified_difference(
-        *([side.cell(one, name).summary for one in strata] for side in (ours, theirs))
-    )
-
-
-def _iou_tables(runs: Runs, unit: str, what: str, keys: list[tuple[str, ...]]) -> list[Table]:
-    """Return the three forms of a table of scores.
-
-    Args:
-        runs: Our runs.
-        unit: Unit of a row: ``task`` or ``configuration``.
-        what: What means and spreads are taken over.
-        keys: Task, or task and variant, of each row.
-    """
+def _iou_tables(runs: Runs, unit: str, what: str) -> list[Table]:
+    """Return the three forms of a table of scores; ``what`` means and spreads are taken over."""
     name, title = f"iou_per_{unit}", f"Normalised incremental IoU per {unit}"
-    columns = ("task", "variant")[: 1 if unit == "task" else 2]
-    ours, paper = Cells("ours", runs), Cells("paper", runs)
+    columns = ["task", "variant"][: 1 if unit == "task" else 2]
+    cells = compare(runs, unit)
+    keys = list(dict.fromkeys(key[:-1] for key in cells))
     printed = [m for m in runs.methods if _in_paper(m)]
     made = []
-    for cells, owner, methods, more in (
-        (ours, "plab", runs.methods, [_INCOMPLETE, *settings_note(runs)]),
-        (paper, "the paper", printed, []),
+    for form, owner, methods, more in (
+        ("ours", "plab", runs.methods, [_INCOMPLETE, *settings_note(runs)]),
+        ("paper", "the paper", printed, []),
     ):
-        grid = [[cells.cell(key, m) for m in methods] for key in keys]
-        shown = pd.DataFrame([[cell.text for cell in line] for line in grid], columns=_labels(methods))
-        shown = shown.replace("0/0", NOTHING)
-        for position, column in enumerate(columns):
-            shown.insert(position, column, [key[position] for key in keys])
-        data = [
-            dict(zip(columns, key, strict=True)) | {"method": m} | cell.numbers
-            for key, line in zip(keys, grid, strict=True)
-            for m, cell in zip(methods, line, strict=True)
-        ]
-        bold = np.array([[False] * len(columns) + _best(line, methods) for line in grid])
+        shown, data, bold = [], [], []
+        for key in keys:
+            line = [cells[(*key, m)] for m in methods]
+            sides = [(cell.ours, cell.expected) if form == "ours" else (cell.paper, 0) for cell in line]
+            shown.append([*key, *(_text(*side) for side in sides)])
+            where = dict(zip(columns, key, strict=True))
+            data += [where | {"method": m} | _numbers(*side) for m, side in zip(methods, sides, strict=True)]
+            bold.append([False] * len(columns) + _best(sides, methods))
+        labels = [*columns, *(method(m).label for m in methods)]
         notes = [f"Mean ± standard deviation {what}.", _BOLD, *more]
-        heading = f"{title}, {owner}"
         made.append(
-            Table(name, cells.source, heading, shown, pd.DataFrame(data), bold, notes, len(keys) > 60)
+            Table(
+                *(name, form, f"{title}, {owner}", pd.DataFrame(shown, columns=labels), pd.DataFrame(data)),
+                *(np.array(bold), notes, len(keys) > 60),
+            )
         )
     compared, data = [], []
-    for key in keys:
-        where = dict(zip(columns, key, strict=True))
-        for m in printed:
-            mine, theirs = ours.cell(key, m), paper.cell(key, m)
-            gap = difference(ours, paper, runs.variants, key, m)
-            texts = {"plab": mine.text, "paper": theirs.text, "difference": number(gap.value, sign=True)}
-            compared.append(where | {"method": method(m).label} | texts | {INTERVAL: ends(gap)})
-            own = {f"paper_{k}": v for k, v in theirs.numbers.items()}
-            gaps: dict[str, Any] = {"difference": gap.value, "low": gap.low, "high": gap.high}
-            data.append(where | {"method": m} | mine.numbers | own | gaps)
+    for key, m in itertools.product(keys, printed):
+        where, cell = dict(zip(columns, key, strict=True)), cells[(*key, m)]
+        gap = cell.difference
+        texts = {"plab": _text(cell.ours, cell.expected), "paper": _text(cell.paper, 0)}
+        texts |= {"difference": number(gap.value, sign=True), INTERVAL: ends(gap)}
+        compared.append(where | {"method": method(m).label} | texts)
+        own = {f"paper_{k}": v for k, v in _numbers(cell.paper, 0).items()}
+        gaps = {"difference": gap.value, "low": gap.low, "high": gap.high}
+        data.append(where | {"method": m} | _numbers(cell.ours, cell.expected) | own | gaps)
     notes = [_DIFFERENCE, *settings_note(runs)]
     shown, title = pd.DataFrame(compared), f"{title}, compared"
     return [*made, Table(name, "comparison", title, shown, pd.DataFrame(data), None, notes, True)]
 
 
-def _labels(methods: Sequence[str]) -> list[str]:
-    return [method(name).label for name in methods]
+def _text(summary: Summary, expected: int) -> str:
+    """Write mean and spread, and how many runs there are where some are missing."""
+    count = f"{summary.count}/{expected}"
+    if not summary.count:
+        return count if expected else NOTHING
+    return mean_and_std(summary) + (f" ({count})" if summary.count < expected else "")
 
 
-def _best(line: Sequence[Cell], methods: Sequence[str]) -> list[bool]:
+def _numbers(summary: Summary, expected: int) -> dict[str, float]:
+    """Return values by column of a CSV file."""
+    values = {"mean": summary.mean, "std": summary.std, "runs": summary.count}
+    return values | ({"expected": expected} if expected else {})
+
+
+def _best(line: Sequence[tuple[Summary, int]], methods: Sequence[str]) -> list[bool]:
     """Return which cells are the best of their kind of method, as printed; none where one is incomplete."""
     best = [False] * len(line)
     for kind in (RL, GRADIENT):
         rivals = [
-            k
-            for k, m in enumerate(methods)
-            if method(m).kind == kind and (_in_paper(m) or line[k].summary.count)
+            k for k, m in enumerate(methods) if method(m).kind == kind and (_in_paper(m) or line[k][0].count)
         ]
-        if not rivals or not all(line[k].complete and line[k].summary.count for k in rivals):
-            continue
-        highest = max(round(line[k].summary.mean, 2) for k in rivals)
-        for k in rivals:
-            best[k] = round(line[k].summary.mean, 2) == highest
+        if rivals and all(line[k][0].count >= max(line[k][1], 1) for k in rivals):
+            highest = max(round(line[k][0].mean, 2) for k in rivals)
+            for k in rivals:
+                best[k] = round(line[k][0].mean, 2) == highest
     return best
+
+
+# -------------------------------------------------------------------------------------------------- agreement
+
+TOLERANCE = 0.1
+"""Differences of scores up to this count as none: about what the paper's own runs of one configuration differ
+by (its standard deviations are 0.09 in the mean)."""
+
+AGREES = f"within two of the paper's standard deviations or {TOLERANCE:g} of its mean"
+"""Criterion for the agreement of a cell."""
+
+
+def compared_cells(runs: Runs) -> pd.DataFrame:
+    """Return the cells that both have, a row per task, variant and method.
+
+    Returns:
+        Columns task, variant, method, ours, paper, paper_std (of the population), runs, difference (ours
+        minus the paper's) and agrees (whether that is within two standard deviations or the tolerance).
+    """
+    columns = ["task", "variant", "method", "ours", "paper", "paper_std", "runs"]
+    rows = [
+        (*key, cell.ours.mean, cell.paper.mean, cell.paper.std, cell.ours.count)
+        for key, cell in compare(runs, "configuration").items()
+        if cell.ours.count and cell.paper.count
+    ]
+    cells = pd.DataFrame(rows, columns=columns)
+    apart = cells["ours"] - cells["paper"]
+    allowed = np.maximum(2.0 * cells["paper_std"], TOLERANCE)
+    return cells.assign(difference=apart, agrees=apart.abs() <= allowed)
+
+
+def agreement(runs: Runs) -> list[Table]:
+    """Return the agreement per method, per kind of method if there are both, and over all of them; nothing
+    where no cell is in both."""
+    cells = compared_cells(runs)
+    if cells.empty:
+        return []
+    groups = [(method(name).label, own) for name, own in cells.groupby("method", sort=False)]
+    kinds = [
+        (f"all {kind}", own) for kind, own in cells.groupby(cells["method"].map(lambda n: method(n).kind))
+    ]
+    groups += kinds if len(kinds) > 1 else []
+    data = pd.DataFrame([{"method": label} | in_all(own) for label, own in [*groups, ("all", cells)]])
+    shown = pd.DataFrame(
+        {
+            "method": data["method"],
+            "cells": data["cells"].map(str),
+            "correlation": data["correlation"].map(number),
+            "mean distance": data["distance"].map(number),
+            "mean difference": [number(value, sign=True) for value in data["difference"]],
+            "agree": [f"{number(100.0 * share, 0)} %" for share in data["agree"]],
+        }
+    )
+    notes = [
+        "Mean scores of the configurations that both have. Correlation: Pearson's. Distance: of the means, "
+        f"without sign; difference: ours minus the paper's. Agree: {AGREES}."
+    ]
+    return [Table("agreement", "comparison", "Agreement with the paper's table", shown, data, notes=notes)]
+
+
+def in_all(cells: pd.DataFrame) -> dict[str, float]:
+    """Return the agreement of some of the :func:`compared_cells` as a whole.
+
+    Returns:
+        Their number ``cells``, ``correlation`` (NaN where nothing varies), mean ``distance``, mean
+        ``difference``, and the share that ``agree``.
+    """
+    varied = len(cells) > 1 and cells["ours"].std() > 0.0 and cells["paper"].std() > 0.0
+    return {
+        "cells": len(cells),
+        "correlation": cells["ours"].corr(cells["paper"]) if varied else float("nan"),
+        "distance": cells["difference"].abs().mean(),
+        "difference": cells["difference"].mean(),
+        "agree": cells["agrees"].mean(),
+    }
 
 
 # ------------------------------------------------------------------------------------------------ solvability
@@ -250,7 +280,7 @@ def solvability(runs: Runs) -> list[Table]:
     paper = paper_table("iou_per_configuration")
     best = paper.loc[paper.groupby(["task", "variant"])["iou_mean"].idxmax()].set_index(["task", "variant"])
     rows, cells = [], []
-    for key in _configurations(runs):
+    for key in itertools.product(ordered_tasks(runs.tasks), runs.variants):
         score = float(known.get(key, np.nan))
         theirs, name, printed = summarise([]), "", NOTHING
         if key in best.index:

@@ -9,12 +9,18 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 import plab
-from plab.report.agreement import agreement
 from plab.report.collect import Ablation, Runs
 from plab.report.formats import Table, write_index, write_table
 from plab.report.hyperparameters import hyperparameters
 from plab.report.series import load_rows, load_series
-from plab.report.tables import iou_per_configuration, iou_per_task, score_at_budget, solvability, timing
+from plab.report.tables import (
+    agreement,
+    iou_per_configuration,
+    iou_per_task,
+    score_at_budget,
+    solvability,
+    timing,
+)
 
 if TYPE_CHECKING:
     from plab.report.figures import Drawing

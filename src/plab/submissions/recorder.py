@@ -29,8 +29,6 @@ from plab.submissions.submission import (
     write,
 )
 
-__all__ = ["record"]
-
 _ledgers: dict[Path, _Ledger] = {}
 """Ledgers of this process by file: environments of one configuration share one, and their steps add up."""
 

@@ -20,15 +20,6 @@ from plab.targets.store import TargetStore
 if TYPE_CHECKING:
     from plab.sim import Simulator
 
-__all__ = [
-    "RECIPES",
-    "build_target",
-    "build_targets",
-    "check_target",
-    "demonstration",
-    "make_recipe",
-]
-
 RECIPES: dict[str, type[Recipe]] = {
     "bodies": recipes.BodiesTarget,
     "ring": recipes.RingTarget,
@@ -78,14 +69,8 @@ def _made(pickled: bytes) -> Recipe:
 
 
 def demonstration(scene: Scene, target: Mapping[str, Any]) -> np.ndarray | None:
-    """Return the actions that make a scripted target.
-
-    Args:
-        scene: The scene that the target belongs to.
-        target: ``recipe`` and the recipe's parameters, as a task's YAML has them.
-
-    Returns:
-        Actions in [-1, 1], shape [EPISODE_STEPS, A]; None for a target that need not be simulated.
+    """Return the actions that make a scripted target, in [-1, 1], shape [EPISODE_STEPS, A]; None for a
+    target that need not be simulated.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value.
@@ -103,14 +88,7 @@ def check_target(scene: Scene, target: Mapping[str, Any]) -> None:
 
 
 def build_target(scene: Scene, target: Mapping[str, Any]) -> np.ndarray:
-    """Build the mass tensor of a target that need not be simulated.
-
-    Args:
-        scene: The scene that the target belongs to: grid, particle count and mass, manipulators.
-        target: ``recipe`` and the recipe's parameters, as a task's YAML has them.
-
-    Returns:
-        Mass tensor, shape [n, n, n], float64.
+    """Return the mass tensor of a scene's target that need not be simulated, shape [n, n, n], float64.
 
     Raises:
         TargetError: If the recipe or a parameter does not exist or has a wrong value, the shape leaves the
@@ -175,9 +153,7 @@ def build_targets(
 
 def _target_scene(scene: Scene, recipe: Recipe) -> Scene:
     """Return the scene that a target is made from: draw 0 of the particles, in the recipe's material."""
-    material: dict[str, Any] = {}
-    if isinstance(recipe, scripted.Script):
-        material |= recipe.material
+    material = recipe.material if isinstance(recipe, scripted.Script) else {}
     made_from = replace(scene, particle_seed=0, **material)
     if material:
         try:

@@ -20,21 +20,6 @@ from plab.objective import spread_mass
 from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
 from plab.scenes.mesh import read_mesh
 
-__all__ = [
-    "EPISODE_STEPS",
-    "TARGET_SEED",
-    "BodiesTarget",
-    "MassTarget",
-    "PointsRecipe",
-    "PointsTarget",
-    "Recipe",
-    "RingTarget",
-    "TargetBody",
-    "TargetError",
-    "TensorRecipe",
-    "read_points",
-]
-
 TARGET_SEED = 1
 """Seed of a target's samples; not the scene's, or a target could be a shifted copy of the bodies."""
 
@@ -55,13 +40,7 @@ class TensorRecipe(Recipe, ABC):
 
     @abstractmethod
     def mass(self, scene: Scene) -> np.ndarray:
-        """Return the mass tensor.
-
-        Args:
-            scene: The scene that the target belongs to.
-
-        Returns:
-            Mass tensor, shape [n, n, n], float64, with the mass of the scene's particles.
+        """Return the mass tensor of a scene's target, shape [n, n, n], float64; its mass is the scene's.
 
         Raises:
             TargetError: If a parameter has a wrong value, or the shape leaves the domain.
@@ -76,7 +55,6 @@ class PointsRecipe(TensorRecipe):
         """Draw or read the points; positions [domain units], shape [point, 3]."""
 
     def mass(self, scene: Scene) -> np.ndarray:
-        """See :meth:`TensorRecipe.mass`."""
         points = self.sample(scene, np.random.default_rng(TARGET_SEED))
         top = 1.0 - 3.0 * scene.dx
         if not np.all((points >= -1e-9) & (points <= top + 1e-9)):
@@ -126,7 +104,6 @@ class BodiesTarget(PointsRecipe):
     bodies: dict[str, TargetBody]
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """See :meth:`PointsRecipe.sample`."""
         if not self.bodies:
             raise TargetError("target.bodies is empty: name at least one body")
         solids = []
@@ -169,7 +146,6 @@ class RingTarget(PointsRecipe):
     floor: float
 
     def sample(self, scene: Scene, rng: np.random.Generator) -> np.ndarray:
-        """See :meth:`PointsRecipe.sample`."""
         if not 0 <= self.around < len(scene.manipulators):
             raise TargetError(
                 f"target.around {self.around} is not the index of a manipulator, 0 .. "
@@ -193,7 +169,7 @@ class RingTarget(PointsRecipe):
 
 
 _MEASURED = 1000
-"""Most points whose distance to the next one is measured."""
+"""Maximum number of points whose distance to the next one is measured."""
 
 
 @dataclass
@@ -210,7 +186,6 @@ class PointsTarget(PointsRecipe):
     sha256: str | None = None
 
     def sample(self, scene: Scene, _: np.random.Generator) -> np.ndarray:
-        """See :meth:`PointsRecipe.sample`."""
         # Imported here: SciPy's start-up would be paid by every `--help`.
         from scipy.spatial import KDTree
 
@@ -243,7 +218,6 @@ class MassTarget(TensorRecipe):
     sha256: str | None = None
 
     def mass(self, scene: Scene) -> np.ndarray:
-        """See :meth:`TensorRecipe.mass`."""
         try:
             mass = _read_tensor(*pinned(self.file, self.sha256))
         except ShapeError as error:

@@ -18,19 +18,6 @@ from numpy.typing import ArrayLike
 from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
-__all__ = [
-    "DECIMALS",
-    "ActionTrack",
-    "CarryTarget",
-    "DentTarget",
-    "DrawTarget",
-    "LiftTarget",
-    "PressTarget",
-    "PushTarget",
-    "RollTarget",
-    "Script",
-]
-
 DRAWS = 200
 """Maximum number of draws of a script whose way is too long for an episode."""
 

@@ -20,8 +20,6 @@ from plab.targets.recipes import TargetError
 if TYPE_CHECKING:
     from plab.sim import Simulator
 
-__all__ = ["TargetStore", "load_release_target"]
-
 PHYSICS_VERSION = 1
 """Version of the physics, raised when results change by more than rounding: cached targets are then stale."""
 
@@ -96,32 +94,26 @@ def load_release_target(folder: str | Path, scene: Scene, variant: str) -> np.nd
     """
     name = "Rollingpin" if scene.name == "RollingPin" else scene.name
     path = Path(folder) / f"{name}3D-v{variant}.npy"
+    n, expected = scene.grid_size, (scene.particle_count, RELEASE_PARTICLES)
     try:
         mass = read_array(path)
+        if mass.shape != (n, n, n) or mass.dtype.kind not in "fiu" or not np.isfinite(mass).all():
+            what = f"shape {mass.shape} of {mass.dtype}, the grid needs finite numbers of shape {(n, n, n)}"
+            raise UnreadableError(f"has {what}")
+        negative, total = (float(part.sum()) / scene.particle_mass for part in (-mass.clip(None, 0), mass))
+        if negative > NEGATIVE_PARTICLES:
+            raise UnreadableError(
+                f"has negative masses, {negative:.3g} particle masses in all where the release's files have "
+                f"up to {NEGATIVE_PARTICLES:g}: the least is {mass.min():.3g}"
+            )
+        if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
+            raise UnreadableError(
+                f"holds {total:.0f} particle masses of {scene.particle_mass:.3g}, but the scene has "
+                f"{scene.particle_count} and the release's files {RELEASE_PARTICLES}"
+            )
     except FileNotFoundError:
-        raise TargetError(
-            f"targets.source: {path} does not exist; name the files like Move3D-v1.npy"
-        ) from None
+        wanted = "does not exist; name the files like Move3D-v1.npy"
+        raise TargetError(f"targets.source: {path} {wanted}") from None
     except (UnreadableError, OSError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise TargetError(f"targets.source: {path} cannot be read: {reason}") from None
-    n, expected = scene.grid_size, (scene.particle_count, RELEASE_PARTICLES)
-    if mass.shape != (n, n, n) or mass.dtype.kind not in "fiu":
-        raise TargetError(
-            f"targets.source: {path} has shape {mass.shape} of {mass.dtype}, the grid needs numbers of shape "
-            f"{(n, n, n)}"
-        )
-    if not np.isfinite(mass).all():
-        raise TargetError(f"targets.source: {path} must hold finite numbers")
-    negative, total = (float(part.sum()) / scene.particle_mass for part in (-mass.clip(None, 0), mass))
-    if negative > NEGATIVE_PARTICLES:
-        raise TargetError(
-            f"targets.source: {path} has negative masses, {negative:.3g} particle masses in all where the "
-            f"release's files have up to {NEGATIVE_PARTICLES:g}: the least is {mass.min():.3g}"
-        )
-    if all(abs(total - count) > MASS_TOLERANCE * count for count in expected):
-        raise TargetError(
-            f"targets.source: {path} holds {total:.0f} particle masses of {scene.particle_mass:.3g}, but the "
-            f"scene has {scene.particle_count} and the release's files {RELEASE_PARTICLES}"
-        )
+        raise TargetError(f"targets.source: {path} {getattr(error, 'strerror', None) or error}") from None
     return mass.astype(np.float64)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 
     from plab.config import Config
 
-__all__ = ["Viewer", "show"]
-
 _HEIGHT = 480
 
 
