@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
-import unseen
 from plab.config import Config, ConfigError, build_scene, drawn_configs, load_config
 from plab.envs.core import EpisodeBatch
-from plab.envs.tensors import TensorEnv
 from plab.problem import Trials
 from plab.results import RunResult, read
 from plab.runners import run_config
 from plab.runners.actors import DEVIATION_MIN, training_scenes
 from plab.runners.pods import PodsTraining
 from plab.runners.policy import load_policy, policy_path
-from plab.runners.runner import SimulatorCache
 from plab.runners.shac import ShacTraining, td_lambda
-from plab.runners.training import evaluate, shared_batches
+from plab.runners.training import shared_batches
 from plab.scenes import SceneError
 from same_runs import KeepsAll, finished_as, stopped_at
 from test_rl import break_evaluation
@@ -152,48 +147,6 @@ def test_a_state_of_other_networks_is_refused() -> None:
     training(8).restore(0, state)
     with pytest.raises(RuntimeError, match=r"mu.0.weight"):
         training(9).restore(0, state)
-
-
-def test_scores_in_scenes_that_a_policy_has_not_seen(finished, tmp_path, capsys, monkeypatch) -> None:
-    """Of five drawn scenes one does not fit; the others are simulated three at a time."""
-    name, table, line = name_of(finished), tmp_path / "unseen.csv", [str(finished.path), "--scenes", "5"]
-    cfg, policy = make_config(tmp_path, name), load_policy(finished.path)
-
-    def kept(cache: SimulatorCache, kind: tuple[list[Config], str]) -> list[EpisodeBatch]:
-        """The environments of the training: building others takes longer than the test."""
-        cfgs, contact = kind
-        batch, _ = environments(cfg)
-        batch.renew(cfgs)
-        batch.problem.simulator.set_contact(contact, softness=cfg.method.softness)
-        return [batch]
-
-    monkeypatch.setattr("unseen.shared_batches", kept)
-    monkeypatch.setattr("unseen.fits", lambda one: one.seed_scene != unseen.FIRST)
-    assert unseen.main([*line, "--together", str(ENVS), "--csv", str(table)]) == 0
-    assert str(finished.path) in capsys.readouterr().out
-    (row,) = pd.read_csv(table).to_dict("records")
-    drawn = {"shac": "2 drawn scenes", "pods": "5 drawn scenes"}[name]
-    assert (row["task"], row["trained_on"], row["scenes"]) == ("Move", drawn, 4)
-    seeds = range(unseen.FIRST + 1, unseen.FIRST + 5)
-    alone = (environments(scene)[1] for scene in drawn_configs(cfg, seeds))
-
-    def decide(observations: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(policy(observations.numpy()))
-
-    found = [evaluate(TensorEnv(judge), decide)[0].measures["score"] for judge in alone]
-    # Student's t with three degrees of freedom; the table has three digits.
-    mean, half = np.mean(found), 3.182446 * np.std(found, ddof=1) / 2.0
-    expected = mean, mean - half, mean + half, np.median(found)
-    assert [row[key] for key in ("score", "lower", "upper", "median")] == pytest.approx(expected, abs=6e-4)
-    monkeypatch.setattr("unseen.fits", lambda one: one.seed_scene == unseen.FIRST)
-    assert unseen.main(line) == 2
-    assert "1 of 5 scenes" in capsys.readouterr().err
-
-
-def test_what_cannot_be_tried(told: Callable[..., str]) -> None:
-    assert "result file" in told(["task=Move"], unseen.main)
-    assert "--scenes" in told(["a.h5", "--scenes", "1"], unseen.main)
-    assert "a.policy.npz" in told(["a.h5"], unseen.main)
 
 
 def test_targets_look_ahead_as_far_as_lambda_says() -> None:

@@ -45,14 +45,6 @@ def test_every_method_composes(method):
     assert isinstance(cfg, Config) and cfg.method.name == method
 
 
-def test_a_profile_gives_the_numbers_and_overrides_win():
-    paper, release = (load_config(["method=sac", f"method.profile={p}"]).method for p in ("paper", "release"))
-    assert (paper.tau, paper.learning_starts, paper.profiles) == (3e-4, 1000, {})
-    assert (release.tau, release.learning_starts, release.profiles) == (0.005, 2500, {})
-    assert load_config(["method=sac"]).method == release
-    assert load_config(["method=sac", "method.profile=paper", "method.tau=0.1"]).method.tau == 0.1
-
-
 def test_methods_differ_only_where_their_files_say():
     adam, gd, adam_h = (
         dataclasses.asdict(load_config([f"method={m}"]).method) for m in ("adam", "gd", "adam_h")
@@ -78,16 +70,6 @@ def test_every_variant_is_a_valid_scene(task, variant):
     assert scene.gravity == (0, -150 if task == "Chopsticks" else -30, 0)
     assert (scene.grid_size, scene.dt, scene.substeps, scene.horizon) == (64, 1e-4, 19, 50)
     assert (scene.yield_stress, scene.particle_count, scene.action_dim) == SUITE[task]
-
-
-def test_move_starts_with_the_spheres_on_either_side_of_the_ball():
-    for variant in (2, 5):
-        scene = build_scene(load_config(["task=Move", f"variant={variant}"]))
-        x, y, z = scene.bodies[0].center
-        left, right = scene.manipulators
-        assert left.position == pytest.approx((x - 0.1, y, z))
-        assert right.position == pytest.approx((x + 0.1, y, z))
-        assert (scene.floor_friction, left.size, left.friction) == (1.5, (0.03,), 0.9)
 
 
 def test_rope_scene():
@@ -131,21 +113,6 @@ def test_particles_scale():
         return build_scene(load_config([f"sim.particles_scale={scale}"])).particle_count
 
     assert (count(0.1), count(1), count(2.5), count(5e-5)) == (1000, 10000, 25000, 1)
-
-
-def test_scalar_overrides_reach_the_scene():
-    given = [
-        "task.yield_stress=.inf",
-        "task.gravity=[0,-5,0]",
-        "sim.dt=1.5e-4",
-        "task.manipulators.left.friction=0",
-    ]
-    scene = build_scene(load_config(given))
-    assert scene.yield_stress == float("inf")
-    assert scene.gravity == (0, -5, 0)
-    assert scene.dt == 1.5e-4
-    assert scene.manipulators[0].friction == 0
-    assert scene.manipulators[1].friction == 0.9
 
 
 def test_a_tilde_is_the_home(monkeypatch, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
 import sys
 import warnings
 import weakref
@@ -86,13 +85,6 @@ def test_ids_are_those_of_the_conf_folder() -> None:
     assert {env_id for env_id in gymnasium.registry if env_id.startswith("plab/")} == expected
 
 
-def test_importing_plab_is_light() -> None:
-    slow = {"taichi", "torch", "hydra", "stable_baselines3"}
-    code = f"import sys, plab, gymnasium; gymnasium.spec('plab/Rope-v1'); print({slow} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout.strip(), done.stderr) == ("set()", "")
-
-
 # ------------------------------------------------------------------------------------------ one environment
 
 
@@ -140,13 +132,6 @@ def test_an_episode_is_that_of_the_simulator_and_the_objective(env: PlabEnv) -> 
     assert info["score_printed"] == pytest.approx(final.score_printed, abs=1e-6)
     with pytest.raises(ResetNeeded):
         env.step(np.zeros(6))
-
-
-def test_actions_outside_are_clipped(env: PlabEnv) -> None:
-    action = np.array([3.0, -0.5, 1.0, -7.0, 0.2, 1.5])
-    wide = env.step(action)
-    env.reset(seed=3)
-    assert data_equivalence(wide, env.step(np.clip(action, -1, 1)), exact=True)
 
 
 def test_wrong_actions_and_options_are_refused(env: PlabEnv, vector: PlabVectorEnv) -> None:
@@ -221,29 +206,28 @@ def test_states_are_restored_and_copied_bit_for_bit(env: PlabEnv, vector: PlabVe
         copied.close()
 
 
-@pytest.mark.parametrize("changed", ["state", "target", "material", "scene"])
-def test_a_reset_follows_changes_of_the_simulator(changed: str) -> None:
+def test_a_reset_follows_changes_of_the_simulator() -> None:
     env = plab.make("Move", overrides=[*OVERRIDES, "observe_target=true"]).unwrapped
-    simulator, before = env.batch.problem.simulator, env.reset()
-    if changed == "state":
-        state = simulator.state()
-        state.x[:] += 0.03
-        simulator.set_initial_state(state)
-    elif changed == "target":
-        mass = np.roll(env.batch.problem.target_mass, 2, axis=1)
-        simulator.set_target(mass, np.stack([target_sdf(one) for one in mass]))
-    elif changed == "material":
-        simulator.set_material(yield_stress=3.0)
-    else:
-        simulator.set_scenes([replace(simulator.scenes[0], gravity=(0.0, -1.0, 0.0))])
-    after, fresh = env.reset(), env.batch.problem.simulator.measure()
-    if changed in ("state", "target"):
-        assert not np.array_equal(before[0], after[0]) and before[1]["iou"] != after[1]["iou"]
-    assert after[1]["iou"] == pytest.approx(fresh.iou[0]) and after[1]["score"] == pytest.approx(0, abs=1e-6)
-    wanted = target_observation(env.batch.problem.initial_mass[0], env.batch.problem.target_mass[0])
-    np.testing.assert_allclose(after[0][-len(wanted) :], wanted, rtol=1e-6)
-    _observation, reward, *_ends, info = env.step(np.zeros(6))
-    assert reward == pytest.approx(after[1]["loss"] - info["loss"], rel=1e-9)
+    simulator, state = env.batch.problem.simulator, env.batch.problem.simulator.state()
+    mass = np.roll(env.batch.problem.target_mass, 2, axis=1)
+    state.x[:] += 0.03
+    changes = (
+        lambda: simulator.set_initial_state(state),
+        lambda: simulator.set_target(mass, np.stack([target_sdf(one) for one in mass])),
+        lambda: simulator.set_material(yield_stress=3.0),
+        lambda: simulator.set_scenes([replace(simulator.scenes[0], gravity=(0.0, -1.0, 0.0))]),
+    )
+    for number, change in enumerate(changes):
+        before = env.reset()
+        change()
+        after, fresh = env.reset(), simulator.measure()
+        assert number > 1 or not np.array_equal(before[0], after[0])
+        assert after[1]["iou"] == pytest.approx(fresh.iou[0])
+        assert after[1]["score"] == pytest.approx(0, abs=1e-6)
+        wanted = target_observation(env.batch.problem.initial_mass[0], env.batch.problem.target_mass[0])
+        np.testing.assert_allclose(after[0][-len(wanted) :], wanted, rtol=1e-6)
+        _observation, reward, *_ends, info = env.step(np.zeros(6))
+        assert reward == pytest.approx(after[1]["loss"] - info["loss"], rel=1e-9)
     env.close()
 
 

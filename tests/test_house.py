@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -57,33 +56,6 @@ def test_starting_imports_nothing_heavy(code, allowed, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == "[]"
-
-
-CLIENT = """
-import numpy as np
-import plab
-
-def mean_height(scene: plab.Scene) -> float:
-    simulator = plab.Simulator([scene], device="cpu")
-    simulator.step(np.zeros((1, scene.action_dim)))
-    return float(simulator.state().x[..., 1].mean())
-
-height: float = mean_height(plab.build_scene(plab.load_config(["task=Move"])))
-observation, info = plab.make(plab.TASKS[0], 1, contact="soft").reset(seed=0)
-actions = plab.make_vec("Rope", num_envs=2).action_space.sample()
-best: float = plab.load_results("example")["score"].max()
-"""
-
-
-@pytest.mark.nightly
-def test_a_typed_client_passes_strict_type_checking(tmp_path) -> None:
-    pytest.importorskip("mypy")
-    (tmp_path / "client.py").write_text(CLIENT)
-    options = ["--strict", "--follow-imports=silent", "--config-file=", "--cache-dir=cache", "client.py"]
-    command = [sys.executable, "-m", "mypy", *options]
-    paths = os.environ | {"MYPYPATH": str(ROOT / "src")}
-    done = subprocess.run(command, cwd=tmp_path, env=paths, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_public_name_of_plab_is_there() -> None:

@@ -149,17 +149,6 @@ def full(device: str) -> Simulator:
     return simulator
 
 
-def test_the_gradient_of_a_rollout_with_a_soft_minimum(full: Simulator) -> None:
-    full.reset()
-    full.set_weights(dict.fromkeys(NAMES, 0.0) | {"soft": 1.0})
-    rng = np.random.default_rng(3)
-    u = rng.uniform(-0.9, 0.9, (2, 2, full.action_dim))
-    way = rng.normal(size=u.shape)
-    slope = (full.rollout(u).gradient * way).sum()
-    ends = [full.rollout(u + s * way, gradient=False).step_terms[..., 2].sum() for s in (1e-5, -1e-5)]
-    assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
-
-
 @pytest.mark.parametrize("every_step", [True, False])
 def test_functions_of_states_are_differentiated(every_step: bool, full: Simulator) -> None:
     """By actions, initial positions and material, against central differences."""
@@ -190,23 +179,6 @@ def test_functions_of_states_are_differentiated(every_step: bool, full: Simulato
             ends = [function(**(values | {name: value + sign * way})) for sign in (1, -1)]
         want, got = float(ends[0] - ends[1]) / 2, float((gradient * way).sum())
         assert got == pytest.approx(want, rel=2e-6), name
-
-
-def test_functions_of_states_agree_with_the_terms(full: Simulator) -> None:
-    """The SDF term, once compiled in and once as a function of the mass tensor."""
-    simulator = full
-    simulator.reset()
-    simulator.set_weights(dict.fromkeys(NAMES, 0.0) | {"sdf": 5.0})
-    sdf = np.random.default_rng(0).random((2, *[simulator.grid_size] * 3))
-    u = np.random.default_rng(1).uniform(-0.9, 0.9, (2, 3, simulator.action_dim))
-    want = simulator.rollout(u)
-    tensor = torch.tensor(u, requires_grad=True)
-    loss = 5.0 * (simulate(simulator, tensor).mass * torch.tensor(sdf)[:, None]).sum()
-    loss.backward()
-    assert float(loss.detach()) == pytest.approx(5.0 * want.step_terms[..., 0].sum(), rel=1e-12)
-    np.testing.assert_allclose(tensor.grad, want.gradient, atol=1e-12 * np.abs(want.gradient).max())
-    # The terms' own weights are as they were.
-    np.testing.assert_array_equal(simulator.rollout(u).gradient, want.gradient)
 
 
 def test_measures_are_the_formulas_and_the_gradient_of_all_is_summed(full: Simulator) -> None:

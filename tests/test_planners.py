@@ -29,12 +29,11 @@ from plab.runners.planners.planner import (
     knots_of,
     make_planner,
 )
-from plab.runners.planners.starts import ContactStarts, support
+from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles
 from plab.sweep.plan import plan
 from same_runs import assert_same_numbers
-from suite import KINDS, TILT, manipulator
 
 # ---------------------------------------------------------------- rules, on a quadratic loss
 
@@ -431,16 +430,6 @@ def test_contact_starts_reach_the_body(task: str) -> None:
             nearest.append([reference.signed_distance(m, p, particles)[0].min() for m, p in moving])
         # A tool's way ends at the body's surface, which the particles leave uneven.
         assert np.min(nearest, axis=0).max() < 0.03
-
-
-def test_support_is_how_far_a_shape_reaches() -> None:
-    points = torch.as_tensor(np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 81)] * 3), axis=-1).reshape(-1, 3))
-    for kind in set(KINDS) - {"Cylinder", "Chopsticks"}:
-        tool = replace(manipulator(kind, near=True), rotation=TILT)
-        pose = torch.tensor([*tool.position, *tool.rotation, tool.gap], dtype=torch.float64)
-        inside = points[reference.signed_distance(tool, pose, points + pose[:3])[0] <= 0].numpy()
-        for direction in np.concatenate([np.eye(3), [[0.6, -0.48, 0.64]]]):
-            assert support(tool, direction) == pytest.approx((inside @ direction).max(), abs=0.006)
 
 
 def solid(target: np.ndarray, center: np.ndarray, half: float, mass: float) -> None:

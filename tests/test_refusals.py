@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import synthetic
-import unseen
 from plab import bench
 from plab.bench import accuracy, speed, stability
 from plab.cli import report, results, status
@@ -196,7 +195,6 @@ TOOLS = [
     (accuracy.main, "--task Table", "Table"),
     (bench.main, "sped", "did you mean speed?"),
     (plab_main, "rnu", "choose from: run"),
-    (unseen.main, "nowhere.h5 --scenes 0", "--scenes"),
 ]
 """Command lines, their arguments, and what the answer names."""
 

@@ -126,16 +126,6 @@ def test_interquartile_mean_is_the_mean_of_the_middle_half() -> None:
     assert found.low == found.value == found.high
 
 
-def test_interval_of_a_mean_is_about_the_normal_one() -> None:
-    scores = np.random.default_rng(0).normal(0.5, 0.1, 400)
-    found = interquartile_mean([scores])
-    middle = scores[(scores > np.quantile(scores, 0.25)) & (scores < np.quantile(scores, 0.75))]
-    assert found.value == pytest.approx(middle.mean(), abs=1e-3)
-    # The trimmed mean of normal numbers has 1.19 times the variance of the mean.
-    reach = 1.96 * scores.std() * np.sqrt(1.19 / 400)
-    assert found.high - found.low == pytest.approx(2 * reach, rel=0.15)
-
-
 def test_improvement_is_the_mann_whitney_statistic_and_a_profile_a_share_of_runs() -> None:
     rng = np.random.default_rng(3)
     a, b = rng.integers(0, 5, 7).astype(float), rng.integers(0, 4, 5).astype(float)

@@ -15,7 +15,6 @@ import synthetic
 from plab.config.identity import member_name
 from plab.results import (
     ResultsError,
-    RunBusyError,
     RunFile,
     RunResult,
     config_hash,
@@ -155,18 +154,6 @@ def test_round_trip_of_every_field(tmp_path: Path, rng: np.random.Generator, com
 # --------------------------------------------------------------------------------------------------- resuming
 
 
-def test_finished_run_is_recognised_unless_forced(tmp_path: Path, rng: np.random.Generator) -> None:
-    run = finish_run(tmp_path, rng)
-    assert not run.partial_path.exists()
-    again = RunFile(make_config(tmp_path))
-    assert again.finished
-    assert again.result.evaluation["score"] == 0.75
-    np.testing.assert_equal(again.result.masses, run.result.masses)
-    forced = RunFile(make_config(tmp_path, force=True))
-    assert not forced.finished and forced.result.iterations.empty
-    assert run.path.exists()
-
-
 def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Generator, caplog) -> None:
     state = make_state(rng)
     run = RunFile(make_config(tmp_path))
@@ -184,19 +171,6 @@ def test_resuming_finds_rows_state_and_times(tmp_path: Path, rng: np.random.Gene
     assert again.result.provenance["resumed"] == 1
     # Other versions of packages are mentioned.
     assert "torch 0.4 ->" in caplog.text
-
-
-def test_a_run_is_computed_by_one_at_a_time(tmp_path: Path, rng) -> None:
-    run = RunFile(make_config(tmp_path))
-    with pytest.raises(RunBusyError, match=r"seed3-"):
-        RunFile(make_config(tmp_path))
-    run.record(make_row(0), make_state(rng))
-    run.close("stopped", "interrupted")
-    again = RunFile(make_config(tmp_path))
-    assert len(again.result.iterations) == 1
-    again.finish({"score": 1.0}, {})
-    assert RunFile(make_config(tmp_path)).finished
-    assert [path.name for path in again.path.parent.iterdir()] == [again.path.name]
 
 
 def test_partial_is_written_when_checkpoint_seconds_are_over(tmp_path: Path, rng, monkeypatch) -> None:

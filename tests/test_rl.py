@@ -240,13 +240,6 @@ def test_ppo_begins_as_the_profile_says() -> None:
             torch.testing.assert_close(weight @ weight.T, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_length_of_a_cycle(tmp_path: Path) -> None:
-    """A cycle is an update of ppo, or a batch of episodes of the others."""
-    for words, steps in ((("sac",), 8), (("ppo", "method.steps_per_update=11"), 12)):
-        method = make_config(tmp_path, *words).method
-        assert agents_of(method).cycle_steps(method, HORIZON) == steps
-
-
 # ---------------------------------------------------------------- interruptions
 
 

@@ -18,7 +18,6 @@ from rich.console import Console
 import synthetic
 from plab.cli.status import main
 from plab.config.selection import select
-from plab.results import pack
 from plab.results.running import acquire
 from plab.status import NAMES, STATES, survey, view
 from plab.status.view import duration, watch
@@ -70,15 +69,6 @@ def test_empty_folder_expects_the_papers_methods_and_three_seeds(tmp_path: Path,
     synthetic.save(synthetic.run(tmp_path))
     assert main([str(tmp_path), "--missing"]) == 0
     assert capsys.readouterr().out.endswith("50 runs: 1 done, 49 missing\n")
-
-
-def test_several_folders_and_archives_are_one_choice(folder: Path, tmp_path_factory) -> None:
-    other, archive = tmp_path_factory.mktemp("other"), tmp_path_factory.mktemp("packed") / "a.plab.zip.xz"
-    synthetic.save(synthetic.run(other, task="Move"))
-    pack(folder, archive, wanted=lambda row: True)
-    assert counts(find(archive)) == counts(find(folder))
-    found = survey([archive, other], select([], NAMES))
-    assert counts(found)["done"] == 3 and [run.task for run in found.runs] == ["Move"] + ["Rope"] * 5
 
 
 # --------------------------------------------------------------------------------------------- runs under way

@@ -22,7 +22,7 @@ from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read
 from plab.runners import RunError, run_config, trajectory
 from plab.runners.loggers import RunLog
-from plab.runners.runner import SimulatorCache, measures, shared_problem, simulator_key
+from plab.runners.runner import SimulatorCache, measures, shared_problem
 from plab.runners.training import shared_batches
 from plab.runners.trajectory import ActionSequence
 from plab.sim import SimulationError, Simulator
@@ -180,17 +180,6 @@ def test_a_finished_run_is_repeated_by_force_alone(finished: RunResult, monkeypa
     assert simulator.scenes[0] == build_scene(other)
     assert_same_numbers(run(replace(cfg, force=True)), finished)
     assert finished.path.stat().st_mtime_ns > before
-
-
-def test_another_kind_of_scene_has_a_simulator_of_its_own(tmp_path: Path) -> None:
-    words = [
-        "sim.substeps=6",
-        "sim.particles_scale=0.04",
-        "sim.precision=float32",
-        "method.loss_weights.sdf=0",
-    ]
-    cfgs = [make_config(tmp_path, word) for word in ("seed=1", *words)]
-    assert len({simulator_key(cfg, build_scene(cfg)) for cfg in cfgs}) == 5
 
 
 def test_a_cache_keeps_the_last_simulator_while_it_can_be_used() -> None:
