@@ -212,7 +212,6 @@ IN_THE_WAY = [
     (view, "task=Rope --output blocked/a.html"),
     (export, "task=Rope --output blocked"),
     (targets, "--task Rope --csv blocked/a.csv"),
-    (demonstrations, "--task Move --markdown blocked/a.md"),
     (speed.main, "--csv blocked/a.csv"),
 ]
 

@@ -33,20 +33,15 @@ def screen(monkeypatch) -> io.StringIO:
     return text
 
 
-def test_a_bar_shows_which_kernel_is_compiled_and_for_how_long(screen, monkeypatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
-
+def test_a_bar_shows_which_kernel_is_compiled(screen) -> None:
     @contextmanager
     def compiler(tell: Callable[[str], None]) -> Iterator[None]:
         tell("step_kernel")
-        assert "compiling step_kernel, 0 s" in screen.getvalue()
-        now[0] += 65.0
+        assert "compiling step_kernel" in screen.getvalue()
         yield tell
 
     with progress.show_progress("Rope build", 0, None, compiling=compiler):
         pass
-    assert "Rope build compiling step_kernel, 65 s" in screen.getvalue()
     tells: list[Callable[[str], None]] = []
 
     @contextmanager
@@ -58,7 +53,7 @@ def test_a_bar_shows_which_kernel_is_compiled_and_for_how_long(screen, monkeypat
         tells[0]("losses_kernel")
         tells[0]("")
         report(1, "loss 2")
-    last = screen.getvalue().split("compiling losses_kernel, 0 s")[-1]
+    last = screen.getvalue().split("compiling losses_kernel")[-1]
     assert "loss 2" in last and "compiling" not in last.rsplit("Rope", 1)[1]
 
 
@@ -91,7 +86,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     assert kernels and all("launch_kernel" not in vars(kernel) for kernel in kernels)
     seen = screen.getvalue()
     assert "Rope-v1 adam seed 0 build" in seen and "Rope-v1 adam seed 0 final evaluation" in seen
-    assert re.search(r"compiling \w+, \d+ s", seen)
+    assert re.search(r"compiling \w+", seen)
     assert re.search(r"loss [\d.]+ soft score \d\.\d{3} best", seen)
     *_, score, hint = capsys.readouterr().out.splitlines()
     assert score.startswith("finished: score 0.0000, results/Rope-v1/adam/seed0-")

@@ -8,17 +8,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-__all__ = [
-    "TRACEBACK",
-    "ArgumentError",
-    "ConfigError",
-    "PlabError",
-    "out_of_memory",
-    "pick",
-    "tell",
-    "traceback_wanted",
-]
-
 TRACEBACK = "PLAB_TRACEBACK"
 """Environment variable that shows bugs with their tracebacks."""
 

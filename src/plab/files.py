@@ -13,9 +13,8 @@ import os
 import stat
 import sys
 import zipfile
-import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
@@ -23,36 +22,8 @@ import numpy as np
 
 from plab.errors import PlabError
 
-__all__ = [
-    "DAMAGE",
-    "LARGEST",
-    "ShapeError",
-    "UnreadableError",
-    "cache_dir",
-    "member_bytes",
-    "one_line",
-    "opened_zip",
-    "pinned",
-    "read_array",
-    "read_arrays",
-    "regular_file",
-]
-
 LARGEST = 1 << 31
 """Most bytes that an array, a table or a member of an archive may take in memory."""
-
-DAMAGE = (
-    OSError,
-    LookupError,
-    ValueError,
-    TypeError,
-    ArithmeticError,
-    RuntimeError,
-    MemoryError,
-    AttributeError,
-    zlib.error,
-)
-"""Errors of h5py, json, zlib and PyTorch for files that are cut short, damaged or of another kind."""
 
 _RATIO, _SMALL = 200, 1 << 24
 """Largest ratio of unpacked to packed size, for results above a size [B]. Deflate reaches 1,032."""
@@ -119,21 +90,12 @@ def opened_zip(path: Path, *, packed: bool = False) -> Iterator[zipfile.ZipFile]
         OSError: If it cannot be opened.
     """
     found = regular_file(path)
-    size = found.st_size
-    with path.open("rb") as packed_file, ExitStack() as stack:
-        file: BinaryIO = packed_file
-        if packed:
-            content = _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino)
-            file, size = stack.enter_context(io.BytesIO(content)), len(content)
-        try:
+    content = _unpacked(path, found.st_size, found.st_mtime_ns, found.st_ino) if packed else b""
+    with io.BytesIO(content) if packed else path.open("rb") as file:
+        with _damage():
             archive = zipfile.ZipFile(file)
-        except (OSError, MemoryError):
-            raise
-        # The library's parser answers damage with whatever error it runs into.
-        except Exception as error:
-            raise ValueError(str(error)) from error
+            _check_members(archive, len(content) if packed else found.st_size)
         with archive:
-            _check_members(archive, size)
             yield archive
 
 
@@ -150,12 +112,19 @@ def member_bytes(archive: zipfile.ZipFile, name: str) -> bytes:
         raise UnreadableError(
             f"{name} has {info.compress_size} bytes that stand for {info.file_size}: plab packs no such file"
         )
-    try:
+    with _damage():
         return archive.read(info)
-    except (OSError, MemoryError):
+
+
+@contextmanager
+def _damage() -> Iterator[None]:
+    """Turn errors of a library's parser, which answers damage with whatever it meets, into a ValueError."""
+    try:
+        yield
+    except (UnreadableError, OSError, MemoryError):
         raise
     except Exception as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(one_line(error)) from error
 
 
 @functools.lru_cache(maxsize=1)
@@ -163,10 +132,8 @@ def _unpacked(path: Path, size: int, *_: int) -> bytes:
     """Return the content of an xz file; the other arguments identify its version."""
     most = min(LARGEST, max(_SMALL, _RATIO * size))
     unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_UNPACKING_MEMORY)
-    try:
+    with _damage():
         content = unpacker.decompress(path.read_bytes(), most)
-    except lzma.LZMAError as error:
-        raise ValueError(str(error)) from error
     if not unpacker.eof and len(content) == most:
         raise UnreadableError(f"{size} bytes stand for more than {most}: plab packs no such file")
     if not unpacker.eof or unpacker.unused_data:
@@ -219,8 +186,9 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         if sum(info.file_size for info in archive.infolist()) > LARGEST:
             raise UnreadableError(f"its arrays would take more than {LARGEST / 1e9:.1f} GB")
         for name in archive.namelist():
+            content = io.BytesIO(member_bytes(archive, name))
             try:
-                arrays[name.removesuffix(".npy")] = _array(io.BytesIO(member_bytes(archive, name)))
+                arrays[name.removesuffix(".npy")] = _array(content)
             except UnreadableError as error:
                 raise UnreadableError(f"{name}: {error}") from error
     return arrays
@@ -228,12 +196,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def _array(file: BinaryIO) -> np.ndarray:
     try:
-        array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)
-    except OSError:
-        raise
-    # The header is Python's own syntax, and damage to it raises whatever its parser runs into.
-    except Exception as error:
-        raise UnreadableError(f"it holds no NumPy array of numbers or text ({one_line(error)})") from error
+        with _damage():
+            array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_LONGEST_HEADER)
+    except ValueError as error:
+        raise UnreadableError(f"it holds no NumPy array of numbers or text ({error})") from error
     if array.dtype.kind not in "biufU":
         raise UnreadableError(f"it holds {array.dtype}, neither numbers nor text")
     return array
@@ -254,7 +220,19 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
     Raises:
         ShapeError: If there is no such file, it cannot be read, or its content is another.
     """
-    path = _find(file, sha256 is not None)
+    path = Path(file)
+    folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
+    places = [path] if path.is_absolute() else [folder / path for folder in folders]
+    if path.is_absolute() and sha256 is not None:
+        places += [folder / path.name for folder in folders]
+    found = next((place for place in places if os.path.exists(place)), None)
+    if found is None:
+        raise ShapeError(
+            f"there is no file {file}: put it there, into the working directory, into the config folder or "
+            "into the folder above it"
+        )
+    # Not resolved: the target of a link may have another ending.
+    path = found.absolute()
     try:
         if regular_file(path).st_size > _LARGEST_SHAPE:
             raise UnreadableError(f"it has more than {_LARGEST_SHAPE / 1e6:.0f} MB")
@@ -267,20 +245,3 @@ def pinned(file: str, sha256: str | None = None) -> tuple[str, str]:
             f"with {str(sha256)[:8]!r}; put that file back, or compose the configuration again"
         )
     return str(path), digest
-
-
-def _find(file: str, known: bool) -> Path:
-    path = Path(file)
-    folders = [Path(), *(Path(folder) for folder in sys.path if folder)]
-    places = [path] if path.is_absolute() else [folder / path for folder in folders]
-    if path.is_absolute() and known:
-        places += [folder / path.name for folder in folders]
-    for place in places:
-        # Path.exists raises for a name that is too long, or a folder that may not be entered.
-        if os.path.exists(place):
-            # Not resolved: the target of a link may have another ending.
-            return place.absolute()
-    raise ShapeError(
-        f"there is no file {file}: put it there, into the working directory, into the config folder or into "
-        "the folder above it"
-    )

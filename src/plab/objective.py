@@ -6,20 +6,23 @@ on its own grid, where their gradient is needed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.errors import ArgumentError
+from plab.errors import ArgumentError, ConfigError, pick
 
 __all__ = [
     "OBSERVED_PARTICLES",
     "TARGET_ENTRIES",
     "TARGET_MASS",
+    "TERMS",
     "Scores",
     "batch_scores",
+    "check_terms",
     "mass_change",
     "rewards",
     "score_scale",
@@ -283,3 +286,40 @@ def rewards(initial_terms: Any, step_terms: Any, weights: Any) -> Any:
         Rewards, shape [..., T], like the terms.
     """
     return total_loss(initial_terms, weights)[..., None] - total_loss(step_terms, weights)
+
+
+# ------------------------------------------------------------------------------------------ terms of the loss
+
+TERMS = {
+    "density": "plab.losses.density:Density",
+    "sdf": "plab.losses.sdf:Sdf",
+    "nearest": "plab.losses.contact:NearestContact",
+    "all": "plab.losses.contact:AllContact",
+    "soft": "plab.losses.contact:SoftContact",
+}
+"""Terms by name, as ``module:Class``."""
+
+_DEFAULT_TERMS = {"contact": "nearest"}
+"""Default terms of weights whose names are not in :data:`TERMS`."""
+
+
+def check_terms(weights: Mapping[str, float], choices: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the class, ``module:Class``, of each weight's term; nothing is imported.
+
+    Raises:
+        ConfigError: If a name stands for no term, or a choice for no weight.
+    """
+    chosen = _DEFAULT_TERMS | dict(choices or {})
+    for name in choices or {}:
+        if name not in weights:
+            raise ConfigError(f"method.loss_terms.{name} has no weight; {pick(name, list(weights))}")
+    classes = {}
+    for name in weights:
+        term = chosen.get(name, name)
+        if term not in TERMS and ":" not in term:
+            raise ConfigError(
+                f"method.loss_weights.{name}: there is no term '{term}'; {pick(term, list(TERMS))}, or set "
+                f"method.loss_terms.{name}=module:Class"
+            )
+        classes[name] = TERMS.get(term, term)
+    return classes

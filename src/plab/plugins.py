@@ -58,7 +58,7 @@ def passed_on() -> Iterator[None]:
 
 
 def load_object(text: str, kind: type[Kind]) -> Kind:
-    """Return what a text names, as ``module:NAME``: an instance of ``kind``, which is ``type`` for classes.
+    """Return the object that a text names as ``module:NAME``, an instance of ``kind`` (``type`` for classes).
 
     Raises:
         plab.config.ConfigError: If the text is no such text, there is no such module or name, the module
@@ -67,7 +67,7 @@ def load_object(text: str, kind: type[Kind]) -> Kind:
     module_name, _, name = text.partition(":")
     if not (name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
         raise ConfigError(f"'{text}' does not name an object: write module:NAME")
-    module = _module(text, module_name)
+    module = _imported(text, module_name)
     if not hasattr(module, name):
         raise ConfigError(f"'{text}': {module.__file__} has no {name}")
     found = getattr(module, name)
@@ -76,7 +76,7 @@ def load_object(text: str, kind: type[Kind]) -> Kind:
     return found
 
 
-def _module(text: str, name: str) -> ModuleType:
+def _imported(text: str, name: str) -> ModuleType:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

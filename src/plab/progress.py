@@ -15,35 +15,31 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
-    Task,
-    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
 from rich.table import Column
-from rich.text import Text
-
-__all__ = ["Report", "Watcher", "forward_to", "show_line", "show_progress", "show_several"]
 
 Report = Callable[[int, str], None]
-"""Takes the number of steps done and a short text about how it goes."""
+"""Function of the number of steps done and a short text about how it goes."""
 
 Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
-"""Takes what is to be called with the name of what is waited for, or nothing, while its block lasts; such as
-:func:`plab.sim.taichi_internals.watch_compiling`."""
+"""Context that passes the name of each kernel under compilation to a function, and an empty one afterwards;
+such as :func:`plab.sim.taichi_internals.watch_compiling`."""
 
-Forward = Callable[..., None]
-"""Takes ``"progress"`` with title, first step, steps to do, steps between two plain lines, steps done and
-text; or ``"compiling"`` with the name of a kernel, empty when it is done."""
-
-_forward: Forward | None = None
+_forward: Callable[..., None] | None = None
 
 PLAIN_EVERY = 10
-"""Steps between two lines where there is no terminal, unless asked for otherwise."""
+"""Default number of steps between two lines where there is no terminal."""
 
 
-def forward_to(forward: Forward) -> None:
-    """Let another process show what this one has to show from now on."""
+def forward_to(forward: Callable[..., None]) -> None:
+    """Let another process show this one's progress from now on.
+
+    Args:
+        forward: Takes ``"progress"`` with title, first step, steps to do, steps between two plain lines,
+            steps done and text; or ``"compiling"`` with the name of a kernel, empty when it is done.
+    """
     global _forward
     _forward = forward
 
@@ -61,56 +57,31 @@ def show_progress(
     """Show how far a run has come while the ``with`` block lasts.
 
     Args:
-        title: What is running.
+        title: Title of the bar.
         start: Steps done before.
-        total: Steps to do, the ones done before included; None: a terminal alone says that something is done.
+        total: Steps to do, the ones done before included; None: a terminal alone shows the title.
         enabled: Whether to show anything.
         plain_every: Steps between two lines where there is no terminal.
-        compiling: Says which kernel is being compiled, which is shown on a terminal; None: nothing does.
+        compiling: Watcher of compiled kernels, which are shown on a terminal; None: none are.
 
     Yields:
         Function to call after every step.
     """
-    console = Console()
-    watch = compiling or (lambda note: nullcontext())
+    watch, console = compiling or (lambda note: nullcontext()), Console()
     if enabled and (forward := _forward) is not None:
         with watch(lambda kernel: forward("compiling", kernel)):
             yield lambda done, text: forward("progress", title, start, total, plain_every, done, text)
     elif enabled and console.is_terminal:
-        columns = (TextColumn("{task.description}"), _TextColumn()) if total is None else _columns()
-        with Progress(*columns, console=console, expand=total is not None, transient=total is None) as shown:
-            task = shown.add_task(title, total=total, completed=start, text="")
-            with watch(lambda kernel: _note(shown, task, kernel)):
-                yield lambda done, text: shown.update(task, completed=done, text=text)
+        with Progress(
+            *_columns(total), console=console, expand=total is not None, transient=not total
+        ) as bars:
+            task = bars.add_task(title, total=total, completed=start, text="")
+            with watch(lambda kernel: bars.update(task, text=_compiling(kernel), refresh=bool(kernel))):
+                yield lambda done, text: bars.update(task, completed=done, text=text)
     elif enabled and total is not None:
         yield _plain(title, start, total, plain_every)
     else:
         yield lambda done, text: None
-
-
-def show_line(text: str) -> None:
-    """Say on standard error what is being measured, if somebody watches, in a line that the next replaces."""
-    if sys.stderr.isatty():
-        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
-
-
-def _note(progress: Progress, task: TaskID, kernel: str) -> None:
-    """Have a bar's text say which kernel is being compiled, and for how long."""
-    # At once: the compiler may keep the thread that draws from running for seconds.
-    progress.update(task, kernel=kernel, since=time.monotonic(), refresh=bool(kernel))
-
-
-class _TextColumn(ProgressColumn):
-    """Text of a run's progress, or the kernel that is being compiled and for how long."""
-
-    def __init__(self) -> None:
-        super().__init__(Column(no_wrap=True))
-
-    def render(self, task: Task) -> Text:
-        """Return the text."""
-        if kernel := task.fields.get("kernel"):
-            return Text(f"compiling {kernel}, {time.monotonic() - task.fields['since']:.0f} s")
-        return Text(task.fields["text"])
 
 
 @contextmanager
@@ -118,43 +89,57 @@ def show_several(names: Sequence[str], *, enabled: bool = True) -> Iterator[Call
     """Show how far several processes have come while the ``with`` block lasts, a bar each.
 
     Yields:
-        Function of one of the ``names`` and what the process has forwarded.
+        Function of one of the ``names`` and the arguments that its process has forwarded.
     """
     console = Console()
     if not (enabled and console.is_terminal):
-        lines: dict[tuple[str, str], Report] = {}
+        lines: dict[str, Report] = {}
 
         def say(name: str, kind: str, *content: Any) -> None:
             if enabled and kind == "progress":
                 title, start, total, every, done, text = content
-                plain = _plain(f"{name} {title}", start, total, every)
-                lines.setdefault((name, title), plain)(done, text)
+                title = f"{name} {title}"
+                lines.setdefault(title, _plain(title, start, total, every))(done, text)
 
         yield say
         return
-    with Progress(*_columns(), console=console, expand=True) as progress:
-        tasks = {name: progress.add_task(name, total=None, text="") for name in names}
+    with Progress(*_columns(), console=console, expand=True) as bars:
+        tasks = {name: bars.add_task(name, total=None, text="") for name in names}
 
         def draw(name: str, kind: str, *content: Any) -> None:
             if kind == "compiling":
-                _note(progress, tasks[name], *content)
+                bars.update(tasks[name], text=_compiling(*content), refresh=True)
                 return
             title, _start, total, _every, done, text = content
-            progress.update(
-                tasks[name], description=f"{name} {title}", total=total, completed=done, text=text
-            )
+            bars.update(tasks[name], description=f"{name} {title}", total=total, completed=done, text=text)
 
         yield draw
 
 
-def _columns() -> tuple[ProgressColumn, ...]:
+def show_line(text: str) -> None:
+    """Show on a terminal what is being measured, in a line of standard error that the next replaces."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _compiling(kernel: str) -> str:
+    return f"compiling {kernel}" if kernel else ""
+
+
+def _columns(total: int | None = 1) -> tuple[ProgressColumn, ...]:
     """Return the parts of the bar; on a narrow terminal the bar itself gives way, then the text."""
+    title, text = (
+        TextColumn(f"{{task.{part}}}", markup=False, table_column=Column(no_wrap=True))
+        for part in ("description", "fields[text]")
+    )
+    if total is None:
+        return title, text
     return (
-        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        title,
         BarColumn(bar_width=None, table_column=Column(ratio=1)),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        _TextColumn(),
+        text,
     )
 
 
@@ -166,7 +151,7 @@ def _plain(title: str, start: int, total: int, every: int) -> Report:
         nonlocal first, last
         now = time.monotonic()
         if first is None or done == first[1]:
-            # The first step compiles the simulator: it says nothing about the pace.
+            # The first step compiles the simulator, which does not count for the pace.
             first, left = first or (now, done), "started"
         else:
             begin, before = first

@@ -19,23 +19,20 @@ from typing import Any, NoReturn
 from plab.config.suite import suite_tasks
 from plab.errors import TRACEBACK, ArgumentError, PlabError, out_of_memory, pick, tell, traceback_wanted
 
-EXIT_BUG = 70
-"""As sysexits.h has it, so that no refusal is taken for a bug, and no bug for a refusal."""
-EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141
-"""Exit code of a program ended by a closed pipe."""
+EXIT_BUG, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 70, 130, 141
+"""Exit codes of a bug, by sysexits.h, of Ctrl-C, and of a closed pipe."""
 
 
 def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., int]:
-    """Let a command answer what goes wrong in one line.
+    """Let a command report errors in one line.
 
     Args:
         main: Takes the arguments after the program's name; returns the exit code, None for 0.
 
     Returns:
-        The same, which takes the arguments of the process if it is given none; where it raises, it says in
-        one line what, and returns 2 for what the user can put right, 130 after Ctrl-C and SIGTERM, 141 if
-        nobody reads its output any more, and 70 for a bug. With ``PLAB_TRACEBACK`` set, a bug is raised.
+        The same, with the arguments of the process by default. It prints an error in one line, and returns 2
+        for a mistake of the user's, 130 after Ctrl-C and SIGTERM, 141 for a closed output, and 70 for a bug.
+        With ``PLAB_TRACEBACK`` set, a bug is raised.
     """
 
     @functools.wraps(main)
@@ -69,7 +66,9 @@ def command_line(main: Callable[[Sequence[str]], int | None]) -> Callable[..., i
         except Exception as error:
             if traceback_wanted():
                 raise
-            tell(_bug(error))
+            last = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{type(error).__name__} in {Path(last.filename).name}, line {last.lineno}"
+            tell(f"a bug: {where}: {error}; please report it with the output of {TRACEBACK}=1")
             return EXIT_BUG
         return PlabError.exit_code
 
@@ -85,15 +84,6 @@ def _close_output() -> int:
     return EXIT_BROKEN_PIPE
 
 
-def _bug(error: Exception) -> str:
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    file = Path(last.filename).name
-    return (
-        f"a bug: {type(error).__name__} in {file}, line {last.lineno}: {error}; unless {file} is yours, "
-        f"please report it to plab's maintainers, with the command and what it prints with {TRACEBACK}=1"
-    )
-
-
 # -------------------------------------------------------------------------------------------------- arguments
 
 
@@ -101,8 +91,7 @@ class Parser(ArgumentParser):
     """The parser of a command: a docstring is its help, a mistake an ArgumentError."""
 
     def __init__(self, name: str, text: str | None, **options: Any) -> None:
-        """Make it without arguments, of a command's name and docstring: its purpose, a blank line, whatever
-        helps, such as examples."""
+        """Make a parser without arguments of a command's name and docstring: purpose, then examples."""
         purpose, _, more = inspect.cleandoc(text or "").partition("\n\n")
         formed = RawDescriptionHelpFormatter
         super().__init__(name, description=purpose, epilog=more, formatter_class=formed, **options)
@@ -128,11 +117,10 @@ def add_sources(parser: ArgumentParser, words: str = "") -> None:
 
 
 def add_forms(parser: ArgumentParser) -> Any:
-    """Add the options ``--csv`` and ``--json``, which set ``form``; ``text`` without either. Return the group
-    of options that exclude each other."""
+    """Add the exclusive options ``--csv`` and ``--json``, which set ``form`` (``text`` by default)."""
     form = parser.add_mutually_exclusive_group()
-    for name, what in (("csv", "CSV"), ("json", "JSON")):
-        what = f"print {what}, for scripts"
+    for name in ("csv", "json"):
+        what = f"print {name.upper()}, for scripts"
         form.add_argument(f"--{name}", dest="form", action="store_const", const=name, help=what)
     parser.set_defaults(form="text")
     return form
@@ -190,26 +178,21 @@ def folder(text: str) -> Path:
 
 
 def results_source(text: str) -> Path:
-    """Read a folder, file or archive of results, or a word that stands for real runs."""
+    """Read a folder, file or archive of results, or one of the names of real runs."""
     from plab.results.examples import EXAMPLES, resolve
 
-    # As a path ./example would be the word.
+    # As a path ./example would be the name.
     return resolve(text) if text in EXAMPLES else folder(text)
 
 
 def to_write(text: str) -> Path:
-    """Read the name of a file that can be written: hours of work should not end in none.
-
-    Folders above it that are not there yet are for whoever writes it to make.
-    """
+    """Read the name of a file that can be written: hours of work should not end in none."""
     path = folder(text)
-    # Of pathlib's `exists` some versions raise where a folder may not be searched.
+    # Folders above it that are not there yet are for whoever writes it to make.
     there = next(place for place in (path, *path.absolute().parents) if os.path.exists(place))
-    is_folder = there.is_dir()
-    if (there == path) == is_folder:
-        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if is_folder else 'no'} folder")
-    needed = os.W_OK | os.X_OK if is_folder else os.W_OK
-    if not os.access(there, needed, effective_ids=os.access in os.supports_effective_ids):
+    if there.is_dir() == (there == path):
+        raise ArgumentTypeError(f"cannot write {path}: {there} is {'a' if there.is_dir() else 'no'} folder")
+    if not os.access(there, os.W_OK):
         raise ArgumentTypeError(f"cannot write {path}: no permission to write to {there}")
     return path
 

@@ -77,23 +77,18 @@ def full_help_text(config_dir: str | None = None) -> str:
     """Return the text of ``--help-all``: that of ``--help``, more examples, what each choice is, and every
     key with its default and explanation."""
     parts = [_USAGE, _MORE_EXAMPLES, _FLAGS]
+    keys = ["KEYS, with their defaults:", *(line for _, line in _keys(conf_folder() / "config.yaml", _LONG))]
     for group in (*GROUPS, EXPERIMENT):
         sign = "+" if group == EXPERIMENT else ""
         parts.append("SIMULATOR PRESETS" if group == "sim" else f"{group.upper()}S")
         for name, path in choices(group, config_dir).items():
-            lines = path.read_text(encoding="utf-8").splitlines()
             # The first line of an experiment says where its keys go.
-            title = next(line for line in lines if not line.startswith("# @package")).lstrip("# ")
-            parts.append(f"  {sign}{group}={name:<10} {title}")
+            lines = path.read_text(encoding="utf-8").removeprefix("# @package _global_\n").splitlines()
+            parts.append(f"  {sign}{group}={name:<10} {lines[0].lstrip('# ')}")
+            if group == "method" or name in ("plab", "fast", "Rope"):
+                keys += [f"  of {group}={name}:", *(line for _, line in _keys(path, _LONG))]
         parts.append("")
-    folder = conf_folder()
-    files = {"KEYS, with their defaults": folder / "config.yaml"}
-    files |= {f"  of {name}": folder / f"{name}.yaml" for name in ("protocol/plab", "sim/fast")}
-    files |= {f"  of method={name}": path for name, path in choices("method", config_dir).items()}
-    files["  of the task; here of Rope"] = folder / "task" / "Rope.yaml"
-    for heading, path in files.items():
-        parts += [f"{heading}:", *(line for _, line in _keys(path, _LONG))]
-    return "\n".join(parts)
+    return "\n".join([*parts, *keys])
 
 
 def _keys(path: Path, width: int) -> Iterator[tuple[str, str]]:

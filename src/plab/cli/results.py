@@ -36,93 +36,54 @@ SELECTABLE = ("task", "variant", "method", "seed", "status")
 
 
 @command_line
-def main(argv: Sequence[str]) -> int:
+def main(argv: Sequence[str]) -> int | None:
     """Run the command line.
 
     Returns:
-        Exit code: 0, 1 if ``check`` found something wrong, 2 for a mistake of the user's.
+        Exit code: 0, 1 if ``check`` found a fault, 2 for a mistake of the user's.
     """
-    options = _parse(argv)
-    return options.run(options)
-
-
-def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = Parser("plab results", __doc__)
     parser.add_argument("command", choices=_COMMANDS, help="what to do; it has a --help of its own")
     parser.add_argument("arguments", nargs=argparse.REMAINDER)
     first = parser.parse_args(argv)
-    run, add_arguments = _COMMANDS[first.command]
     # Not by subparsers: they cannot have words on both sides of an option.
-    command = Parser(f"plab results {first.command}", add_arguments.__doc__ or "")
-    add_arguments(command)
-    command.set_defaults(run=run)
-    return command.parse_intermixed_args(first.arguments)
+    return _COMMANDS[first.command](first.arguments)
 
 
-def _scores_arguments(parser: Parser) -> None:
+def _scores(argv: Sequence[str]) -> None:
     """Print runs with their scores, a line each."""
+    parser = Parser("plab results scores", _scores.__doc__)
     add_sources(parser, "runs: task=Rope,Move seed=0,1,2; by default those finished")
     what = "further columns, with commas: keys such as method.lr, or columns of plab.results.load such as iou"
     parser.add_argument("--keys", type=_names, default=[], help=what)
     parser.add_argument("--sort", type=_names, default=[], help="columns to sort by, with commas")
     parser.add_argument("--descending", action="store_true", help="with --sort: the largest first")
     add_forms(parser)
-
-
-def _sql_arguments(parser: Parser) -> None:
-    """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
-    parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
-    add_sources(parser)
-    add_forms(parser)
-
-
-def _check_arguments(parser: Parser) -> None:
-    """Check every file against the schema; exit code 1 if anything is wrong."""
-    add_sources(parser)
-
-
-def _pack_arguments(parser: Parser) -> None:
-    """Put runs into one small file."""
-    add_sources(parser, "runs to take: task=Rope,Move status=all (default: finished)")
-    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
-    parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
-    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
-    parser.add_argument("--digits", type=positive, help=what)
-    parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
-
-
-def _unpack_arguments(parser: Parser) -> None:
-    """Make files of the runs of an archive; files that are there stay."""
-    parser.add_argument("archive", type=results_source, help="archive to read")
-    parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
-
-
-def _names(text: str) -> list[str]:
-    return [name for name in text.split(",") if name]
-
-
-def _scores(options: argparse.Namespace) -> int:
+    options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
-    chosen = _finished_unless_said(select(words, SELECTABLE))
+    chosen = _finished_by_default(select(words, SELECTABLE))
     table, unreadable = scores(sources, chosen, options.keys, options.sort, descending=options.descending)
     _tell_left_out(unreadable)
     print_table(list(table.columns), table.astype(object).itertuples(index=False, name=None), options.form)
-    return 0
 
 
-def _sql(options: argparse.Namespace) -> int:
+def _sql(argv: Sequence[str]) -> None:
+    """Answer an SQL query about the tables runs, config, evaluations, times and iterations."""
+    parser = Parser("plab results sql", _sql.__doc__)
+    parser.add_argument("query", help='for example "select task, avg(score) from runs group by task"')
+    add_sources(parser)
+    add_forms(parser)
+    options = parser.parse_intermixed_args(argv)
     columns, rows, unreadable = query(sources_and_words(options.sources)[0], options.query)
     _tell_left_out(unreadable)
     print_table(columns, rows, options.form)
-    return 0
 
 
-def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
-    for error in unreadable:
-        tell(f"left out: {error}")
-
-
-def _check(options: argparse.Namespace) -> int:
+def _check(argv: Sequence[str]) -> int:
+    """Check every file against the schema; exit code 1 if anything is wrong."""
+    parser = Parser("plab results check", _check.__doc__)
+    add_sources(parser)
+    options = parser.parse_intermixed_args(argv)
     count = wrong = 0
     for source in sources_and_words(options.sources)[0]:
         for _, fault in check(source):
@@ -135,7 +96,16 @@ def _check(options: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def _pack(options: argparse.Namespace) -> int:
+def _pack(argv: Sequence[str]) -> None:
+    """Put runs into one small file."""
+    parser = Parser("plab results pack", _pack.__doc__)
+    add_sources(parser, "runs to take: task=Rope,Move status=all (default: finished)")
+    parser.add_argument("--output", type=folder, required=True, help="archive to write, <name>.plab.zip.xz")
+    parser.add_argument("--masses", action="store_true", help="keep the mass tensors")
+    what = "significant digits that the iterations keep, >= 1 (default: all); 4 take two thirds off"
+    parser.add_argument("--digits", type=positive, help=what)
+    parser.add_argument("--resume", action="store_true", help="keep the state of unfinished runs")
+    options = parser.parse_intermixed_args(argv)
     sources, words = sources_and_words(options.sources)
     chosen = select(words, SELECTABLE)
     for text in chosen.choices.get("status", ()):
@@ -144,7 +114,7 @@ def _pack(options: argparse.Namespace) -> int:
     if words:
         others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
         require_possible(Selection(others, chosen.keys), readable_rows(sources)[0])
-    chosen = _finished_unless_said(chosen)
+    chosen = _finished_by_default(chosen)
     done = pack(
         sources,
         options.output,
@@ -154,32 +124,35 @@ def _pack(options: argparse.Namespace) -> int:
         digits=options.digits,
     )
     _tell_left_out(done.unreadable)
-    size = f"{done.archive_bytes / 1e3:.1f} kB, {done.archive_bytes / done.runs / 1e3:.1f} kB per run"
     before = f"; {done.file_bytes / 1e3:.1f} kB as files" if done.file_bytes else ""
-    print(f"{options.output}: {done.runs} run(s), {size}{before}")
-    return 0
+    print(f"{options.output}: {done.runs} run(s), {done.archive_bytes / 1e3:.1f} kB{before}")
 
 
-def _finished_unless_said(chosen: Selection) -> Selection:
-    """Take finished runs unless the words say something about the status."""
+def _unpack(argv: Sequence[str]) -> None:
+    """Make files of the runs of an archive; files that are there stay."""
+    parser = Parser("plab results unpack", _unpack.__doc__)
+    parser.add_argument("archive", type=results_source, help="archive to read")
+    parser.add_argument("--output", type=folder, default=Path("results"), help="folder to write to")
+    options = parser.parse_intermixed_args(argv)
+    written, kept = unpack(options.archive, options.output)
+    there = f", {kept} there already" if kept else ""
+    print(f"{options.output}: {written} run(s) written{there}")
+
+
+_COMMANDS = {"scores": _scores, "sql": _sql, "check": _check, "pack": _pack, "unpack": _unpack}
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+def _tell_left_out(unreadable: Iterable[ResultsError]) -> None:
+    for error in unreadable:
+        tell(f"left out: {error}")
+
+
+def _finished_by_default(chosen: Selection) -> Selection:
     statuses = chosen.choices.setdefault("status", ["finished"])
     if statuses == ["all"]:
         del chosen.choices["status"]
     return chosen
-
-
-def _unpack(options: argparse.Namespace) -> int:
-    written, kept = unpack(options.archive, options.output)
-    there = f", {kept} there already" if kept else ""
-    print(f"{options.output}: {written} run(s) written{there}")
-    return 0
-
-
-_COMMANDS = {
-    "scores": (_scores, _scores_arguments),
-    "sql": (_sql, _sql_arguments),
-    "check": (_check, _check_arguments),
-    "pack": (_pack, _pack_arguments),
-    "unpack": (_unpack, _unpack_arguments),
-}
-"""Functions that carry out a command, and that add its arguments."""

@@ -15,6 +15,7 @@ from plab.config.compose import check_sources
 from plab.config.identity import IDLE
 from plab.config.selection import one_protocol, select
 from plab.config.words import require_effect
+from plab.errors import ArgumentError
 from plab.render.graphics import RenderError, require_graphics, require_packages
 
 if TYPE_CHECKING:
@@ -57,13 +58,16 @@ def render(argv: Sequence[str]) -> None:
     add("--film-strip", type=folder, metavar="FILE", help="a .jpg")
     add("--size", type=_size, metavar="WxH", help="pixels of a frame, 480x360 unless given, or of a cell")
     options = parser.parse_intermixed_args(argv)
-    sheets = {".png": options.contact_sheet, ".jpg": options.film_strip}
-    suffix, path = next(((suffix, path) for suffix, path in sheets.items() if path), (".png", None))
-    if path is not None:
-        _check_sheet(parser, options, path, suffix)
+    if options.contact_sheet and options.film_strip:
+        parser.error("give either --contact-sheet or --film-strip")
+    if path := options.contact_sheet or options.film_strip:
+        suffix = ".png" if options.contact_sheet else ".jpg"
+        if path.suffix.lower() != suffix:
+            raise RenderError(f"cannot write {path}: it has to be a {suffix}")
+        own = ("task=", "variant=") if options.contact_sheet else ("task=",)
+        _refuse_choice(options, own)
     else:
-        settle(options, suffix)
-        path = options.output
+        path = settle(options, ".png")
     require_writable(path)
     require_graphics()
     # Imported here, as below: they load the simulator, for which no mistake above should have to wait.
@@ -102,8 +106,7 @@ def view(argv: Sequence[str]) -> None:
     parser.add_argument("--gallery", action="store_true", help="the best actions known for every task")
     options = parser.parse_intermixed_args(argv)
     if options.gallery:
-        if unwanted := [word for word in options.what if "=" not in word or word.startswith("task=")]:
-            parser.error(f"a gallery of all tasks: leave out '{unwanted[0]}'")
+        _refuse_choice(options, ("task=",))
         output = (options.output or Path("gallery")) / "index.html"
     else:
         output = settle(options, ".html")
@@ -114,22 +117,17 @@ def view(argv: Sequence[str]) -> None:
     from plab.render.rollouts import demonstration, record_with_motion
     from plab.view.page import gallery, page
 
+    output.parent.mkdir(parents=True, exist_ok=True)
     if options.gallery:
         pages = []
         for task, (cfg,) in _of_all_tasks(options, variants=False):
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
-            _write(output.with_name(file), page(recording, options.every))
+            output.with_name(file).write_text(page(recording, options.every), encoding="utf-8")
             pages.append((task, file, recording.score))
-        _write(output, gallery(pages))
+        output.write_text(gallery(pages), encoding="utf-8")
     else:
-        _write(output, page(record_with_motion(*rollout(options)), options.every))
+        output.write_text(page(record_with_motion(*rollout(options)), options.every), encoding="utf-8")
     print(output)
-
-
-def _write(path: Path, text: str) -> None:
-    from plab.results.run_file import replace_file
-
-    replace_file(path, text.encode(), sync=False, folders=True)
 
 
 @command_line
@@ -193,39 +191,31 @@ def settle(options: argparse.Namespace, ending: str) -> Path:
         RenderError: If nothing is chosen, or two things are.
         plab.config.ConfigError: If the configuration is wrong.
     """
-    usual = _usual_output(options, ending)
-    options.output = options.output or usual
-    return options.output
+    # Imported here, as below: h5py and pandas load, for which no mistake should have to wait.
+    from plab.results.schema import ARCHIVE_SUFFIX
 
-
-def _usual_output(options: argparse.Namespace, ending: str) -> Path:
     sources, words = sources_and_words(options.what, default=None)
-    if sources and all(map(_holds_many, sources)):
+    if sources and all(str(one).endswith(ARCHIVE_SUFFIX) or one.is_dir() for one in sources):
         options.result, name = _best(sources, words)
-        return Path(f"{name}{ending}")
-    require_effect(words, WITHOUT_EFFECT, "a picture")
-    if len(sources) > 1 or (sources and words):
+        usual = Path(f"{name}{ending}")
+    elif len(sources) > 1 or (sources and words):
         raise RenderError(f"give one result file or overrides (KEY=VALUE), not '{' '.join(options.what)}'")
-    if sources:
-        # Imported here, as below: it loads pandas, for which no mistake should have to wait.
+    elif sources:
         from plab.results.run_file import split_archive
 
         (options.result,) = sources
         place = Path() if split_archive(options.result) else options.result.parent
-        return place / (options.result.stem + ending)
-    if not words:
+        usual = place / (options.result.stem + ending)
+    elif words:
+        require_effect(words, WITHOUT_EFFECT, "a picture")
+        options.result = None
+        cfg = options.config = load_config(words, options.config_dir)
+        check_sources(cfg)
+        usual = Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
+    else:
         raise RenderError("say what to show: a result file, or a task such as task=Torus; --help explains")
-    options.result = None
-    cfg = options.config = load_config(words, options.config_dir)
-    check_sources(cfg)
-    return Path(f"{cfg.task.name}-v{cfg.variant}{ending}")
-
-
-def _holds_many(source: Path) -> bool:
-    """Return whether a source is a folder or an archive of results."""
-    from plab.results.schema import ARCHIVE_SUFFIX
-
-    return str(source).endswith(ARCHIVE_SUFFIX) or source.is_dir()
+    options.output = options.output or usual
+    return options.output
 
 
 def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
@@ -256,17 +246,12 @@ def rollout(options: argparse.Namespace) -> tuple[Config, np.ndarray]:
 # ------------------------------------------------------------------------------------- pictures of all tasks
 
 
-def _check_sheet(parser: Parser, options: argparse.Namespace, path: Path, suffix: str) -> None:
-    """Refuse what goes with no picture of all tasks."""
+def _refuse_choice(options: argparse.Namespace, own: tuple[str, ...]) -> None:
+    """Refuse results, and words that begin like one of ``own``, for a picture of all tasks."""
     require_effect([word for word in options.what if "=" in word], WITHOUT_EFFECT, "a picture")
-    own = ("task=", "variant=") if options.contact_sheet else ("task=",)
     unwanted = [word for word in options.what if "=" not in word or word.startswith(own)]
-    unwanted += ["--output"] if options.output else []
-    unwanted += ["--film-strip"] if options.contact_sheet and options.film_strip else []
-    if unwanted:
-        parser.error(f"a picture of all tasks: leave out '{unwanted[0]}'")
-    if path.suffix.lower() != suffix:
-        raise RenderError(f"cannot write {path}: it has to be a {suffix}")
+    if unwanted or (options.output and not getattr(options, "gallery", False)):
+        raise ArgumentError(f"all tasks are shown: leave out '{(*unwanted, '--output')[0]}'")
 
 
 def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[str, list[Config]]]:
@@ -278,7 +263,7 @@ def _of_all_tasks(options: argparse.Namespace, *, variants: bool) -> list[tuple[
         own = [[f"variant={name}"] for name in OmegaConf.load(path).variants] if variants else [[]]
         words = [[f"task={task}", *variant, *options.what] for variant in own]
         found.append((task, [load_config(each, options.config_dir) for each in words]))
-    return [(task, cfgs) for task, cfgs in found if cfgs]
+    return found
 
 
 def _size(text: str) -> tuple[int, int]:

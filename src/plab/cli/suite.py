@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from plab.cli.command import Parser, command_line, sources_and_words, task_list, to_write
-from plab.cli.tables import print_table, write_csv, write_markdown
+from plab.cli.tables import print_table, write_csv
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config.compose import check_sources
 from plab.config.identity import IDLE
@@ -26,15 +26,6 @@ from plab.results.table import Row, readable_rows
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
 from plab.targets.scripted import DECIMALS
-
-HEADING = """\
-# Demonstrations
-
-Look up the scores of the best known actions in each variant, in the hard contact model.
-`plab demonstrations --markdown docs/demonstrations.md` writes this table, and prints more.
-[The suite](suite.md#demonstrations) explains how the actions were found.
-
-"""
 
 
 def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str) -> Namespace:
@@ -83,7 +74,6 @@ def demonstrations(argv: Sequence[str]) -> None:
     Overrides of the configuration, such as sim.device=cuda, may follow.
     """
     parser = Parser("plab demonstrations", demonstrations.__doc__)
-    parser.add_argument("--markdown", type=to_write, help="write the table to this file, too")
     parser.add_argument("--record", action="store_true", help="record what is replayed")
     options = _options(parser, argv, ("method", "seed", *IDLE), "demonstrations")
     tasks = [_configs(task, options.overrides) for task in options.task]
@@ -104,12 +94,6 @@ def demonstrations(argv: Sequence[str]) -> None:
             save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
         rows += [_row(item) for item in replays]
     print_table(list(rows[0]), [list(row.values()) for row in rows])
-    if options.markdown is not None:
-        by_task: dict[str, dict[str, str]] = {}
-        for row in rows:
-            line = by_task.setdefault(row["task"], {"task": row["task"], "target": row["target"]})
-            line[row["variant"]] = row["score"]
-        write_markdown(options.markdown, HEADING, ("task", "target", *SUITE_VARIANTS), by_task.values())
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:

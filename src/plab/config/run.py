@@ -10,7 +10,7 @@ from plab.config import ranges
 from plab.config.identity import config_dict, config_hash, member_name
 from plab.config.task import TaskConfig
 from plab.errors import ConfigError
-from plab.losses.registry import check_terms
+from plab.objective import check_terms
 from plab.scenes import CONTACTS, CONVENTIONS, DEVICES, PRECISIONS
 
 __all__ = ["Config", "MethodConfig", "ProtocolConfig", "SimConfig", "TargetsConfig"]

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from plab.errors import ConfigError
-from plab.losses.registry import TERMS, check_terms
+from plab.objective import TERMS, check_terms
 from plab.plugins import load_object
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import FAMILIES, family
-from plab.files import DAMAGE, one_line, read_arrays
+from plab.files import one_line, read_arrays
 from plab.results import ResultsError
 from plab.results.run_file import replace_file
 from plab.runners.libraries import torch
@@ -228,7 +228,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         ) from None
     except ResultsError:
         raise
-    except DAMAGE as error:
+    except Exception as error:
         raise ResultsError(
             f"{path} is no policy of plab's ({one_line(error)}): run it again with force=true"
         ) from error

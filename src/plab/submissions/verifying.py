@@ -20,7 +20,7 @@ import numpy as np
 import plab
 from plab.config import Config
 from plab.envs.core import EpisodeBatch
-from plab.files import DAMAGE, one_line
+from plab.files import one_line
 from plab.results.run_file import replace_file
 from plab.results.running import now
 from plab.scenes import PRECISIONS
@@ -335,6 +335,6 @@ def read_verification(submission: Submission) -> Verification | None:
         return Verification(submission.digest, tuple(verdicts), tuple(record["overrides"]))
     except FileNotFoundError:
         return None
-    except DAMAGE as error:
+    except Exception as error:
         why = f"cannot be read ({one_line(error)}): verify the submission again"
         raise SubmissionError(f"{path} {why}") from None

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from hydra._internal.callbacks import Callbacks
@@ -34,11 +36,11 @@ from plab.sweep.plan import plan
 from plab.targets import TargetError
 
 Carrier = Callable[[list[list[Config]], Callable[[], str]], Iterator[Outcome]]
-"""Carries out batches: takes them and a function that says how far the sweep has come, yields outcomes."""
+"""Function that carries out batches, given them and the sweep's progress as a text, and yields outcomes."""
 
 
 def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = None) -> int:
-    """Run all combinations of the values that overrides give, and say how the runs ended.
+    """Run all combinations of the values that overrides give, and report how the runs ended.
 
     Args:
         words: Prepared overrides.
@@ -68,15 +70,19 @@ def sweep(words: Sequence[str], master: DictConfig, config_dir: str | None = Non
     with ExitStack() as stack:
         carry, processes = carry_here, 1
         if settings["inner"] is not None:
-            carry, processes = _Elsewhere(master, settings["inner"], by_path), _processes(settings["inner"])
+            carry = partial(_carry_elsewhere, master, settings["inner"], by_path)
+            # As joblib counts: -1 is one for each core.
+            wanted = settings["inner"].get("n_jobs", 1)
+            processes = wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
         else:
             for cfg in cfgs:
                 require_runnable(cfg)
             if settings["per_gpu"]:
                 carry, processes = stack.enter_context(gpu_workers(settings["per_gpu"], len(cfgs), look_up))
         try:
-            for one in run_batches(cfgs, carry, settings["batch_size"], processes, settings["per_gpu"] or 1):
-                ended.append(one)
+            ended.extend(
+                run_batches(cfgs, carry, settings["batch_size"], processes, settings["per_gpu"] or 1)
+            )
         finally:
             code = report(ended)
     return code
@@ -199,58 +205,46 @@ def carry_here(batches: list[list[Config]], progress: Callable[[], str]) -> Iter
         yield from runners.run_batch(batch, progress(), cache)
 
 
-class _Elsewhere:
-    """Hands batches to a launcher of Hydra's, one job each."""
-
-    def __init__(self, master: DictConfig, inner: DictConfig, jobs: Mapping[str, list[str]]) -> None:
-        """Keep the launcher's settings, and the overrides of each run by its result file."""
-        self._config, self._jobs = deepcopy(master), jobs
-        with open_dict(self._config.hydra):
-            self._config.hydra.launcher = inner
-
-    def __call__(self, batches: list[list[Config]], _progress: Callable[[], str]) -> Iterator[Outcome]:
-        """Carry out batches."""
-        context = HydraContext(hydra_app().config_loader, Callbacks(self._config))
-        name = self._config.hydra.launcher["_target_"].rpartition(".")[2]
-        runs = sum(len(batch) for batch in batches)
-        alone = "; hydra.launcher.batch_size=1 makes a job of each" if runs > len(batches) == 1 else ""
-        print(f"{runs} runs go to {name} in {len(batches)} jobs{alone}", flush=True)
-        try:
-            launcher = Plugins.instance().instantiate_launcher(
-                hydra_context=context, task_function=_BatchTask(batches), config=self._config
-            )
-            with passed_on():
-                # A job composes the configuration of its first run and then computes the whole batch.
-                returns = launcher.launch([self._jobs[str(batch[0].path)] for batch in batches], 0)
-            yield from [one for job in returns for one in job.return_value]
-        except Exception as error:
-            # A job's process was killed, or the queue refused the jobs: the files know how far they came.
-            tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
-            yield from [look_up(cfg) for batch in batches for cfg in batch]
-
-
-class _BatchTask:
-    """The task of a launcher's jobs: each carries out the batch of its number."""
-
-    def __init__(self, batches: Sequence[Sequence[Config]]) -> None:
-        self._batches = batches
-
-    def __call__(self, _composed: DictConfig) -> list[Outcome]:
-        """Carry out a batch; called in the job's process."""
-        number = HydraConfig.get().job.num
-        note = f"[batch {number + 1}/{len(self._batches)}] " if len(self._batches) > 1 else ""
-        return runners.run_batch(self._batches[number], note, SimulatorCache())
+def _carry_elsewhere(
+    master: DictConfig,
+    inner: DictConfig,
+    jobs: Mapping[str, list[str]],
+    batches: list[list[Config]],
+    _progress: Callable[[], str],
+) -> Iterator[Outcome]:
+    """Hand batches to a launcher of Hydra's, one job each, given the overrides of each run by its file."""
+    config = deepcopy(master)
+    with open_dict(config.hydra):
+        config.hydra.launcher = inner
+    name = inner["_target_"].rpartition(".")[2]
+    runs = sum(len(batch) for batch in batches)
+    alone = "; hydra.launcher.batch_size=1 makes a job of each" if runs > len(batches) == 1 else ""
+    print(f"{runs} runs go to {name} in {len(batches)} jobs{alone}", flush=True)
+    try:
+        launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=HydraContext(hydra_app().config_loader, Callbacks(config)),
+            task_function=partial(_job, batches),
+            config=config,
+        )
+        with passed_on():
+            # A job composes the configuration of its first run and then computes the whole batch.
+            returns = launcher.launch([jobs[str(batch[0].path)] for batch in batches], 0)
+        yield from [one for job in returns for one in job.return_value]
+    except Exception as error:
+        # A job's process was killed, or the queue refused the jobs: the files know how far they came.
+        tell(f"{name}: {type(error).__name__}: {' '.join(str(error).split())[:300]}")
+        yield from [look_up(cfg) for batch in batches for cfg in batch]
 
 
-def _processes(inner: DictConfig) -> int:
-    """Return how many processes another launcher starts at a time, as far as its settings tell."""
-    wanted = inner.get("n_jobs", 1)
-    # As joblib counts: -1 is one for each core.
-    return wanted if wanted > 0 else max(1, (os.cpu_count() or 1) + 1 + wanted)
+def _job(batches: Sequence[Sequence[Config]], _composed: DictConfig) -> list[Outcome]:
+    """Carry out the batch of a launcher's job, in that job's process."""
+    number = HydraConfig.get().job.num
+    note = f"[batch {number + 1}/{len(batches)}] " if len(batches) > 1 else ""
+    return runners.run_batch(batches[number], note, SimulatorCache())
 
 
 def look_up(cfg: Config) -> Outcome:
-    """Say from its files how a run ended whose process cannot say it any more."""
+    """Return from its files the outcome of a run whose process was killed."""
     path = cfg.path
     if (done := _finished_before(cfg)) is not None:
         return Outcome.of(cfg, "finished", done.score)
@@ -268,12 +262,10 @@ def look_up(cfg: Config) -> Outcome:
 def _finished_before(cfg: Config) -> Outcome | None:
     """Return the outcome of a run whose result is there."""
     path = cfg.path
+    left = (lock_path(path), path.with_suffix(PARTIAL_SUFFIX))
     try:
-        # Where there is something left of a process that was killed, RunFile clears it up.
-        left = path.exists() and any(
-            one.exists() for one in (lock_path(path), path.with_suffix(PARTIAL_SUFFIX))
-        )
-        result = RunFile(cfg).result if left else read(path)
+        # RunFile removes what a killed process has left.
+        result = RunFile(cfg).result if path.exists() and any(map(Path.exists, left)) else read(path)
     except ResultsError:
         return None
     return Outcome.of(cfg, "before", result.score) if result.status == "finished" else None
