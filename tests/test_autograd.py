@@ -9,8 +9,8 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 
-from plab.autograd import policy_gradient, rollout, simulate
 from plab.config import load_config
+from plab.envs.autograd import policy_gradient, rollout, simulate
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from plab.autograd import policy_gradient, rollout
 from plab.config import Config, load_config
+from plab.envs.autograd import policy_gradient, rollout
 from plab.envs.core import EpisodeBatch
 from plab.envs.tensors import TensorEnv
 from plab.problem import Problem

@@ -13,8 +13,8 @@ import taichi as ti
 import torch
 
 import reference_mpm as reference
-from plab.autograd import simulate
 from plab.config import ConfigError, load_config
+from plab.envs.autograd import simulate
 from plab.losses import TERMS, check_gradient, make_terms
 from plab.losses.term import DistanceTerm
 from plab.objective import soft_iou

@@ -12,7 +12,7 @@ import torch
 
 import reference_mpm as reference
 import suite
-from plab.autograd import simulate
+from plab.envs.autograd import simulate
 from plab.losses import make_terms
 from plab.scenes import MATERIAL_KEYS, Body, Scene, SceneError, sample_particles
 from plab.sim import Simulator, State

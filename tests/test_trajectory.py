@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from plab import autograd
-from plab.autograd import policy_gradient
 from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
+from plab.envs import autograd
+from plab.envs.autograd import policy_gradient
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read

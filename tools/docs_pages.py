@@ -44,7 +44,7 @@ PYTHON = {
             "plab.objective",
             "plab.losses",
             "plab.losses.term",
-            "plab.autograd",
+            "plab.envs.autograd",
             "plab.scenes",
             "plab.targets",
         ),

@@ -80,7 +80,7 @@ class ApgRunner(Runner):
 
     def step(self, track: Track) -> Step:
         """Run an episode of the policy, and improve the policy by the gradient of its loss."""
-        from plab.autograd import policy_gradient
+        from plab.envs.autograd import policy_gradient
 
         episode, problem = self._episode, self.problem
         _, before = episode.reset()

@@ -31,7 +31,7 @@ from plab.runners.libraries import torch
 from plab.runners.policy import Spaces
 
 if TYPE_CHECKING:
-    from plab.autograd import Stretch
+    from plab.envs.autograd import Stretch
     from plab.envs.core import EpisodeBatch
 
 
@@ -95,7 +95,7 @@ class ShacTraining(ActorTraining):
 
     def learn(self, rate_left: float) -> None:
         """Run one episode of all environments, window by window."""
-        from plab.autograd import policy_gradient
+        from plab.envs.autograd import policy_gradient
 
         batch, method = self.batch, self._method
         parameters = list(self.network.parameters())
