@@ -12,7 +12,7 @@ import numpy as np
 
 from plab.config import load_config
 from plab.config.families import family
-from plab.config.identity import member_name
+from plab.config.run import member_name
 from plab.config.suite import PAPER_METHODS, SUITE_VARIANTS, suite_tasks
 from plab.objective import scores_from_iou
 from plab.results import RunResult, config_dict, config_hash, write

@@ -16,6 +16,8 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
         if path.is_file() and os.access(path, os.R_OK)
         else None
         for path in folder.rglob("*")
+        # The index of results is made as soon as they are two seconds old.
+        if not path.name.startswith(".plab-index")
     }
 
 

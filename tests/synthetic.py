@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from plab.config.identity import config_hash, member_name
+from plab.config.run import config_hash, member_name
 from plab.results import RunResult, write
 from synthetic_runs import synthetic_run, template
 

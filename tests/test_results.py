@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import synthetic
-from plab.config.identity import member_name
+from plab.config.run import member_name
 from plab.results import (
     ResultsError,
     RunFile,

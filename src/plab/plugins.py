@@ -19,8 +19,6 @@ from typing import Any, TypeVar
 
 from plab.errors import ConfigError
 
-__all__ = ["LazyModule", "load_object", "passed_on", "search_in"]
-
 Kind = TypeVar("Kind")
 
 

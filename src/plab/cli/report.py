@@ -125,7 +125,7 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--accuracy", type=Path, help=what)
     what = "notebooks: folder of speed.csv, accuracy.csv and precision.csv; example: those that come with "
     what += "plab (default: reports/bench; example where the results come with plab)"
-    parser.add_argument("--bench", type=_bench, help=what)
+    parser.add_argument("--bench", type=measurements, help=what)
     what = "html: draw no pictures, which takes minutes; those that are there stay"
     parser.add_argument("--no-pictures", dest="pictures", action="store_false", help=what)
     what = "key whose values are put side by side as if they were methods: method.lr, or folder, or seed"
@@ -140,8 +140,3 @@ def _parse(argv: Sequence[str]) -> argparse.Namespace:
         shipped = options.sources[0] in map(resolve, EXAMPLES)
         options.bench = measurements(EXAMPLES[0] if shipped else "reports/bench")
     return options
-
-
-def _bench(text: str) -> Path:
-    """Read the name of a folder with files of benchmarks."""
-    return measurements(text) if text in EXAMPLES else folder(text)

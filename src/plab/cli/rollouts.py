@@ -12,7 +12,7 @@ import numpy as np
 from plab.cli.command import Parser, command_line, folder, positive, require_writable, sources_and_words
 from plab.config import choices, load_config
 from plab.config.compose import check_sources
-from plab.config.identity import IDLE
+from plab.config.run import IDLE
 from plab.config.selection import one_protocol, select
 from plab.config.words import require_effect
 from plab.errors import ArgumentError

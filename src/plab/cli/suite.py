@@ -14,7 +14,7 @@ from plab.cli.command import Parser, command_line, sources_and_words, task_list,
 from plab.cli.tables import print_table, write_csv
 from plab.config import Config, ConfigError, build_scene, load_config
 from plab.config.compose import check_sources
-from plab.config.identity import IDLE
+from plab.config.run import IDLE
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import require_effect
 from plab.demonstrations import action_names, known_actions, save_actions

@@ -45,6 +45,6 @@ def __getattr__(name: str) -> Any:
     # The types first: composing needs them while it is imported.
     for part in ("task", "run", "suite", "compose") if name in __all__ else ():
         module = import_module(f"{__name__}.{part}")
-        if name in module.__all__:
+        if hasattr(module, name):
             return getattr(module, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

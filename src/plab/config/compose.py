@@ -31,29 +31,11 @@ from omegaconf.errors import OmegaConfBaseException
 from plab.config.families import family
 from plab.config.run import Config
 from plab.config.suite import conf_folder
-from plab.config.variants import RANDOM, draw_variant, merge_variant, variant_changes
 from plab.config.words import COMPOSE_ERRORS, explain, parse, prepared, quoted
 from plab.errors import ConfigError, pick
 from plab.plugins import search_in
 from plab.scenes import Scene, vector3
 from plab.targets import check_target, load_release_target
-
-__all__ = [
-    "EXPERIMENT",
-    "GROUPS",
-    "build_scene",
-    "check_overrides",
-    "check_sources",
-    "choices",
-    "compose",
-    "compose_with_hydra",
-    "cuda_devices",
-    "drawn_configs",
-    "finish",
-    "hydra_app",
-    "load_config",
-    "require_runnable",
-]
 
 GROUPS = ("task", "method", "protocol", "sim")
 """Sections of the configuration that are a choice of one file."""
@@ -71,6 +53,9 @@ class _Composed(Config):
 
 ConfigStore.instance().store(name="plab_schema", node=_Composed)
 
+
+RANDOM = "random"
+"""Name of the variant that is drawn instead of looked up."""
 
 TABLES = {
     "lr_by_task": "numbers",
@@ -481,6 +466,8 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
     """Put the variant into the task, drawn if it is to be random, and forget the others."""
     task, name = composed.task, composed.variant
     if name == RANDOM:
+        from plab.config.variants import draw_variant
+
         drawn = draw_variant(task, composed.seed_scene)
         _refuse_undone(overrides, drawn, "variant=random")
         composed.variant = f"{RANDOM}{composed.seed_scene}"
@@ -489,6 +476,31 @@ def _choose_variant(composed: DictConfig, overrides: Sequence[Override]) -> None
         _refuse_undone(overrides, variant_changes(task, name), f"variant={name}", f"task.variants.{name}")
         composed.seed_scene = None
     merge_variant(task, composed.variant)
+
+
+def variant_changes(task: DictConfig, name: str) -> DictConfig:
+    """Return what a variant changes, of a task with all its variants; ConfigError if there is no such
+    variant."""
+    if name not in task.variants:
+        names = [*task.variants, *([RANDOM] if task.random else [])]
+        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
+        raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
+    changes = task.variants[name]
+    if not isinstance(changes, DictConfig):
+        expected = "a part of the task's structure, or {}"
+        raise ConfigError(f"variant {name} of task {task.name} must be {expected}, not {changes}")
+    return changes
+
+
+def merge_variant(task: DictConfig, name: str) -> None:
+    """Merge a variant over a task, which has all its variants, and leave no other; ConfigError if it does
+    not exist or does not fit."""
+    changes = variant_changes(task, name)
+    try:
+        task.merge_with(changes)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
+    task.variants, task.random = {name: changes}, {}
 
 
 def _reject_unknown(node: Any, path: str) -> None:

@@ -16,18 +16,6 @@ from typing import Any, TypeVar
 from plab.errors import ConfigError, pick
 from plab.plugins import load_object
 
-__all__ = [
-    "FAMILIES",
-    "GRADIENT",
-    "RL",
-    "SOLVED",
-    "Appearance",
-    "Family",
-    "Rule",
-    "family",
-    "known_family",
-]
-
 RL, GRADIENT = "RL", "gradient"
 """Kinds of methods: those that learn from rewards, and those that use the simulator's gradient."""
 

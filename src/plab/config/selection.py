@@ -11,8 +11,6 @@ from typing import Any
 from plab.config.suite import SUITE_VARIANTS, group_names
 from plab.errors import PlabError, pick
 
-__all__ = ["OBSERVED", "Selection", "SelectionError", "lookup", "one_protocol", "require_possible", "select"]
-
 OBSERVED = ("observe_particles", "observe_target")
 """Keys of a configuration that say which numbers an observation holds."""
 

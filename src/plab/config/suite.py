@@ -11,16 +11,6 @@ import yaml
 
 from plab.errors import ConfigError
 
-__all__ = [
-    "PAPER_METHODS",
-    "PAPER_SEEDS",
-    "SUITE_VARIANTS",
-    "conf_folder",
-    "group_names",
-    "shipped_file",
-    "suite_tasks",
-]
-
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 

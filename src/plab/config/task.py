@@ -12,8 +12,6 @@ from plab.files import ShapeError, pinned
 from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
 from plab.targets import TargetError, make_recipe
 
-__all__ = ["BodyConfig", "DrawConfig", "ManipulatorConfig", "RandomConfig", "RangeConfig", "TaskConfig"]
-
 
 @dataclass
 class BodyConfig(ranges.Section):

@@ -14,14 +14,12 @@ import numpy as np
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from plab.config.compose import variant_changes
 from plab.config.task import RandomConfig, RangeConfig, TaskConfig
 from plab.config.words import explain
 from plab.errors import ConfigError, pick
 from plab.scenes import Scene, SceneError
 from plab.targets import BodiesTarget, TargetBody, TargetError, check_target, make_recipe
-
-RANDOM = "random"
-"""The variant that is drawn, by :func:`draw_variant`, instead of looked up."""
 
 ATTEMPTS = 100
 """Maximum number of draws until a scene is valid."""
@@ -34,31 +32,6 @@ FIRST_TARGET_SEED = 1000
 
 # Entropy besides seed_scene, one per purpose; 0 would be the same as none.
 _NUMBERS, _TARGET_SEED = 1, 2
-
-
-def variant_changes(task: DictConfig, name: str) -> DictConfig:
-    """Return what a variant changes, of a task with all its variants; ConfigError if there is no such
-    variant."""
-    if name not in task.variants:
-        names = [*task.variants, *([RANDOM] if task.random else [])]
-        advice = pick(name, names) if names else 'add variants: {"1": {}} to the task'
-        raise ConfigError(f"variant {name} of task {task.name} does not exist; {advice}")
-    changes = task.variants[name]
-    if not isinstance(changes, DictConfig):
-        expected = "a part of the task's structure, or {}"
-        raise ConfigError(f"variant {name} of task {task.name} must be {expected}, not {changes}")
-    return changes
-
-
-def merge_variant(task: DictConfig, name: str) -> None:
-    """Merge a variant over a task, which has all its variants, and leave no other; ConfigError if it does
-    not exist or does not fit."""
-    changes = variant_changes(task, name)
-    try:
-        task.merge_with(changes)
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"variant {name} of task {task.name}: {explain(error)}") from None
-    task.variants, task.random = {name: changes}, {}
 
 
 def draw_variant(task: DictConfig, seed_scene: int | None) -> DictConfig:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, IntervalSweep, Override
@@ -33,7 +34,7 @@ def prepared(words: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: If they are no list of texts.
     """
-    given = list(words) if isinstance(words, Iterable) and not isinstance(words, str) else [None]
+    given: list[Any] = list(words) if isinstance(words, Iterable) and not isinstance(words, str) else [None]
     if not all(isinstance(word, str) for word in given):
         raise ConfigError(f"overrides are a list of texts, such as ['task=Move', 'seed=3'], not {words!r}")
     return [_quote_path(_YAML_NUMBER.sub(r"\1\2", word)) for word in given]

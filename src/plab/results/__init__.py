@@ -9,7 +9,7 @@ load like folders. This package imports neither torch nor taichi, so that readin
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from plab.config.identity import config_dict, config_hash
+from plab.config.run import config_dict, config_hash
 from plab.config.selection import lookup
 from plab.results.running import RunFile, read, write
 from plab.results.schema import (

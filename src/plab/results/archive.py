@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from plab.config.identity import member_name
+from plab.config.run import member_name
 from plab.results.run_file import encode, read, replace_file
 from plab.results.schema import ARCHIVE_SUFFIX, PARTIAL_SUFFIX, ResultsError, RunResult
 from plab.results.table import Row, readable_rows, rows

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from plab.config.families import SOLVED, known_family
-from plab.config.identity import config_hash
+from plab.config.run import config_hash
 from plab.objective import scores_from_iou
 from plab.results.run_file import run_of
 from plab.results.schema import (

@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, SoftFileLock, Timeout
 
-from plab.config.identity import config_dict, config_hash, member_name
+from plab.config.run import config_dict, config_hash, member_name
 from plab.results.run_file import read, replace_file, write
 from plab.results.schema import (
     PARTIAL_SUFFIX,

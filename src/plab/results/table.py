@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import pandas as pd
 
-from plab.config.identity import SUFFIX
+from plab.config.run import SUFFIX
 from plab.config.selection import lookup
 from plab.files import cache_dir
 from plab.results.examples import resolve

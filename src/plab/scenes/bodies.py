@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plab.errors import PlabError
-from plab.scenes.mesh import Mesh, load_mesh
+
+if TYPE_CHECKING:
+    from plab.scenes.mesh import Mesh
 
 __all__ = [
     "BODY_SHAPES",
@@ -177,4 +180,7 @@ def make_body(
         return Body(shape, vector3(center), tuple(size), particles, **material)
     if file is None:
         raise SceneError("shape mesh needs a file: name an OBJ, STL or PLY file")
+    # Imported here: few scenes have meshes.
+    from plab.scenes.mesh import load_mesh
+
     return MeshBody(shape, vector3(center), tuple(size), particles, load_mesh(file, sha256), **material)

@@ -18,7 +18,6 @@ from plab.errors import PlabError
 from plab.files import ShapeError, one_line, pinned, read_array
 from plab.objective import spread_mass
 from plab.scenes import Body, Scene, SceneError, make_body, sample_particles
-from plab.scenes.mesh import read_mesh
 
 TARGET_SEED = 1
 """Seed of a target's samples; not the scene's, or a target could be a shifted copy of the bodies."""
@@ -240,6 +239,8 @@ def read_points(file: str, _sha256: str = "") -> np.ndarray:
     """
     kind = Path(file).suffix.lower()
     if kind == ".ply":
+        from plab.scenes.mesh import read_mesh
+
         points = np.asarray(read_mesh(file).vertices, np.float64)
     elif kind == ".xyz":
         try:
