@@ -80,6 +80,7 @@ def rows(
         numbers = mean, lower, upper, np.median(scores), (scores >= 0.9).mean()
         known = config["method"].get("scenes", 0)
         trained_on = f"{known} drawn scenes" if known else f"variant {config['variant']}"
+        trained_on = "a dataset" if "dataset" in config["method"] else trained_on
         named = (path, config["task"]["name"], trained_on, len(drawn))
         yield dict(zip(COLUMNS, (*named, *(f"{number:.3f}" for number in numbers)), strict=True))
 

@@ -252,7 +252,7 @@ def test_what_is_observed_is_moved_together() -> None:
     training.network.register_forward_pre_hook(lambda _, seen: given.extend(seen))
     start = torch.as_tensor(batch.reset()[0])
     seen = training.scaled(torch.cat([start] * 50)[:100])
-    training._imitate(seen, torch.zeros((len(seen), 6)), 50)
+    training.imitate(seen, torch.zeros((len(seen), 6)), 50)
     # In the order of the rows: all are alike.
     moved = (torch.cat(given) - seen[:1]) * training._deviation
     particles, pose, target = 6 * 5, 2 * 7, 14

@@ -189,7 +189,7 @@ RANGES: dict[str, tuple[list[Any], list[Any], str]] = {
         sac.num_envs sac.batch_size td3.policy_delay pods.num_envs pods.updates pods.epochs pods.batch_size
         shac.num_envs shac.window shac.value_epochs shac.minibatches ppo.minibatches ppo.epochs
         ppo.statistics_episodes cem.iterations cem.knots multistart.updates multistart.replace_every
-        body.particles .observe_particles""",
+        bc.batch_size body.particles .observe_particles""",
     ),
     "positive": (
         [0.0, -1.0, nan, inf],

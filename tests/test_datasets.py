@@ -1,4 +1,4 @@
-"""Datasets of demonstrations: what is written, how it is read, and refusals."""
+"""Datasets of demonstrations and policies cloned from them: what is written, read, learned and refused."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ import pytest
 
 import plab
 from plab.cli.dataset import main
+from plab.config import Config, ConfigError, load_config
 from plab.demonstrations.minari import DatasetError, metadata_of, read_episodes
+from plab.results import read
+from plab.runners import run_config
+from plab.runners.policy import load_policy, policy_path
+from same_runs import KeepsAll, finished_as, stopped_at
 
 COARSE = (
     "observe_particles=5", "observe_target=true", "sim.grid_size=32", "sim.particles_scale=0.03",
     "sim.dt=2.7e-4", "sim.substeps=7", "progress=false",
 )  # fmt: skip
+CACHE = KeepsAll()
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +61,40 @@ def test_minari_reads_it(written: Path, monkeypatch: pytest.MonkeyPatch) -> None
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(written))
     dataset = minari.load_dataset("plab/Move-v0")
-    for own, read in zip(read_episodes(written / "plab/Move-v0"), dataset, strict=True):
-        assert (
-            np.array_equal(own.actions, read.actions) and read.truncations.sum() == read.truncations[-1] == 1
-        )
-        last = {key: values[-1] for key, values in read.observations.items()}
+    for own, theirs in zip(read_episodes(written / "plab/Move-v0"), dataset, strict=True):
+        assert np.array_equal(own.actions, theirs.actions) and theirs.truncations.tolist() == [
+            *[False] * 49,
+            True,
+        ]
+        last = {key: values[-1] for key, values in theirs.observations.items()}
         assert dataset.observation_space.contains(last)
     assert dataset.recover_environment().observation_space == dataset.observation_space
+
+
+def cloned(folder: Path, *words: str) -> Config:
+    place = f"method.dataset={folder}/plab/Move-v0"
+    small = ["method.episodes=18", "method.evaluate_every=9", "method.hidden=[8]", "method.shift=0.1"]
+    return load_config(
+        ["task=Move", "variant=random", "seed_scene=9000", "method=bc", place, *COARSE, *small, *words]
+    )
+
+
+def test_a_policy_learns_the_actions_of_a_dataset(written: Path, tmp_path: Path) -> None:
+    cfg = cloned(written, f"results_dir={tmp_path}/a")
+    run_config(cfg, CACHE)
+    whole = read(cfg.path)
+    errors = whole.columns["imitation_error"]
+    assert np.isnan(errors[0]) and errors[2] < errors[1] and whole.provenance["dataset_rows"] == 150
+    policy, (episode, *_) = load_policy(cfg.path), read_episodes(written / "plab/Move-v0")
+    assert policy(episode.observations["state"]).shape == (51, 6)
+    # Resumed, it is the same.
+    again = cloned(written, f"results_dir={tmp_path}/b")
+    for _ in range(2):
+        with stopped_at(1):
+            run_config(again, CACHE)
+    run_config(again, CACHE)
+    finished_as(again, whole)
+    assert policy_path(again.path).read_bytes() == policy_path(cfg.path).read_bytes()
 
 
 def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> None:
@@ -72,5 +105,7 @@ def test_mistakes_are_told_in_one_line(written: Path, told, tmp_path: Path) -> N
     assert "observe" in told([*again, "--observe", "smell"], main)
     (tmp_path / "cameras.yaml").write_text("top: {place: 1}")
     assert "cameras.yaml" in told([*again, "--cameras", str(tmp_path / "cameras.yaml")], main)
+    with pytest.raises(ConfigError, match="observe_target"):
+        run_config(cloned(written, "observe_target=false"), CACHE)
     with pytest.raises(DatasetError, match="no dataset"):
         metadata_of(tmp_path)

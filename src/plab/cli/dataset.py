@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -83,7 +84,7 @@ def main(argv: Sequence[str]) -> None:
     output = options.output or Path(os.environ.get("MINARI_DATASETS_PATH") or "datasets")
     cameras = None if options.cameras is None else _cameras(options.cameras)
     observe = options.observe.split(",") if "," in options.observe else options.observe
-    found = _demonstrations(*sources_and_words(options.what, default=None), options.config_dir)
+    found = _demonstrations(options)
     tasks: dict[str, list[Demonstration]] = {one.cfg.task.name: [] for one in found}
     for one in found:
         tasks[one.cfg.task.name].append(one)
@@ -92,7 +93,7 @@ def main(argv: Sequence[str]) -> None:
     rows = []
     for task, own in tasks.items():
         name = options.name or f"plab/{task}-v0"
-        recorder = _Recorder(own, observe, cameras, options.together)
+        recorder = _Recorder(own, observe, cameras, options.together or 25)
         episodes = (one for one in recorder.play() if one.attributes["score"] >= options.min_score)
         about = {
             "algorithm_name": ", ".join(sorted({one.source for one in own})),
@@ -117,9 +118,9 @@ def _cameras(path: Path) -> dict[str, Camera]:
 # --------------------------------------------------------------------------------------------------- actions
 
 
-def _demonstrations(
-    sources: Sequence[Path], words: Sequence[str], config_dir: str | None
-) -> list[Demonstration]:
+def _demonstrations(options: Namespace) -> list[Demonstration]:
+    sources, words = sources_and_words(options.what, default=None)
+    config_dir = options.config_dir
     if sources:
         return _of_results(sources, words)
     from plab.sweep.running import compose_jobs, jobs_of
@@ -134,7 +135,7 @@ def _demonstrations(
             cfgs.append(one)
     require_runnable(cfgs[0])
     if "method" in given:
-        return _solved(cfgs)
+        return _solved(cfgs, options.together)
     actions = [known_actions(cfg) for cfg in cfgs]
     for cfg, own in zip(cfgs, actions, strict=True):
         if own is None:
@@ -146,11 +147,11 @@ def _demonstrations(
     return [Demonstration(cfg, own, "demonstration") for cfg, own in pairs if own is not None]
 
 
-def _solved(cfgs: Sequence[Config]) -> list[Demonstration]:
+def _solved(cfgs: Sequence[Config], together: int | None) -> list[Demonstration]:
     """Carry out runs, and return their best actions; those that break off are left out."""
     from plab.sweep.running import carry_here, run_batches
 
-    for one in run_batches(cfgs, carry_here):
+    for one in run_batches(cfgs, carry_here, together):
         if not one.finished:
             tell(f"{one.title}: {one.message}")
     done = [(cfg, read(cfg.path)) for cfg in cfgs if cfg.path.is_file()]

@@ -119,6 +119,7 @@ FAMILIES: Mapping[str, Family] = _Registry(
     apg="plab.runners.apg:FAMILY",
     pods="plab.runners.pods:FAMILY",
     shac="plab.runners.shac:FAMILY",
+    bc="plab.runners.bc:FAMILY",
 )
 """plab's own families by name, the ``family`` of a method's YAML."""
 

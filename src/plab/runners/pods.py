@@ -24,7 +24,8 @@ import numpy as np
 
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
-from plab.runners.actors import ActorConfig, ActorRunner, ActorTraining, set_rate, training_scenes
+from plab.runners.actors import ActorConfig, ActorRunner, set_rate, training_scenes
+from plab.runners.bc import Imitation
 from plab.runners.libraries import torch
 
 if TYPE_CHECKING:
@@ -53,21 +54,17 @@ class PodsConfig(ActorConfig):
     shift: float = field(metadata=ranges.FINITE)
 
 
-class PodsTraining(ActorTraining):
+class PodsTraining(Imitation):
     """A policy and the rounds of episodes from which it learns."""
 
     columns = ("train_reward", "train_score", "plan_reward", "plan_score")
 
     def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
         """Begin; the seed is that of the initial weights and of the minibatches."""
-        from plab.envs.observations import level_entries
-
-        cfg = cfgs[0]
-        updates = cfg.method_as(PodsConfig).updates
+        updates = cfgs[0].method_as(PodsConfig).updates
         # The policy's own, those with gradient, and those of what they led to.
         self.round_episodes = updates + 2, updates
         super().__init__(cfgs, batch)
-        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfg), device=self._device)
         self._turns = max(1, math.ceil(self._method.scenes / batch.size))
         self._rounds: list[tuple[torch.Tensor, torch.Tensor]] = []
 
@@ -92,7 +89,7 @@ class PodsTraining(ActorTraining):
             self._rounds = [*self._rounds, (seen, wanted)][-self._turns :]
             every, given = map(torch.cat, zip(*self._rounds, strict=True))
             count = math.ceil(method.epochs * len(seen) / method.batch_size)
-            self._imitate(self.scaled(every), given, count)
+            self.imitate(self.scaled(every), given, count)
 
     def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
         """Run an episode of given actions, shape [env, T, A], or of the policy, and note reward and score
@@ -135,24 +132,6 @@ class PodsTraining(ActorTraining):
     def _note_failures(self, failures: Mapping[int, str]) -> None:
         self._failed |= set(failures)
         self.broken += failures.values()
-
-    def _imitate(self, seen: torch.Tensor, wanted: torch.Tensor, count: int) -> None:
-        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry].
-
-        It does so by ``count`` minibatches.
-        """
-        method, drawn = self._method, dict[str, Any](generator=self._generator, device=self._device)
-        minibatches: list[torch.Tensor] = []
-        for _ in range(count):
-            minibatches = minibatches or list(torch.randperm(len(seen), **drawn).split(method.batch_size))
-            rows = minibatches.pop()
-            noisy = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
-            if method.shift > 0.0:
-                for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
-                    noisy[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
-            self._optimizer.zero_grad()
-            torch.nn.functional.mse_loss(self.network(noisy), wanted[rows]).backward()
-            self._optimizer.step()
 
     def states(self) -> list[dict[str, Any]]:
         """Return everything that the next episodes depend on, as arrays and numbers."""

@@ -224,7 +224,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
         policy = _policy(path)
     except FileNotFoundError:
         raise ResultsError(
-            f"{path} is not there: sac, td3, ppo, shac and pods write it when a run ends; see docs/rl.md"
+            f"{path} is not there: sac, td3, ppo, shac, pods and bc write it when a run ends; see docs/rl.md"
         ) from None
     except ResultsError:
         raise

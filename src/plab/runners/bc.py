@@ -1,0 +1,166 @@
+"""Behaviour cloning: ``bc``, a policy that learns the actions of a dataset from its observations.
+
+``plab dataset`` writes datasets, and so does minari. To reproduce a result:
+
+    plab dataset task=Torus variant=random 'seed_scene=range(1000,1400)' observe_target=true
+    plab run task=Torus variant=random seed_scene=9000 method=bc observe_target=true
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plab.config import Config, ConfigError, ranges
+from plab.config.families import Appearance, Family, Rule
+from plab.runners.actors import ActorTraining, set_rate
+from plab.runners.libraries import torch
+from plab.runners.policy import PolicyConfig, Spaces
+from plab.runners.runner import Step, Track
+from plab.runners.training import PolicyRunner, shared_batches, whole_cycles
+
+if TYPE_CHECKING:
+    from plab.envs.core import EpisodeBatch
+
+
+@dataclass
+class BcConfig(PolicyConfig):
+    """Behaviour cloning.
+
+    Attributes:
+        dataset: Folder of a dataset of this task, with the same observation.
+        demonstrations: Episodes of the dataset to learn from, at most; None: all.
+        episodes: Episodes to learn from, each pass over the dataset counted; rounded up to whole passes.
+        batch_size: Actions per update of the policy.
+        observation_noise: Standard deviation of noise on the observations, in units of theirs.
+        shift: Largest common shift of all observed positions along x and along z [domain units].
+    """
+
+    dataset: str
+    demonstrations: int | None = field(metadata=ranges.COUNT)
+    batch_size: int = field(metadata=ranges.COUNT)
+    observation_noise: float = field(metadata=ranges.FINITE)
+    shift: float = field(metadata=ranges.FINITE)
+
+
+class Imitation(ActorTraining):
+    """A policy that learns given actions by their mean squared error, with observations augmented."""
+
+    def __init__(self, cfgs: Sequence[Config], batch: EpisodeBatch) -> None:
+        """Begin; the seed is that of the initial weights and of the minibatches."""
+        from plab.envs.observations import level_entries
+
+        super().__init__(cfgs, batch)
+        self._level = torch.as_tensor(level_entries(batch.problem.scenes[0], cfgs[0]), device=self._device)
+
+    def imitate(self, seen: torch.Tensor, wanted: torch.Tensor, count: int) -> float:
+        """Let the policy learn actions, shape [row, A], for scaled observations, shape [row, entry], by
+        ``count`` minibatches; return the mean of their errors."""
+        method, drawn = self._method, dict[str, Any](generator=self._generator, device=self._device)
+        minibatches: list[torch.Tensor] = []
+        errors: list[torch.Tensor] = []
+        for _ in range(count):
+            minibatches = minibatches or list(torch.randperm(len(seen), **drawn).split(method.batch_size))
+            rows = minibatches.pop()
+            noisy = seen[rows] + method.observation_noise * torch.randn(seen[rows].shape, **drawn)
+            if method.shift > 0.0:
+                for entries, along in zip(self._level, torch.rand((2, len(rows), 1), **drawn), strict=True):
+                    noisy[:, entries] += method.shift * (2.0 * along - 1.0) / self._deviation[entries]
+            self._optimizer.zero_grad()
+            error = torch.nn.functional.mse_loss(self.network(noisy), wanted[rows])
+            error.backward()
+            self._optimizer.step()
+            errors.append(error.detach())
+        return float(torch.stack(errors).mean())
+
+
+class Cloning(Imitation):
+    """A policy that learns from a dataset; a cycle is a pass over it."""
+
+    columns = ("imitation_error",)
+
+    def __init__(
+        self, cfgs: Sequence[Config], batch: EpisodeBatch, data: tuple[np.ndarray, np.ndarray]
+    ) -> None:
+        """Begin with observations, shape [row, entry], and actions, shape [row, A]."""
+        super().__init__(cfgs, batch)
+        self.total_steps = whole_cycles(self._method.episodes * batch.horizon, len(data[0]))
+        self.statistics.update(data[0].astype(np.float64))
+        self.hold_moments()
+        seen, self._wanted = (torch.as_tensor(part, device=self._device) for part in data)
+        self._seen = self.scaled(seen)
+
+    def cycle(self) -> None:
+        """Pass over the data once."""
+        self.learn(1.0 - self.steps / self.total_steps)
+        self._steps += len(self._seen)
+        self.report()
+
+    def learn(self, rate_left: float) -> None:
+        """Pass over the data once, at a share of the learning rate."""
+        set_rate(self._optimizer, self._method.lr * rate_left)
+        count = math.ceil(len(self._seen) / self._method.batch_size)
+        self.note(imitation_error=np.array([self.imitate(self._seen, self._wanted, count)]))
+
+
+class BcRunner(PolicyRunner):
+    """Trains a policy; each iteration is some passes over the data, then one episode of the policy."""
+
+    def build(self) -> None:
+        """Read the dataset, and make the environment that judges."""
+        from plab.envs.tensors import TensorEnv
+
+        self.require_torch_device()
+        cfgs = [track.cfg for track in self.tracks]
+        (judge,) = shared_batches(self.cache, (cfgs, "hard"))
+        self._judge, self.problem = TensorEnv(judge), judge.problem
+        data = pairs(self.method, Spaces.of(judge))
+        self.policies = Cloning(cfgs, judge, data)
+        for track in self.tracks:
+            track.run.result.provenance["dataset_rows"] = len(data[0])
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Pass over the data until the next evaluation is due; only that simulates anything."""
+        for track, step in super().iterate(tracks):
+            yield track, replace(step, steps_forward=len(step.actions), steps_gradient=0)
+
+
+def pairs(method: BcConfig, spaces: Spaces) -> tuple[np.ndarray, np.ndarray]:
+    """Return observations, shape [row, entry], and actions, shape [row, A], of a dataset, float32.
+
+    Raises:
+        plab.config.ConfigError: If observations or actions are not those of the spaces.
+    """
+    from plab.demonstrations.minari import read_episodes
+
+    seen, wanted = [], []
+    for episode in read_episodes(method.dataset, method.demonstrations):
+        observations: Any = episode.observations
+        if isinstance(observations, dict):
+            observations = observations.get("state")
+        entries = [None if rows is None else rows.shape[1:] for rows in (observations, episode.actions)]
+        if entries != [(size,) for size in spaces.sizes]:
+            raise ConfigError(
+                f"method.dataset={method.dataset} has states and actions of shapes {entries}, not of "
+                f"{list(spaces.sizes)} entries: use its task, observe_particles and observe_target"
+            )
+        seen.append(observations[:-1])
+        wanted.append(episode.actions)
+    return np.concatenate(seen).astype(np.float32), np.concatenate(wanted).astype(np.float32)
+
+
+FAMILY = Family(
+    label="a policy that imitates the actions of a dataset",
+    config=BcConfig,
+    runner=BcRunner,
+    columns=Cloning.columns,
+    may_be_nan=Cloning.columns,
+    ranking="score",
+    rules={"bc": Rule(Cloning, BcConfig)},
+    contact="hard",
+    methods={"bc": Appearance("BC", "#882255", "-.")},
+)
