@@ -6,16 +6,23 @@ from docstrings. Files of the repository's root, the suite's tasks and the examp
 
 from __future__ import annotations
 
+import base64
 import dataclasses
-import json
+import hashlib
+import html
+import itertools
 import re
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import griffe
 import mkdocs_gen_files
+import nbformat
 import yaml
+from nbclient import NotebookClient
 
 from plab import config
 from plab.config.suite import conf_folder
@@ -130,15 +137,52 @@ def main() -> None:
 
 
 def _notebook(path: Path) -> Iterator[str]:
-    """Yield text and code of a notebook, with links as the site has them."""
-    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
-        text = "".join(cell["source"])
-        if cell["cell_type"] == "code":
+    """Yield text, code and outputs of a notebook, with links as the site has them; 3-D views are files."""
+    views = itertools.count(1)
+    for cell in _executed(path).cells:
+        text = cell.source
+        if cell.cell_type == "code":
             yield f"```python\n{text}\n```"
+            for output in cell.outputs:
+                yield from _output(output, path.stem, views)
         else:
             text = re.sub(r"\]\((\w+)\.ipynb", r"](\1.md", text)
             yield re.sub(r"\]\(\.\./\.\./docs/", "](../", text)
-    yield f"Open `examples/notebooks/{path.name}` in Jupyter to run it and to see the rollouts in 3-D."
+    yield f"Open `examples/notebooks/{path.name}` in Jupyter to run it."
+
+
+def _executed(path: Path) -> nbformat.NotebookNode:
+    """Return a notebook with its outputs, executed in a copy of examples/; kept in build/ by its text."""
+    kept = ROOT / "build" / "notebooks" / f"{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}.ipynb"
+    if not kept.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            examples = Path(folder) / "examples"
+            ignored = shutil.ignore_patterns("results", "own_conf")
+            shutil.copytree(ROOT / "examples", examples, ignore=ignored)
+            notebook = nbformat.read(path, as_version=4)
+            where = {"metadata": {"path": str(examples / "notebooks")}}
+            NotebookClient(notebook, timeout=None, kernel_name="python3", resources=where).execute()
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        nbformat.write(notebook, kept)
+    return nbformat.read(kept, as_version=4)
+
+
+def _output(output: nbformat.NotebookNode, name: str, views: Iterator[int]) -> Iterator[str]:
+    """Yield an output of a cell as Markdown; progress bars (stderr) are left out."""
+    data = output.get("data", {})
+    frame = re.search('<iframe .*srcdoc="([^"]*)"', data.get("text/html", ""))
+    number = f"{name}-{next(views)}" if frame or "image/png" in data else ""
+    if frame:
+        _write(f"notebooks/{number}.html", html.unescape(frame[1]))
+        yield f'<iframe src="{number}.html" width="100%" height="520" frameborder="0"></iframe>'
+    elif "image/png" in data:
+        with mkdocs_gen_files.open(f"notebooks/{number}.png", "wb") as file:
+            file.write(base64.b64decode(data["image/png"]))
+        yield f"![Output of the cell]({number}.png)"
+    elif "text/html" in data:
+        yield data["text/html"]
+    elif text := data.get("text/plain") or (output.text if output.get("name") == "stdout" else ""):
+        yield f"```text\n{text.rstrip()}\n```"
 
 
 def _write(path: str, text: str) -> None:
