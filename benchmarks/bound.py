@@ -14,12 +14,12 @@ import time
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import taichi as ti
 
 from plab.bench.workload import GRADIENT, KINDS, Workload, build, time_calls
 from plab.cli.command import Parser, command_line, positive, to_write
 from plab.cli.tables import measure_table
 from plab.config import Config, load_config
+from plab.sim.compiler import ti
 from plab.sim.cpu_engine import SPLIT
 from plab.sim.runtime import Runtime, start_runtime
 from plab.sim.storage import STATE

@@ -25,7 +25,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import taichi as ti
 import torch
 
 from plab.cli.tables import measure_table
@@ -37,6 +36,7 @@ from plab.runners.agents import OffPolicyAgents, OffPolicyConfig, RlConfig
 from plab.runners.ppo import PpoConfig
 from plab.runners.rl import Population, population_settings
 from plab.runners.training import evaluate
+from plab.sim.compiler import ti
 
 __all__ = ["COLUMNS", "PARTS", "measure", "rows"]
 

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import taichi as ti
 
 from plab.losses.term import ParticleTerm
 from plab.scenes import MANIPULATOR_SHAPES, Body, Manipulator, Scene
 from plab.sim import Simulator, State
+from plab.sim.compiler import ti
 
 if TYPE_CHECKING:
     import reference_mpm as reference

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import taichi as ti
 
+from plab.sim.compiler import BITCODE, Bitcode, ti
 from plab.sim.cuda_sums import add
 from plab.sim.runtime import start_runtime
-from plab.sim.taichi_internals import BITCODE, Bitcode
 
 
 def test_bitcode_is_that_of_its_source(monkeypatch) -> None:

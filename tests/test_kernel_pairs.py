@@ -9,16 +9,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import suite
 from plab.scenes import Body
+from plab.sim.compiler import address_of, ti
 from plab.sim.cpu_engine import CpuPhases
 from plab.sim.cuda_phases import CudaPhases
 from plab.sim.particle_phases import spline
 from plab.sim.runtime import start_runtime
 from plab.sim.storage import FRAME_ADJOINT, STATE
-from plab.sim.taichi_internals import address_of
 
 pytestmark = pytest.mark.skipif(suite.DEVICE != "cpu", reason="on CUDA the reference is compared with")
 

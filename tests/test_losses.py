@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import taichi as ti
 import torch
 
 import reference_mpm as reference
@@ -21,6 +20,7 @@ from plab.objective import soft_iou
 from plab.results import check, load, read
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim import SimulationError, Simulator
+from plab.sim.compiler import ti
 from suite import KINDS, Kinetic, scene, tools
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
-from taichi.lang import kernel_impl
 
 from plab import progress
 from plab.cli.run import main
@@ -20,7 +19,8 @@ from plab.config import load_config
 from plab.results import RunFile
 from plab.results import read as read_result
 from plab.runners.tracks import Track
-from plab.sim.taichi_internals import watch_compiling
+from plab.sim import compiler
+from plab.sim.compiler import watch_compiling
 
 COARSE = ("sim.grid_size=16", "sim.horizon=2", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.03")
 
@@ -60,7 +60,7 @@ def test_a_bar_shows_which_kernel_is_compiled(screen) -> None:
 def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, capsys) -> None:
     kept: list[tuple[int, int]] = []
     compiled: list[str] = []
-    entry, record = kernel_impl._get_tree_and_ctx, RunFile.record
+    entry, record = getattr(compiler._traced, compiler._TRACE), RunFile.record
 
     def look(run: RunFile, *args, **kwargs) -> None:
         record(run, *args, **kwargs)
@@ -71,7 +71,7 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
         with watch_compiling(lambda name: (compiled.append(name), tell(name))):
             yield
 
-    monkeypatch.setattr("plab.sim.taichi_internals.watch_compiling", watch)
+    monkeypatch.setattr("plab.sim.compiler.watch_compiling", watch)
     monkeypatch.setattr(RunFile, "record", look)
     monkeypatch.chdir(tmp_path)
     argv = ["task=Rope", *COARSE, "method.iterations=3", "checkpoint_seconds=1e6"]
@@ -81,8 +81,8 @@ def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, cap
     assert {"step_kernel", "losses_kernel", "step_adjoint_kernel"} <= set(compiled[: kept[0][1]])
     # Each begins and ends before the next begins.
     assert all(compiled[0::2]) and not any(compiled[1::2]) and len(compiled) % 2 == 0
-    assert kernel_impl._get_tree_and_ctx is entry
-    kernels = [one for one in gc.get_objects() if isinstance(one, kernel_impl.Kernel)]
+    assert getattr(compiler._traced, compiler._TRACE) is entry
+    kernels = [one for one in gc.get_objects() if isinstance(one, compiler.Kernel)]
     assert kernels and all("launch_kernel" not in vars(kernel) for kernel in kernels)
     seen = screen.getvalue()
     assert "Rope-v1 adam seed 0 build" in seen and "Rope-v1 adam seed 0 final evaluation" in seen

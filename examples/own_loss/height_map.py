@@ -4,9 +4,9 @@ plab run --config-dir examples/own_loss/conf method=adam_height task=RollingPin
 """
 
 import numpy as np
-import taichi as ti
 
 from plab.losses.term import NodeTerm
+from plab.sim.compiler import ti
 
 __all__ = ["HeightMap"]
 

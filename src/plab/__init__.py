@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 # Before Taichi is imported, by whichever part of plab: it would print a banner on standard output, and send
 # version, platform and a number of its own to its makers.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("ENABLE_QUADRANTS_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 if os.name == "posix" and "HOME" not in os.environ:
     # Taichi aborts without it.

@@ -25,7 +25,7 @@ Report = Callable[[int, str], None]
 
 Watcher = Callable[[Callable[[str], None]], AbstractContextManager[None]]
 """Context that passes the name of each kernel under compilation to a function, and an empty one afterwards;
-such as :func:`plab.sim.taichi_internals.watch_compiling`."""
+such as :func:`plab.sim.compiler.watch_compiling`."""
 
 _forward: Callable[..., None] | None = None
 

@@ -10,7 +10,7 @@ import pytest
 
 SCRIPT = """
 import numpy as np
-import taichi as ti
+from plab.sim.compiler import ti
 from plab.losses import make_terms
 from plab.scenes import Body, Manipulator, Scene
 from plab.sim import Simulator

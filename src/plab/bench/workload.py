@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import taichi as ti
 
 from plab.config import Config, load_config
 from plab.demonstrations import known_actions
 from plab.objective import target_sdf
 from plab.problem import make_simulator
 from plab.sim import Simulator
+from plab.sim.compiler import ti
 
 FORWARD = "forward"
 REWARD = "forward + reward"

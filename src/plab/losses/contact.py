@@ -7,9 +7,8 @@
 Distances are 0 inside a manipulator. Each term is summed over the moving manipulators.
 """
 
-import taichi as ti
-
 from plab.losses.term import DistanceTerm
+from plab.sim.compiler import ti
 
 __all__ = ["AllContact", "NearestContact", "SoftContact"]
 

@@ -1,9 +1,9 @@
 """Density term, ``sum |S - S*|``: mass where the target has none, and the reverse."""
 
 import numpy as np
-import taichi as ti
 
 from plab.losses.term import NodeTerm
+from plab.sim.compiler import ti
 
 __all__ = ["Density"]
 

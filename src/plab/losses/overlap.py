@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
 from plab.losses.term import NodeTerm
+from plab.sim.compiler import ti
 from plab.sim.tensors import Constants
 
 __all__ = ["Overlap"]

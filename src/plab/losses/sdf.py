@@ -1,8 +1,7 @@
 """Distance term, ``sum sdf* S``: mass times its distance to the target."""
 
-import taichi as ti
-
 from plab.losses.term import NodeTerm
+from plab.sim.compiler import ti
 
 __all__ = ["Sdf"]
 

@@ -6,7 +6,8 @@ to manipulators. The simulator sums up, forward and backward.
 """
 
 import numpy as np
-import taichi as ti
+
+from plab.sim.compiler import ti
 
 __all__ = ["DistanceTerm", "NodeTerm", "ParticleTerm", "Term"]
 

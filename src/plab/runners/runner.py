@@ -220,7 +220,7 @@ class Runner:
         return self._note + batch_title([track.cfg for track in self.tracks])
 
     def _waiting(self, what: str) -> AbstractContextManager[Report]:
-        from plab.sim.taichi_internals import watch_compiling
+        from plab.sim.compiler import watch_compiling
 
         enabled = self.tracks[0].cfg.progress
         return show_progress(f"{self._heading()} {what}", 0, None, enabled=enabled, compiling=watch_compiling)
@@ -252,7 +252,7 @@ class Runner:
 
     def _optimise(self) -> None:
         """Do the iterations that the files do not hold yet."""
-        from plab.sim.taichi_internals import watch_compiling
+        from plab.sim.compiler import watch_compiling
 
         done, total, every = self.extent()
         # The first rollout of a process compiles the kernels.

@@ -1,7 +1,7 @@
 """The Taichi simulator: usable alone, with no Hydra, Gymnasium or torch around it."""
 
 # First: it changes the decorators of the kernels that the others define.
-import plab.sim.taichi_internals  # noqa: F401
+import plab.sim.compiler  # noqa: F401
 from plab.sim.runtime import DeviceError, SimulationError
 from plab.sim.simulator import Simulator
 from plab.sim.state import Measures, Rollout, State

@@ -10,9 +10,9 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import taichi as ti
 
 from plab.scenes import Camera
+from plab.sim.compiler import ti
 from plab.sim.tensors import Array, on_device
 
 if TYPE_CHECKING:

@@ -10,13 +10,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-import taichi as ti
-
+from plab.sim.compiler import address_of, ti
 from plab.sim.cpu_tiles import KEY, NODE, TilePhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.motion import PosePhases
 from plab.sim.storage import AT_V, BASES, BLOCK, CHUNKS, FRAME_ADJOINT, STATE, STENCILS, STRAINS
-from plab.sim.taichi_internals import address_of
 from plab.sim.tensors import Array
 from plab.sim.term_phases import TermPhases
 

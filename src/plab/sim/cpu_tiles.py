@@ -15,8 +15,7 @@ addresses of arrays of states.
 import platform
 import sys
 
-import taichi as ti
-
+from plab.sim.compiler import Bitcode, local_variable, ti
 from plab.sim.particle_phases import ParticlePhases, at_base, spline, spline_slope
 from plab.sim.storage import (
     ADJOINT_FIELD,
@@ -36,7 +35,6 @@ from plab.sim.storage import (
     STRAINS,
     WEIGHTS,
 )
-from plab.sim.taichi_internals import Bitcode, local_variable
 
 # Entries in ``bases``: node in the environment's grid; block and crossing in one number.
 NODE = 0

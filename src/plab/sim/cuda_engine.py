@@ -11,8 +11,7 @@ runs by rounding, unless the simulator is deterministic (:mod:`plab.sim.cuda_sum
 
 import ctypes
 
-import taichi as ti
-
+from plab.sim.compiler import ti
 from plab.sim.cuda_phases import DISTANCE_GROUPS, POSE_SHARE, RESIDENT_BLOCK, CudaPhases
 from plab.sim.cuda_warp import BLOCK_WARPS, NODE_BITS, NODE_STRIDE, WARP_BLOCK, WARP_NUMBERS
 from plab.sim.particle_phases import SIZES

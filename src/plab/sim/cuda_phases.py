@@ -10,8 +10,7 @@ depend on timing.
 from collections.abc import Sequence
 from typing import Any
 
-import taichi as ti
-
+from plab.sim.compiler import grid_memory_fence, ti
 from plab.sim.cuda_sums import LARGEST_MOMENTUM, gather_sums, look, particle, particle_adjoint
 from plab.sim.cuda_warp import (
     ALL_LANES,
@@ -399,13 +398,13 @@ class CudaPhases(OrderPhases, PosePhases):
         ti.simt.block.sync()
         if w % RESIDENT_BLOCK == 0:
             # After a meeting of its block one thread's fence is one for what all have written.
-            ti.simt.grid.memfence()
+            grid_memory_fence()
             # What all blocks add turns the sign, so that nobody need begin anew.
             before = ti.atomic_add(self.arrivals[0], ti.select(w == 0, self.last_arrival, 1))
             while (before ^ look(ti.get_addr(self.arrivals, 0))) >= 0:
                 pass
             # What others wrote must not be read from this processor's own cache.
-            ti.simt.grid.memfence()
+            grid_memory_fence()
         ti.simt.block.sync()
 
     @ti.func

@@ -13,10 +13,8 @@ statements, each of which Taichi looks for in all others; ``tools/particle.py`` 
 
 import math
 
-import taichi as ti
-
+from plab.sim.compiler import Bitcode, local_variable, ti
 from plab.sim.storage import Storage
-from plab.sim.taichi_internals import Bitcode, local_variable
 
 MOMENTUM_BITS, MASS_BITS = 36, 42
 """Bits after the point of a node's momentum [particle mass x domain units / s] and mass [particle mass]."""

@@ -10,8 +10,7 @@ each cell holds, where each cell's share begins, and which place that gives to e
 a cell depends on timing.
 """
 
-import taichi as ti
-
+from plab.sim.compiler import ti
 from plab.sim.cuda_sums import SumPhases
 from plab.sim.grid_phases import GridPhases
 from plab.sim.particle_phases import SIZES, ParticlePhases

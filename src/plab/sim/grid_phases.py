@@ -2,9 +2,8 @@
 
 import math
 
-import taichi as ti
-
 from plab.scenes import MANIPULATOR_SHAPES
+from plab.sim.compiler import ti
 from plab.sim.shapes import gap_slope, hessian_product, signed_distance
 from plab.sim.storage import (
     AT_FRAME_GAP,

@@ -11,9 +11,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import taichi as ti
-
 from plab.scenes import Scene, SceneError
+from plab.sim.compiler import ti
 from plab.sim.runtime import cuda_driver
 from plab.sim.storage import BLOCK, CHUNKS, INDEX_MASK, LANES, STATE, STATE_MASK
 

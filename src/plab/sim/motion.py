@@ -5,9 +5,8 @@ of the motion that an environment step's action asks for. Adjoints are written b
 quaternion products. Everything here is float64 in both precisions; a manipulator is 8 numbers.
 """
 
-import taichi as ti
-
 from plab.scenes import MANIPULATOR_SHAPES, ROLL_RADIUS
+from plab.sim.compiler import ti
 from plab.sim.storage import AT_FRAME_GAP, AT_FRAME_ROTATION, AT_FRAME_SPIN, AT_FRAME_VELOCITY, Storage
 from plab.sim.tensors import Array
 

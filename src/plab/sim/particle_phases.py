@@ -5,8 +5,7 @@ the particle (APIC, moving least squares). Such a field is a 4-vector at the bas
 one per axis, also 4-vectors: three components of momentum or velocity and the mass (or nothing).
 """
 
-import taichi as ti
-
+from plab.sim.compiler import ti
 from plab.sim.spectral import (
     product,
     product_nt,

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import taichi as ti
 
+from plab.sim.compiler import ti
 from plab.sim.state import State
 from plab.sim.storage import AT_C, AT_F, AT_V, STATE
 from plab.sim.tensors import copy_numbers

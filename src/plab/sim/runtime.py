@@ -13,16 +13,15 @@ import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import taichi as ti
-
 from plab.errors import ArgumentError, PlabError
 from plab.scenes import DEVICES, PRECISIONS
-from plab.sim.taichi_internals import (
+from plab.sim.compiler import (
     cache_folder,
     cuda_available,
     forget_arguments,
     free_own_arrays_only,
     hasten_tracing,
+    ti,
 )
 
 CACHE_BYTES = 1 << 30

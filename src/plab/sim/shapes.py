@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import taichi as ti
-
 from plab.scenes import MANIPULATOR_SHAPES, SceneError
+from plab.sim.compiler import ti
 
 
 @dataclass(frozen=True)

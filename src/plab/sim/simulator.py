@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
 from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
+from plab.sim.compiler import ti
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
 from plab.sim.particles import Particles

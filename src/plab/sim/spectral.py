@@ -7,8 +7,7 @@ smallest singular value carries the sign of det F) and a derivative in divided d
 Material parameters are called as there, matrices are 3x3.
 """
 
-import taichi as ti
-
+from plab.sim.compiler import ti
 from plab.sim.material import NORM_SHIFT
 
 SINGULAR_VALUE_MIN = 0.05

@@ -18,11 +18,11 @@ from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.sim.batch import material_parameters
+from plab.sim.compiler import ti
 from plab.sim.linalg import Series
 from plab.sim.runtime import Runtime
 from plab.sim.shapes import SURFACES, require_surfaces

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import taichi as ti
 
 from plab.errors import ArgumentError
+from plab.sim.compiler import ti
 from plab.sim.memory import ENTRIES_MAX, held_bytes, segment_length
 from plab.sim.particles import Particles
 from plab.sim.storage import AT_V

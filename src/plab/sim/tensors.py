@@ -9,10 +9,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
+from plab.sim.compiler import ti
 
 # What kernels take: an array of Taichi's or NumPy's or a CUDA tensor, of numbers or of vectors.
 if TYPE_CHECKING:

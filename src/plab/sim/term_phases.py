@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import taichi as ti
 
 from plab.scenes import MANIPULATOR_SHAPES
+from plab.sim.compiler import ti
 from plab.sim.motion import rotation_matrix, rotation_matrix_adjoint, vec4, vec8
 from plab.sim.particle_phases import spline, spline_slope
 from plab.sim.shapes import gap_slope, signed_distance

@@ -1,8 +1,10 @@
-"""Reaches into Taichi's internals: everything that its documented interface does not promise.
+"""The kernels' compiler: Taichi, or Quadrants, a fork of it with wheels for Python 3.14.
 
-Written for Taichi 1.7.4 (July 2025); pyproject.toml asks for ``>=1.7.4,<1.8``. Each function says what it
-changes or uses, and why. Nothing of the standard library is changed. :mod:`plab.sim` imports this module
-before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the others.
+No other module imports either, or uses what their documented interfaces do not promise. Written for Taichi
+1.7.4 (July 2025) and Quadrants 1.3.3; pyproject.toml has the versions that are allowed. Each function says
+what it changes or uses, and why. Nothing of the standard library is changed. :mod:`plab.sim` imports this
+module before any kernel is defined, as it changes Taichi's decorators; ``plab.sim.runtime`` applies the
+others.
 """
 
 from __future__ import annotations
@@ -13,15 +15,34 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import taichi as ti
-from taichi.lang import _ndarray, impl, kernel_impl
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-from taichi.lang.source_builder import SourceBuilder
-
 from plab.files import cache_dir
+
+QUADRANTS = os.environ.get("PLAB_COMPILER") == "quadrants" or find_spec("taichi") is None
+"""True if kernels are compiled by Quadrants: Taichi is missing, or PLAB_COMPILER=quadrants."""
+
+if QUADRANTS:
+    import quadrants as ti
+    from quadrants.lang import impl
+    from quadrants.lang._func_base import FuncBase as _traced
+    from quadrants.lang.kernel import Kernel
+    from quadrants.lang.source_builder import SourceBuilder
+
+    _TRACE = "get_tree_and_ctx"
+    grid_memory_fence = ti.simt.grid.mem_fence
+else:
+    import taichi as ti
+    from taichi.lang import _ndarray, impl
+    from taichi.lang import kernel_impl as _traced
+    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    from taichi.lang.kernel_impl import Kernel
+    from taichi.lang.source_builder import SourceBuilder
+
+    _TRACE = "_get_tree_and_ctx"
+    grid_memory_fence = ti.simt.grid.memfence
 
 BITCODE = Path(__file__).with_name("bitcode")
 """Folder of the files that ``make bitcode`` writes."""
@@ -37,7 +58,7 @@ def _tell_classes_quickly() -> None:
     For each function of a module Taichi asks ``inspect`` for the source of the module's importer, which looks
     through all modules, each time, for a file that it does not know: a quarter of the simulator's import.
     """
-    tell = kernel_impl._inside_class
+    tell = _traced._inside_class
 
     @functools.wraps(tell)
     def inside_class(level_of_class_stackframe: int) -> bool:
@@ -46,10 +67,11 @@ def _tell_classes_quickly() -> None:
             return False
         return bool(tell(level_of_class_stackframe + 1))
 
-    kernel_impl._inside_class = inside_class
+    _traced._inside_class = inside_class
 
 
-_tell_classes_quickly()
+if not QUADRANTS:
+    _tell_classes_quickly()
 
 
 # -- compiling ----------------------------------------------------------------------------------------------
@@ -61,6 +83,8 @@ def hasten_tracing() -> None:
 
     Taichi wraps an excerpt of the source for each node: half of what compiling from a warm cache takes.
     """
+    if QUADRANTS:
+        return
     find = ASTTransformerContext.get_pos_info
     if hasattr(find, "__wrapped__"):
         return
@@ -75,35 +99,36 @@ def hasten_tracing() -> None:
 @contextlib.contextmanager
 def watch_compiling(tell: Callable[[str], None]) -> Iterator[None]:
     """Tell which kernel is being compiled while the ``with`` block lasts: patches
-    ``kernel_impl._get_tree_and_ctx``, which Taichi calls once per kernel or function that it compiles, and at
-    no launch.
+    ``kernel_impl._get_tree_and_ctx``, or ``FuncBase.get_tree_and_ctx`` of Quadrants, which is called for each
+    kernel or function that is compiled, and at no launch.
 
     Args:
         tell: Takes the kernel's name when its compiling begins, and an empty name after its first launch.
     """
-    original = kernel_impl._get_tree_and_ctx
+    original = getattr(_traced, _TRACE)
 
     @functools.wraps(original)
     def entry(function: Any, *args: Any, **kwargs: Any) -> Any:
-        if isinstance(function, kernel_impl.Kernel):
+        # Quadrants traces a kernel twice.
+        if isinstance(function, Kernel) and "launch_kernel" not in vars(function):
             tell(function.func.__name__)
             _tell_after_launch(function, tell)
         return original(function, *args, **kwargs)
 
-    kernel_impl._get_tree_and_ctx = entry
+    setattr(_traced, _TRACE, entry)
     try:
         yield
     finally:
-        kernel_impl._get_tree_and_ctx = original
+        setattr(_traced, _TRACE, original)
 
 
 def _tell_after_launch(kernel: Any, tell: Callable[[str], None]) -> None:
 
-    def launch(*args: Any) -> Any:
+    def launch(*args: Any, **kwargs: Any) -> Any:
         # Only of this launch: the attribute hides the method.
         del kernel.launch_kernel
         try:
-            return kernel.launch_kernel(*args)
+            return kernel.launch_kernel(*args, **kwargs)
         finally:
             tell("")
 
@@ -128,6 +153,8 @@ def free_own_arrays_only() -> None:
 
     Taichi would free what is at their addresses by now, an array that is in use, perhaps.
     """
+    if QUADRANTS:
+        return
     kind, current = _ndarray.ScalarNdarray, impl.get_runtime
     make, free = kind.__init__, kind.__del__
     if hasattr(free, "__wrapped__"):
@@ -158,7 +185,8 @@ def address_of(array: ti.Ndarray) -> int:
 
 def cache_folder() -> Path:
     """Return the folder of Taichi's cache of compiled kernels, in which killed processes leave locks."""
-    return Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path)
+    variable = f"{'QD' if QUADRANTS else 'TI'}_OFFLINE_CACHE_FILE_PATH"
+    return Path(os.environ.get(variable) or impl.default_cfg().offline_cache_file_path)
 
 
 def cuda_available() -> bool:
