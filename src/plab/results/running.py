@@ -391,7 +391,17 @@ def _locked(file: Path, timeout: float) -> Lock:
 
 # ------------------------------------------------------------------------------------------------- provenance
 
-_PACKAGES = ("plab", "taichi", "torch", "numpy", "gymnasium", "stable_baselines3", "h5py", "hydra-core")
+_PACKAGES = (
+    "plab",
+    "taichi",
+    "quadrants",
+    "torch",
+    "numpy",
+    "gymnasium",
+    "stable_baselines3",
+    "h5py",
+    "hydra-core",
+)
 """Distributions whose versions are recorded. They are not imported: torch alone takes seconds."""
 
 

@@ -183,10 +183,11 @@ def address_of(array: ti.Ndarray) -> int:
 # -- devices and cache --------------------------------------------------------------------------------------
 
 
-def cache_folder() -> Path:
-    """Return the folder of Taichi's cache of compiled kernels, in which killed processes leave locks."""
-    variable = f"{'QD' if QUADRANTS else 'TI'}_OFFLINE_CACHE_FILE_PATH"
-    return Path(os.environ.get(variable) or impl.default_cfg().offline_cache_file_path)
+def cache_lock() -> Path:
+    """Return the lock of the cache of compiled kernels, which killed processes leave behind."""
+    place, lock = ("QD", "kernel_compilation_manager/qdcache.lock") if QUADRANTS else ("TI", "ticache.lock")
+    folder = os.environ.get(f"{place}_OFFLINE_CACHE_FILE_PATH") or impl.default_cfg().offline_cache_file_path
+    return Path(folder, lock)
 
 
 def cuda_available() -> bool:

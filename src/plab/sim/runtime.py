@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from plab.errors import ArgumentError, PlabError
 from plab.scenes import DEVICES, PRECISIONS
 from plab.sim.compiler import (
-    cache_folder,
+    cache_lock,
     cuda_available,
     forget_arguments,
     free_own_arrays_only,
@@ -147,7 +147,7 @@ def free_abandoned_cache() -> None:
 
     Taichi waits for it a fifth of a second, and would then compile every kernel anew in every later process.
     """
-    lock = cache_folder() / "ticache.lock"
+    lock = cache_lock()
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > ABANDONED_SECONDS:
             lock.unlink()
