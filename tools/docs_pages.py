@@ -161,7 +161,7 @@ def _executed(path: Path) -> nbformat.NotebookNode:
             shutil.copytree(ROOT / "examples", examples, ignore=ignored)
             notebook = nbformat.read(path, as_version=4)
             where = {"metadata": {"path": str(examples / "notebooks")}}
-            NotebookClient(notebook, timeout=None, kernel_name="python3", resources=where).execute()
+            NotebookClient(notebook, coalesce_streams=True, timeout=None, resources=where).execute()
         kept.parent.mkdir(parents=True, exist_ok=True)
         nbformat.write(notebook, kept)
     return nbformat.read(kept, as_version=4)
