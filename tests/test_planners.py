@@ -25,10 +25,9 @@ from plab.runners.planners.planner import (
     CandidateStart,
     Preview,
     Request,
-    actions_of,
-    knots_of,
     make_planner,
 )
+from plab.runners.planners.samplers import actions_of, knots_of
 from plab.runners.planners.starts import ContactStarts
 from plab.runners.runner import SimulatorCache
 from plab.scenes import sample_particles

@@ -28,11 +28,9 @@ from plab import config
 from plab.config.suite import conf_folder
 from plab.runners.agents import OffPolicyConfig, RlConfig
 from plab.runners.apg import ApgConfig
-from plab.runners.planners.cem import CemConfig
-from plab.runners.planners.mppi import MppiConfig
 from plab.runners.planners.multistart import MultistartConfig
-from plab.runners.planners.planner import PlannerConfig, SamplerConfig
-from plab.runners.planners.stages import StagesConfig
+from plab.runners.planners.planner import PlannerConfig, StagesConfig
+from plab.runners.planners.samplers import CemConfig, MppiConfig, SamplerConfig
 from plab.runners.ppo import PpoConfig
 from plab.runners.shac import ShacConfig
 from plab.runners.td3 import Td3Config

@@ -1,17 +1,12 @@
 """Planners: searches for a sequence of actions with many candidates, which a simulator tries together.
 
-One file per planner; :mod:`plab.runners.planners.planner` has what they share.
+:mod:`plab.runners.planners.planner` has what they share.
 """
 
 from plab.config.families import Appearance, Family, Rule
-from plab.runners.planners.cem import Cem, CemConfig
-from plab.runners.planners.cmaes import Cmaes, CmaesConfig
-from plab.runners.planners.mppi import Mppi, MppiConfig
 from plab.runners.planners.multistart import Multistart, MultistartConfig
-from plab.runners.planners.planner import PlannerConfig, PlannerRunner
-from plab.runners.planners.stages import Stages, StagesConfig
-
-__all__ = ["FAMILY"]
+from plab.runners.planners.planner import PlannerConfig, PlannerRunner, Stages, StagesConfig
+from plab.runners.planners.samplers import Cem, CemConfig, Cmaes, CmaesConfig, Mppi, MppiConfig
 
 FAMILY = Family(
     label="a sequence of actions, searched for with many candidates",

@@ -20,8 +20,6 @@ from plab.runners.planners.planner import Asking, CandidateStart, Planner, Plann
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Multistart", "MultistartConfig"]
-
 
 @dataclass
 class MultistartConfig(PlannerConfig):
@@ -48,7 +46,6 @@ class MultistartConfig(PlannerConfig):
     fresh: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         if not self.lrs:
             raise ConfigError(f"{path}.lrs is empty: give one learning rate at least")
@@ -59,12 +56,11 @@ class MultistartConfig(PlannerConfig):
 
 
 class Multistart(Planner):
-    """Each candidate has moments and, in turn, a learning rate of its own."""
+    """Gradient descent of candidates that have moments and, in turn, learning rates of their own."""
 
     method: MultistartConfig
 
     def __init__(self, method: MultistartConfig, start: CandidateStart) -> None:
-        """Make places for the candidates."""
         super().__init__(method, start)
         zeros = torch.zeros((method.population, *start.shape), dtype=torch.float64, device=start.device)
         self._places = [place.clone().requires_grad_() for place in zeros]
@@ -74,7 +70,6 @@ class Multistart(Planner):
         self._adam = torch.optim.Adam(groups, betas=(first, second), eps=method.eps)
 
     def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Take over what has been found, but for the share that starts anew."""
         count = self.method.population
         kept = found[: count - round(self.method.fresh * count)]
         self._put(torch.cat([kept, self.start.draw(self.method, count - len(kept), random)]), range(count))
@@ -95,7 +90,6 @@ class Multistart(Planner):
         return self.show(actions, shown)
 
     def candidates(self) -> Tensor:
-        """Return the candidates, the best of the last judgement first."""
         return self._actions()[self.memory["order"]]
 
     def _softness(self) -> float | None:
@@ -136,13 +130,11 @@ class Multistart(Planner):
         self._put(torch.cat([moved, fresh]), worse.tolist())
 
     def state(self) -> dict[str, Any]:
-        """Return everything that the next iterations depend on, Adam's moments included."""
         held = {str(k): self._adam.state[p] for k, p in enumerate(self._places) if p in self._adam.state}
         moments = {k: {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in held.items()}
         return super().state() | {"actions": self._actions().cpu().numpy(), "moments": moments}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
         super().restore(state)
         self._put(torch.tensor(state["actions"]), range(len(self._places)))
         for k, own in state.get("moments", {}).items():

@@ -1,4 +1,4 @@
-"""Base of the planners: keys, candidates tried in one simulator, starts, curves, and the runner.
+"""Base of the planners: keys, candidates tried in one simulator, starts, stages, and the runner.
 
 A planner asks for candidates to be tried, by ``yield``, and is sent what they gave; the runner tries those of
 all runs of a batch together. Candidates, losses, scores and gradients are tensors on the simulator's device.
@@ -11,12 +11,12 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from plab.config import MethodConfig, ranges
+from plab.config import ConfigError, MethodConfig, ranges
 from plab.config.families import family
 from plab.runners.libraries import torch
 from plab.runners.policy import torch_settings
@@ -27,26 +27,7 @@ if TYPE_CHECKING:
 
     from plab.problem import Episodes
     from plab.scenes import Scene
-
-__all__ = [
-    "Answer",
-    "Asking",
-    "CandidateStart",
-    "Planner",
-    "PlannerConfig",
-    "PlannerRunner",
-    "Preview",
-    "Request",
-    "Sampler",
-    "SamplerConfig",
-    "actions_of",
-    "knots_of",
-    "make_planner",
-]
-
-
 OBJECTIVES = ("loss", "final", "score")
-CURVES = ("constant", "linear")
 
 
 @dataclass
@@ -72,25 +53,8 @@ class PlannerConfig(MethodConfig):
     contact_starts: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         ranges.one_of(f"{path}.algorithm", self.algorithm, tuple(family(self.family).rules))
-
-
-@dataclass
-class SamplerConfig(PlannerConfig):
-    """Keys of the planners that draw candidates and learn from their costs, without a gradient.
-
-    Attributes:
-        knots: Actions are a curve through so many points in time, at most one per environment step.
-        curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
-            the next.
-        spread: Standard deviation of the first draws around the best start, of each point.
-    """
-
-    knots: int = field(metadata=ranges.COUNT)
-    curve: str = field(metadata=ranges.within(ranges.one_of, CURVES))
-    spread: float = field(metadata=ranges.POSITIVE)
 
 
 @dataclass(frozen=True)
@@ -236,102 +200,65 @@ class Planner(ABC):
         self.memory = {name: torch.as_tensor(array, device=self.start.device) for name, array in arrays}
 
 
-def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
-    """Return the actions of curves.
-
-    Args:
-        knots: Points, evenly spaced in time, shape [P, K, A].
-        steps: Environment steps T.
-        curve: ``constant`` or ``linear``.
-
-    Returns:
-        Actions in [-1, 1], shape [P, T, A].
-    """
-    by_component = knots.transpose(1, 2)
-    if curve == "constant":
-        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="nearest")
-    else:
-        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="linear", align_corners=True)
-    return drawn.transpose(1, 2).clamp(-1.0, 1.0)
-
-
-def knots_of(actions: Tensor, knots: int) -> Tensor:
-    """Return points, shape [P, knots, A], that are means of actions, shape [P, T, A], over their share of the
-    time."""
-    return torch.nn.functional.adaptive_avg_pool1d(actions.transpose(1, 2), knots).transpose(1, 2)
-
-
-class Sampler(Planner):
-    """Draws curves, has them tried, and learns from what they cost; first the starts, then around the best.
-
-    Attributes:
-        method: Its numbers.
-        knots: Points K of a curve.
-    """
-
-    method: SamplerConfig
-
-    @property
-    def knots(self) -> int:
-        """Points of a curve, at most one per step."""
-        return min(self.method.knots, self.start.shape[0])
-
-    def begin(self, random: torch.Generator, found: Tensor) -> None:
-        """Take over the better half of what has been found, and draw starts for the others."""
-        kept = found[: self.method.population // 2]
-        drawn = self.start.draw(self.method, self.method.population - len(kept), random)
-        self.memory["candidates"] = torch.cat([kept, drawn])
-
-    def candidates(self) -> Tensor:
-        """Return the curves drawn last, the best first."""
-        return self.memory["candidates"]
-
-    def iterate(self, random: torch.Generator) -> Asking:
-        """Try the starts, later what is drawn, and learn from it."""
-        method, first = self.method, self.iteration == 0
-        if first:
-            points = knots_of(self.memory["candidates"], self.knots)
-        else:
-            points = self.sample(random).clamp(-1.0, 1.0)
-            points[0] = self.memory["best"]
-        actions = actions_of(points, self.start.shape[0], method.curve)
-        softness = method.softness if method.contact == "soft" else None
-        answer = yield Request(actions, softness)
-        cost = answer.cost(method.objective)
-        order = cost.argsort(stable=True)
-        self.memory |= {"candidates": actions[order], "best": points[order[0]].clone()}
-        if first:
-            self.settle(points[order[0]])
-        else:
-            self.learn(points, cost)
-        if softness is not None:
-            # Rows are of the hard model: that of the best half, so that it is no gamble.
-            actions = actions[order[: len(order) // 2]]
-            answer = yield Request(actions)
-        return self.show(actions, answer)
-
-    @abstractmethod
-    def settle(self, point: Tensor) -> None:
-        """Begin to draw around a curve, shape [K, A]."""
-
-    @abstractmethod
-    def sample(self, random: torch.Generator) -> Tensor:
-        """Draw curves, shape [P, K, A]; whatever leaves [-1, 1] will be clipped."""
-
-    @abstractmethod
-    def learn(self, points: Tensor, cost: Tensor) -> None:
-        """Learn from curves, shape [P, K, A], and what they cost, shape [P], infinite for what broke off."""
-
-    def noise(self, random: torch.Generator) -> Tensor:
-        """Draw standard normal numbers, shape [P, K, A]."""
-        size = (self.method.population, self.knots, self.start.shape[1])
-        return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
-
-
 def make_planner(method: MethodConfig, start: CandidateStart) -> Any:
     """Return the planner of a method's section: a :class:`Planner`, or stages of some."""
     rule = family(method.family).rules[getattr(method, "algorithm")]  # noqa: B009
     return rule.what(method, start)
+
+
+@dataclass
+class StagesConfig(MethodConfig):
+    """Planners one after the other, ``hybrid`` and ``solve``, each from what the one before has found.
+
+    Attributes:
+        algorithm: ``stages``.
+        stages: Planners by names of your choice, in order; each has the keys of a method of its own.
+    """
+
+    algorithm: str
+    stages: dict[str, Any]
+
+    def check(self, path: str) -> None:
+        super().check(path)
+        if not self.stages:
+            raise ConfigError(f"{path}.stages is empty: give one planner at least")
+        for name, stage in self.stages.items():
+            if not isinstance(stage, PlannerConfig):
+                raise ConfigError(
+                    f"{path}.stages.{name} is no planner: start from one, as conf/method/solve.yaml"
+                )
+            for part in ("loss_weights", "loss_terms"):
+                if getattr(stage, part) != getattr(self, part):
+                    raise ConfigError(
+                        f"{path}.stages.{name}.{part} differs from {path}.{part}: all share one loss"
+                    )
+            stage.check(f"{path}.stages.{name}")
+
+
+class Stages:
+    """Planner that does what the planner of its stage does."""
+
+    def __init__(self, method: StagesConfig, start: CandidateStart) -> None:
+        self._methods, self._start = list(method.stages.values()), start
+        self._enter(0)
+
+    def plan(self, random: torch.Generator) -> Asking:
+        found = None
+        if self._planner.iteration == self._planner.method.iterations:
+            found = self._planner.found()
+            self._enter(self._stage + 1)
+        return (yield from self._planner.plan(random, found))
+
+    def state(self) -> dict[str, Any]:
+        return {"stage": self._stage, "planner": self._planner.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._enter(int(state["stage"]))
+        self._planner.restore(state["planner"])
+
+    def _enter(self, stage: int) -> None:
+        self._stage = stage
+        self._planner: Planner = make_planner(self._methods[stage], self._start)
 
 
 class PlannerRunner(Runner):
@@ -365,9 +292,9 @@ class PlannerRunner(Runner):
         """Make the run's planner, as the file knows it if it does."""
         number = track.number
         start = CandidateStart(self.problem.scenes[number], self.problem.target_mass[number], self._device)
-        self._planners[number] = make_planner(track.cfg.method, start)
+        planner = self._planners[number] = make_planner(track.cfg.method, start)
         if state is not None:
-            self._planners[number].restore(state)
+            planner.restore(state)
 
     def has_more(self, track: Track) -> bool:
         """Return whether a run has iterations left: none once it is solved."""
@@ -382,7 +309,8 @@ class PlannerRunner(Runner):
         shown: dict[Track, Preview] = {}
         while pending:
             first = next(iter(pending.values()))
-            together = {track: request for track, request in pending.items() if _alike(request, first)}
+            kind = first.gradient, first.actions.shape
+            together = {t: r for t, r in pending.items() if (r.gradient, r.actions.shape) == kind}
             for track, answer in self._try(together).items():
                 request = pending.pop(track)
                 spent[track][request.gradient] += request.actions.shape[0] * request.actions.shape[1]
@@ -393,9 +321,17 @@ class PlannerRunner(Runner):
                     shown[track] = stop.value
         share = (time.perf_counter() - begin) / len(tracks)
         for track, best in shown.items():
-            state = self._planners[track.number].state()
-            step = Step(best.measures, best.actions.cpu().numpy().copy(), state, seconds=share)
-            yield track, replace(step, steps_forward=spent[track][False], steps_gradient=spent[track][True])
+            yield (
+                track,
+                Step(
+                    best.measures,
+                    best.actions.cpu().numpy().copy(),
+                    self._planners[track.number].state(),
+                    steps_forward=spent[track][False],
+                    steps_gradient=spent[track][True],
+                    seconds=share,
+                ),
+            )
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Run the runs' actions, shape [run, T, A], in the hard contact model, in all environments."""
@@ -455,13 +391,8 @@ class PlannerRunner(Runner):
         return {name: v.reshape(width, runs, *v.shape[1:])[:size] for name, v in tensors.items()}
 
 
-def _alike(a: Request, b: Request) -> bool:
-    """Return whether two runs' candidates can be tried together."""
-    return a.gradient == b.gradient and a.actions.shape == b.actions.shape
-
-
 def _smallest_population(method: Any) -> int:
-    """Return how many candidates are tried at once at least: more environments would stand still then."""
+    """Return the fewest candidates that are tried at once: further environments would stand still then."""
     if hasattr(method, "stages"):
         return min(map(_smallest_population, method.stages.values()))
     return method.population

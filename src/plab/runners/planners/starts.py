@@ -20,8 +20,6 @@ from scipy.spatial.transform import Rotation
 from plab.scenes import ROLL_RADIUS, Manipulator, Scene, sample_particles
 from plab.targets.scripted import ActionTrack
 
-__all__ = ["ContactStarts", "support"]
-
 POINTS = 256
 """Points of the body, and of the target."""
 

@@ -1,0 +1,255 @@
+"""Samplers: planners that draw curves of actions and learn from their costs, without a gradient.
+
+* ``cem``, the cross-entropy method: draw curves from a normal distribution, fit it to the best, again.
+* ``mppi``, model-predictive path integral: the mean of all curves, weighted by exp(-cost), again and again;
+  over the whole episode: the simulator is deterministic, so that planning anew on the way would gain nothing.
+* ``cmaes``, covariance matrix adaptation of a curve's points, by the library cmaes.
+
+To reproduce a result:
+
+    python -m plab.run task=Move variant=1 method=cem seed=0
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plab.config import ConfigError, ranges
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import Asking, Planner, PlannerConfig, Request
+
+if TYPE_CHECKING:
+    from cmaes import CMA
+    from torch import Tensor
+
+CURVES = ("constant", "linear")
+
+
+@dataclass
+class SamplerConfig(PlannerConfig):
+    """Keys of the planners that draw candidates and learn from their costs, without a gradient.
+
+    Attributes:
+        knots: Actions are a curve through so many points in time, at most one per environment step.
+        curve: ``constant``: each point holds for its share of the episode; ``linear``: straight from one to
+            the next.
+        spread: Standard deviation of the first draws around the best start, of each point.
+    """
+
+    knots: int = field(metadata=ranges.COUNT)
+    curve: str = field(metadata=ranges.within(ranges.one_of, CURVES))
+    spread: float = field(metadata=ranges.POSITIVE)
+
+
+def actions_of(knots: Tensor, steps: int, curve: str) -> Tensor:
+    """Return the actions of curves.
+
+    Args:
+        knots: Points, evenly spaced in time, shape [P, K, A].
+        steps: Environment steps T.
+        curve: ``constant`` or ``linear``.
+
+    Returns:
+        Actions in [-1, 1], shape [P, T, A].
+    """
+    by_component = knots.transpose(1, 2)
+    if curve == "constant":
+        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="nearest")
+    else:
+        drawn = torch.nn.functional.interpolate(by_component, size=steps, mode="linear", align_corners=True)
+    return drawn.transpose(1, 2).clamp(-1.0, 1.0)
+
+
+def knots_of(actions: Tensor, knots: int) -> Tensor:
+    """Return points, shape [P, knots, A], that are means of actions, shape [P, T, A], over their share of the
+    time."""
+    return torch.nn.functional.adaptive_avg_pool1d(actions.transpose(1, 2), knots).transpose(1, 2)
+
+
+class Sampler(Planner):
+    """Planner that draws curves, has them tried, and learns from their costs; first the starts, then around
+    the best."""
+
+    method: SamplerConfig
+
+    @property
+    def knots(self) -> int:
+        """Points of a curve, at most one per step."""
+        return min(self.method.knots, self.start.shape[0])
+
+    def begin(self, random: torch.Generator, found: Tensor) -> None:
+        # The better half of what has been found, and starts for the others.
+        kept = found[: self.method.population // 2]
+        drawn = self.start.draw(self.method, self.method.population - len(kept), random)
+        self.memory["candidates"] = torch.cat([kept, drawn])
+
+    def candidates(self) -> Tensor:
+        return self.memory["candidates"]
+
+    def iterate(self, random: torch.Generator) -> Asking:
+        """Try the starts, later what is drawn, and learn from it."""
+        method, first = self.method, self.iteration == 0
+        if first:
+            points = knots_of(self.memory["candidates"], self.knots)
+        else:
+            points = self.sample(random).clamp(-1.0, 1.0)
+            points[0] = self.memory["best"]
+        actions = actions_of(points, self.start.shape[0], method.curve)
+        softness = method.softness if method.contact == "soft" else None
+        answer = yield Request(actions, softness)
+        cost = answer.cost(method.objective)
+        order = cost.argsort(stable=True)
+        self.memory |= {"candidates": actions[order], "best": points[order[0]].clone()}
+        if first:
+            self.settle(points[order[0]])
+        else:
+            self.learn(points, cost)
+        if softness is not None:
+            # Rows are of the hard model: that of the best half, so that it is no gamble.
+            actions = actions[order[: len(order) // 2]]
+            answer = yield Request(actions)
+        return self.show(actions, answer)
+
+    @abstractmethod
+    def settle(self, point: Tensor) -> None:
+        """Begin to draw around a curve, shape [K, A]."""
+
+    @abstractmethod
+    def sample(self, random: torch.Generator) -> Tensor:
+        """Draw curves, shape [P, K, A]; whatever leaves [-1, 1] will be clipped."""
+
+    @abstractmethod
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        """Learn from curves, shape [P, K, A], and what they cost, shape [P], infinite for what broke off."""
+
+    def noise(self, random: torch.Generator) -> Tensor:
+        """Draw standard normal numbers, shape [P, K, A]."""
+        size = (self.method.population, self.knots, self.start.shape[1])
+        return torch.randn(size, generator=random, dtype=torch.float64, device=self.start.device)
+
+
+@dataclass
+class CemConfig(SamplerConfig):
+    """Cross-entropy method.
+
+    Attributes:
+        elites: Candidates that mean and spread are taken from.
+        smoothing: Share of the old mean and spread that is kept.
+        least_spread: The spread falls no lower.
+    """
+
+    elites: int = field(metadata=ranges.within(ranges.at_least, 2))
+    smoothing: float = field(metadata=ranges.FRACTION)
+    least_spread: float = field(metadata=ranges.FINITE)
+
+    def check(self, path: str) -> None:
+        super().check(path)
+        if self.elites > self.population:
+            raise ConfigError(
+                f"{path}.elites must be at most population = {self.population}, not {self.elites}"
+            )
+
+
+class Cem(Sampler):
+    """Sampler whose mean and standard deviation of each point follow those of the elites."""
+
+    method: CemConfig
+
+    def settle(self, point: Tensor) -> None:
+        self.memory |= {"mean": point.clone(), "std": torch.full_like(point, self.method.spread)}
+
+    def sample(self, random: torch.Generator) -> Tensor:
+        return self.memory["mean"] + self.memory["std"] * self.noise(random)
+
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        elites = points[cost.argsort(stable=True)[: self.method.elites]]
+        mean, std = elites.mean(0), elites.std(0).clamp(min=self.method.least_spread)
+        self.memory["mean"] = torch.lerp(mean, self.memory["mean"], self.method.smoothing)
+        self.memory["std"] = torch.lerp(std, self.memory["std"], self.method.smoothing)
+
+
+@dataclass
+class MppiConfig(SamplerConfig):
+    """Model-predictive path integral: the mean of all candidates, weighted by how good they are.
+
+    Attributes:
+        temperature: Candidates that are worse than the best by this many standard deviations of the costs
+            weigh 1 / e of it.
+        decay: The spread is multiplied by this after each iteration.
+    """
+
+    temperature: float = field(metadata=ranges.POSITIVE)
+    decay: float = field(metadata=ranges.UNIT)
+
+
+class Mppi(Sampler):
+    """Sampler that learns the mean alone; the spread falls with the iterations."""
+
+    method: MppiConfig
+
+    def settle(self, point: Tensor) -> None:
+        self.memory["mean"] = point.clone()
+
+    def sample(self, random: torch.Generator) -> Tensor:
+        spread = self.method.spread * self.method.decay ** (self.iteration - 1)
+        return self.memory["mean"] + spread * self.noise(random)
+
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        """Weigh the curves by their costs, in units of the costs' standard deviation."""
+        through = cost[cost.isfinite()]
+        scale = through.std(correction=0).clamp(min=1e-12) * self.method.temperature
+        weights = torch.softmax(-(cost - through.min()) / scale, dim=0)
+        self.memory["mean"] = (weights[:, None, None] * points).sum(0)
+
+
+@dataclass
+class CmaesConfig(SamplerConfig):
+    """Covariance matrix adaptation."""
+
+
+class Cmaes(Sampler):
+    """Search of the library over the points of a curve, end to end, on the host: tens of numbers."""
+
+    method: CmaesConfig
+    _search: CMA
+
+    def settle(self, point: Tensor) -> None:
+        from cmaes import CMA
+
+        flat = point.flatten().cpu().numpy()
+        bounds = np.stack([-np.ones_like(flat), np.ones_like(flat)], axis=1)
+        # Not drawn again where it leaves the bounds, but clipped: in many dimensions nearly all would.
+        self._search = CMA(
+            flat,
+            self.method.spread,
+            bounds=bounds,
+            n_max_resampling=0,
+            population_size=self.method.population,
+        )
+
+    def sample(self, random: torch.Generator) -> Tensor:
+        # The library draws with its own generator, from a seed of the iteration's.
+        self._search.reseed_rng(int(torch.randint(2**31, (1,), generator=random, device=self.start.device)))
+        drawn = np.stack([self._search.ask() for _ in range(self.method.population)])
+        return torch.as_tensor(drawn, device=self.start.device).reshape(-1, self.knots, self.start.shape[1])
+
+    def learn(self, points: Tensor, cost: Tensor) -> None:
+        pairs = zip(points.flatten(1).cpu().numpy(), cost.tolist(), strict=True)
+        self._search.tell(list(pairs))
+        # What the library keeps of its covariance is one triangle: a run that goes on has to have just that.
+        self._search.__setstate__(self._search.__getstate__())
+
+    def state(self) -> dict[str, Any]:
+        held = self._search.__getstate__()
+        return super().state() | {"search": {name: v for name, v in held.items() if v is not None}}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self.settle(self.memory["best"])
+        held = {name: np.asarray(value)[()] for name, value in state["search"].items()}
+        self._search.__setstate__(self._search.__getstate__() | held)
