@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -25,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from torch.distributions import normal
 
 from plab.config import Config, load_config
-from plab.runners.agents import Agents, Block, OffPolicyConfig
+from plab.runners.agents import Agents, OffPolicyConfig
 from plab.runners.policy import CLIP, Spaces, first_policy, torch_settings
 from plab.runners.replay import ReplayBuffer, Sizes
 from plab.runners.rl import agents_of
@@ -97,10 +95,7 @@ def taped_and_played(agents: Agents, observations: np.ndarray, rewards: np.ndarr
 
 def play(agents: Agents, observations: np.ndarray, rewards: np.ndarray) -> None:
     """Let agents draw number by number, and learn from scripts."""
-    for name, block in list(vars(agents).items()):
-        if isinstance(block, Block):
-            draw = partial(getattr(agents.draws, block._draw.__name__), *block._shape[1:])
-            setattr(agents, name, SimpleNamespace(next=draw))
+    agents.draws.block = lambda use, draw, *shape: draw(*shape)
     told = iter(torch.from_numpy(observations).to(agents.device).unbind(1))
     now = next(told)
     agents.begin(now)

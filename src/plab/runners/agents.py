@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from torch import Tensor
     from torch.optim import Adam
 
-BLOCK = 50
-"""Entries that are drawn at once."""
-
 LARGEST = 2**62
 """Integers are drawn below it, and taken modulo what is asked for: then they are uniform to 1e-12."""
 
@@ -69,7 +66,6 @@ class OffPolicyConfig(RlConfig):
     gradient_steps: int
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         ranges.at_least(f"{path}.buffer_size", self.buffer_size, self.num_envs)
         if self.gradient_steps != -1:
@@ -77,12 +73,16 @@ class OffPolicyConfig(RlConfig):
 
 
 class Draws:
-    """Generators of K agents on a device; what one draws does not depend on the others."""
+    """Random numbers of K agents on a device; what one draws does not depend on the others."""
+
+    BLOCK = 50
+    """Entries that :meth:`block` draws at once."""
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
         """Seed a generator per agent."""
         self._generators = [torch.Generator(device).manual_seed(seed) for seed in seeds]
         self._device = device
+        self._rest: dict[str, list[Tensor]] = {}
 
     def _each(self, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
         return torch.stack([draw(generator) for generator in self._generators])
@@ -103,36 +103,21 @@ class Draws:
         """The numbers below ``count`` in random order, shape [agent, count]."""
         return self._each(lambda g: torch.randperm(count, generator=g, device=self._device))
 
+    def block(self, use: str, draw: Callable[..., Tensor], *shape: int) -> Tensor:
+        """Return the next entry, shape [agent, *shape], of a block for some use, which a method of this class
+        draws when the last one is used up."""
+        if not self._rest.get(use):
+            self._rest[use] = list(draw(self.BLOCK, *shape).unbind(1))[::-1]
+        return self._rest[use].pop()
+
     def states(self) -> list[np.ndarray]:
-        """Return the state of each generator."""
+        """Return the state of each generator, and drop the blocks: a process that resumes has none."""
+        self._rest = {}
         return [generator.get_state().numpy() for generator in self._generators]
 
     def restore(self, agent: int, state: np.ndarray) -> None:
         """Return an agent's generator to one of :meth:`states`."""
         self._generators[agent].set_state(torch.from_numpy(np.array(state, np.uint8)))
-
-
-class Block:
-    """Hands out entries of a block of random numbers one by one, and draws the next block when it is used up.
-
-    At a checkpoint the rest is to be dropped: a process that resumes begins with a new block.
-    """
-
-    def __init__(self, draw: Callable[..., Tensor], length: int, *shape: int) -> None:
-        """Take over a method of :class:`Draws`, and the length of a block and the shape of an agent's
-        entry."""
-        self._draw, self._shape = draw, (length, *shape)
-        self.drop()
-
-    def drop(self) -> None:
-        """Forget what has not been handed out."""
-        self._rest: list[Tensor] = []
-
-    def next(self) -> Tensor:
-        """Return an entry, shape [agent, ...]."""
-        if not self._rest:
-            self._rest = list(self._draw(*self._shape).unbind(1))[::-1]
-        return self._rest.pop()
 
 
 class Agents:
@@ -170,7 +155,6 @@ class Agents:
         self.draws = Draws([cfg.seed for cfg in cfgs], device)
         self.networks = Networks(first, self.PARTS, device)
         self.tensors: dict[str, Tensor] = {}
-        self._blocks: list[Block] = []
         self._updates: dict[str, CapturedUpdate] = {}
         self._losses: dict[str, list[Tensor]] = {}
 
@@ -224,8 +208,6 @@ class Agents:
 
     def states(self) -> list[dict[str, Any]]:
         """Return each agent's state: all that further training depends on, except a replay buffer."""
-        for block in self._blocks:
-            block.drop()
         rows = {name: flat(tensors, self.count).cpu().numpy() for name, tensors in self._tables().items()}
         shared = {"steps": self.steps, "updates": self.updates}
         for name, optimizer in self.optimizers.items():
@@ -258,11 +240,6 @@ class Agents:
             for name, row in zip(self.LOSSES, losses, strict=False):
                 self._losses.setdefault(name, []).append(row.clone())
 
-    def _block(self, draw: Callable[..., Tensor], *shape: int) -> Block:
-        """Return blocks of random numbers of which a checkpoint drops the rest."""
-        self._blocks.append(Block(draw, BLOCK, *shape))
-        return self._blocks[-1]
-
     def _captured(self, update: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
         """Call a function that is recorded on CUDA; what it returns is overwritten by the next call."""
         return self._updates.setdefault(update.__name__, CapturedUpdate(update))(*arguments)
@@ -274,15 +251,10 @@ class OffPolicyAgents(Agents):
     method: OffPolicyConfig
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks and empty buffers."""
         super().__init__(cfgs, spaces, device)
         window = max(self.method.buffer_size // self.sizes.envs, 1)
         capacity = self.sizes.capacity(self.method, self.total_steps)
         self.replay = ReplayBuffer(self.count, self.sizes, capacity, window, device)
-        explored = self.sizes.envs, self.sizes.actions
-        self._anything = self._block(self.draws.uniform, *explored)
-        self._noise = self._block(self.draws.normal, *explored)
-        self._numbers = self._block(self.draws.integers, self.method.batch_size)
 
     @abstractmethod
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
@@ -296,10 +268,19 @@ class OffPolicyAgents(Agents):
         """Return random actions at first, then those of the policy with noise."""
         self._observations = observations
         if self.steps < self.method.learning_starts:
-            self._actions = self.explore_at_random(self._anything.next())
+            shape = self.sizes.envs, self.sizes.actions
+            self._actions = self.explore_at_random(self.draws.block("start", self.draws.uniform, *shape))
         else:
-            self._actions = self._captured(self._explore, observations, self._noise.next()).clone()
+            self._actions = self._captured(self._explore, observations, self.noise()).clone()
         return self._actions
+
+    def noise(self) -> Tensor:
+        """Draw standard normal noise of the environments' actions, shape [agent, env, action]."""
+        return self.draws.block("noise", self.draws.normal, self.sizes.envs, self.sizes.actions)
+
+    def numbers(self) -> Tensor:
+        """Draw the numbers of an update's transitions, shape [agent, row]."""
+        return self.draws.block("numbers", self.draws.integers, self.method.batch_size)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Return the actions before learning starts, given uniformly random ones."""

@@ -68,7 +68,6 @@ class PpoConfig(RlConfig):
     value_gain: float = field(metadata=ranges.POSITIVE)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         # Advantages are standardised: a minibatch needs two of them.
         if self.minibatches > self.steps_per_update // 2:
@@ -118,7 +117,6 @@ class PpoAgents(Agents):
     method: PpoConfig
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks."""
         super().__init__(cfgs, spaces, device)
         agents, envs = self.count, self.sizes.envs
         self._length = self.cycle_steps(self.method, self.sizes.horizon) // envs
@@ -135,7 +133,6 @@ class PpoAgents(Agents):
         self.tensors["returns"] = self._returns
         parameters = self.networks.parameters()
         self.optimizers = {"policy": adam(parameters, self.method.lr, eps=self.method.adam_eps)}
-        self._noise = self._block(self.draws.normal, envs, self.sizes.actions)
         rollout = agents, envs, self._length
         self.observations = torch.zeros((*rollout, self.sizes.observed), device=device)
         self.actions = torch.zeros((*rollout, self.sizes.actions), device=device)
@@ -157,7 +154,6 @@ class PpoAgents(Agents):
         return policy
 
     def moments(self, agent: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return means and variances that scale an agent's observations, if any do."""
         if not self.method.normalise:
             return None
         return self._seen.mean[agent].cpu().numpy(), self._seen.var[agent].cpu().numpy()
@@ -179,14 +175,14 @@ class PpoAgents(Agents):
         with torch.no_grad():
             mean, values = self._evaluate(seen)
             std = self.networks["log_std"][""].exp().unsqueeze(1)
-            actions = mean + std * self._noise.next()
+            noise = self.draws.block("noise", self.draws.normal, self.sizes.envs, self.sizes.actions)
+            actions = mean + std * noise
             self.observations[:, :, step], self.actions[:, :, step] = seen, actions
             self.rollout["values"][:, :, step] = values
             self.rollout["log_probs"][:, :, step] = self._log_prob(mean, actions)
         return actions
 
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the most likely actions."""
         with torch.no_grad():
             return self._evaluate(self.scaled(observations))[0].clamp(-1.0, 1.0)
 

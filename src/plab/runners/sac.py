@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from stable_baselines3.sac.policies import SACPolicy
     from torch import Tensor
 
-__all__ = ["SacAgents", "SacConfig"]
-
 LOG_STD = -20.0, 2.0
 """Smallest and largest logarithm of a standard deviation."""
 
@@ -43,7 +41,6 @@ class SacAgents(OffPolicyAgents):
     LOSSES: ClassVar = ("ent_coef", "ent_coef_loss", "critic_loss", "actor_loss")
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks and empty buffers."""
         super().__init__(cfgs, spaces, device)
         self.log_ent_coef = torch.zeros(self.count, device=device, requires_grad=True)
         self.tensors["log_ent_coef"] = self.log_ent_coef
@@ -53,8 +50,6 @@ class SacAgents(OffPolicyAgents):
             "critics": adam(networks.parameters("critics"), lr),
             "actor": adam(networks.parameters("actor"), lr),
         }
-        drawn = self.method.batch_size, self.sizes.actions
-        self._now, self._next = (self._block(self.draws.normal, *drawn) for _ in range(2))
 
     @staticmethod
     def make_policy(method: SacConfig, spaces: Spaces) -> SACPolicy:
@@ -74,19 +69,17 @@ class SacAgents(OffPolicyAgents):
         return policy
 
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Draw actions."""
         mean, log_std = self._gaussian(observations)
         return torch.tanh(mean + log_std.exp() * noise)
 
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the most likely actions."""
         with torch.no_grad():
             return torch.tanh(self._gaussian(observations)[0])
 
     def update(self) -> None:
-        """Make one update."""
-        drawn = self._numbers.next(), self._now.next(), self._next.next()
-        self._note(self._captured(self.descent, *drawn))
+        shape, numbers = (self.method.batch_size, self.sizes.actions), self.numbers()
+        noise = [self.draws.block(use, self.draws.normal, *shape) for use in ("actions", "next actions")]
+        self._note(self._captured(self.descent, numbers, *noise))
 
     def descent(self, numbers: Tensor, noise: Tensor, next_noise: Tensor) -> Tensor:
         """Update entropy coefficient, critics, actor and targets from some transitions, see

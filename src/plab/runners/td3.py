@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from stable_baselines3.td3.policies import TD3Policy
     from torch import Tensor
 
-__all__ = ["Td3Agents", "Td3Config"]
-
 
 @dataclass
 class Td3Config(OffPolicyConfig):
@@ -52,12 +50,10 @@ class Td3Agents(OffPolicyAgents):
     method: Td3Config
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
-        """Begin with untrained networks and empty buffers."""
         super().__init__(cfgs, spaces, device)
         self.optimizers = {
             part: adam(self.networks.parameters(part), self.method.lr) for part in ("critics", "actor")
         }
-        self._smoothing = self._block(self.draws.normal, self.method.batch_size, self.sizes.actions)
 
     @staticmethod
     def make_policy(method: Td3Config, spaces: Spaces) -> TD3Policy:
@@ -69,23 +65,23 @@ class Td3Agents(OffPolicyAgents):
         )
 
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Add noise to the policy's actions."""
         return self._noisy(self._actor("actor", observations), noise)
 
     def explore_at_random(self, actions: Tensor) -> Tensor:
         """Add noise to random actions, too, as Stable-Baselines3 does."""
-        return self._noisy(actions, self._noise.next())
+        return self._noisy(actions, self.noise())
 
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the policy's actions."""
         with torch.no_grad():
             return self._actor("actor", observations)
 
     def update(self) -> None:
         """Make one update of the critics, and of the actor if it is its turn."""
         delayed = self.updates % self.method.policy_delay != 0
-        update = self.critics if delayed else self.both
-        self._note(self._captured(update, self._numbers.next(), self._smoothing.next()))
+        update, numbers = self.critics if delayed else self.both, self.numbers()
+        shape = self.method.batch_size, self.sizes.actions
+        noise = self.draws.block("smoothing", self.draws.normal, *shape)
+        self._note(self._captured(update, numbers, noise))
 
     def critics(self, numbers: Tensor, noise: Tensor) -> Tensor:
         """Update the critics from some transitions, see
