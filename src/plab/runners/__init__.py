@@ -12,10 +12,10 @@ from contextlib import suppress
 
 from plab.config import Config
 from plab.config.families import FAMILIES, Appearance, Family, Rule, family
-from plab.errors import ConfigError, traceback_wanted
+from plab.errors import ConfigError, PlabError, traceback_wanted
 from plab.results import ResultsError, RunBusyError, RunFile
 from plab.runners.runner import Runner, SimulatorCache, Step, Track, measures, shared_problem
-from plab.runners.tracks import USER_ERRORS, Outcome, RunError, TogetherError
+from plab.runners.tracks import Outcome, RunError, TogetherError
 
 __all__ = [
     "FAMILIES",
@@ -83,7 +83,7 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
     if traceback_wanted():
         # Once if it ended several runs.
         for error in {id(track.error): track.error for track in todo}.values():
-            if error is not None and not isinstance(error, (RunError, *USER_ERRORS)):
+            if error is not None and not isinstance(error, PlabError):
                 traceback.print_exception(error)
     for track in todo:
         if track.error is None:
@@ -100,10 +100,10 @@ def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> Non
         while parties:
             party = parties.pop(0)
             try:
-                own = family(party[0].cfg.method.family)
+                name = party[0].cfg.method.family
+                own = family(name)
                 kind = own.runner_type()
                 if not issubclass(kind, Runner):
-                    name = party[0].cfg.method.family
                     raise ConfigError(f"the runner of method.family '{name}' is no plab.runners.Runner")
                 groups = _groups(party, own)
                 if len(groups) == 1:

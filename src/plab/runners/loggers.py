@@ -15,16 +15,11 @@ from contextlib import suppress
 from plab.config import Config
 from plab.results import ResultsError, RunFile
 
-__all__ = ["RunLog"]
-
 PROJECT = "plab"
 """Name of the project at Weights & Biases, unless ``WANDB_PROJECT`` names another."""
 
 Write = Callable[[Mapping[str, float], int], object]
 """Logs finite numbers by name at some environment steps."""
-
-_LONGEST_ID = 128
-"""Letters of a run's id there, at most."""
 
 
 class RunLog:
@@ -97,7 +92,8 @@ def _wandb(cfg: Config, run: RunFile, steps: int) -> tuple[Write, Callable[[], o
         begun = wandb.init(
             project=os.environ.get("WANDB_PROJECT") or PROJECT,
             name=name,
-            id=re.sub(r"[^\w.-]", "_", name)[:_LONGEST_ID],
+            # An id has at most 128 letters.
+            id=re.sub(r"[^\w.-]", "_", name)[:128],
             dir=cfg.results_dir,
             config=run.result.config,
             resume="allow",

@@ -156,13 +156,7 @@ class Policy:
     """
 
     def __init__(self, network: BasePolicy, mean: np.ndarray | None, variance: np.ndarray | None) -> None:
-        """Take over a network.
-
-        Args:
-            network: The policy of a model.
-            mean: Means of the observations that scale them, shape [entry]; None if they were not scaled.
-            variance: Their variances, shape [entry].
-        """
+        """Take over a network; means and variances scale the observations, shape [entry], unless None."""
         self.network = network
         self._mean, self._variance = mean, variance
 

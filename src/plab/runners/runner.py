@@ -1,8 +1,7 @@
-"""Base of all runners: runs from where their files stand to the end, with named hooks.
+"""Base of all runners: files, rows, best actions, wall times, progress, failures and the final evaluation.
 
-A family of methods is a subclass of :class:`Runner` that says how it begins, what an iteration is and what
-the next one starts from. Taking up files, rows, the best actions so far, wall times, progress, runs that
-break off and the final evaluation in the hard contact model are here.
+A family of methods is a subclass of :class:`Runner`, whose hooks say how a run begins, what an iteration is
+and what the next one starts from.
 """
 
 from __future__ import annotations
@@ -18,30 +17,16 @@ import numpy as np
 
 from plab.config import Config, ConfigError
 from plab.config.families import family
-from plab.errors import out_of_memory
+from plab.errors import PlabError, out_of_memory
 from plab.progress import PLAIN_EVERY, Report, show_progress
 from plab.results import ResultsError, row_count
-from plab.runners.tracks import USER_ERRORS, RunError, Step, TogetherError, Track, batch_title
+from plab.runners.tracks import RunError, Step, TogetherError, Track, batch_title
 
 if TYPE_CHECKING:
     from plab.problem import Episodes, Problem
     from plab.scenes import Scene
 
 Kept = TypeVar("Kept")
-
-__all__ = [
-    "COLUMNS",
-    "LAST",
-    "Runner",
-    "SimulatorCache",
-    "Step",
-    "Track",
-    "episode_columns",
-    "measures",
-    "shared_problem",
-    "simulation_errors",
-    "simulator_key",
-]
 
 COLUMNS = ("loss", "reward", "iou", "score")
 """Columns of the results that every method has: what an episode is measured by, beside the terms of its
@@ -55,7 +40,7 @@ _MISFITS = (LookupError, ValueError, TypeError, ArithmeticError, AttributeError,
 
 
 class Runner:
-    """Takes the runs of a batch from where their files stand to the end, and finishes the files.
+    """Base of runners, which take the runs of a batch from where their files stand to the end.
 
     A family overrides :meth:`build`, and :meth:`step` or :meth:`iterate`; the other hooks where it has to.
     They are called in this order: :meth:`context`, :meth:`build`, :meth:`start` of each run, :meth:`iterate`
@@ -72,11 +57,11 @@ class Runner:
     report: Report
 
     def __init__(self, tracks: Sequence[Track], note: str, cache: SimulatorCache) -> None:
-        """Take over some runs; nothing is built yet.
+        """Take over some runs, alike as far as :func:`plab.sweep.plan` asks for; nothing is built yet.
 
         Args:
-            tracks: The runs, alike as far as :func:`plab.sweep.plan` asks for.
-            note: Shown before the progress.
+            tracks: The runs.
+            note: Text before the progress.
             cache: Simulators of earlier runs.
         """
         self.tracks = list(tracks)
@@ -86,17 +71,11 @@ class Runner:
         self._family = family(tracks[0].cfg.method.family)
         self._phase, self._since, self._timed = "", 0.0, self.tracks
 
-    def _unfinished(self) -> ConfigError:
-        name = self.tracks[0].cfg.method.family
-        return ConfigError(
-            f"the runner of method.family '{name}' is not finished: it needs build, and step or iterate"
-        )
-
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
         """Find out what is missing, then make what the runs share, :attr:`problem` at least."""
-        raise self._unfinished()
+        raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Make what a run has of its own, from a :attr:`Step.state` if there is one, else from nothing."""
@@ -128,7 +107,7 @@ class Runner:
             plab.sim.SimulationError: If a state, loss or gradient stops being finite.
             plab.runners.RunError: If it cannot go on for another reason.
         """
-        raise self._unfinished()
+        raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
         """Let go of what the iterations needed, even if they broke off."""
@@ -179,7 +158,7 @@ class Runner:
     # ----------------------------------------------------------------------------------------- what is shared
 
     def run(self) -> None:
-        """Carry out the runs. One that breaks off is noted in its job and does not disturb the others.
+        """Carry out the runs; one that breaks off does not disturb the others.
 
         Raises:
             TogetherError: If nothing can be built of several runs: perhaps fewer do.
@@ -187,9 +166,6 @@ class Runner:
             plab.results.ResultsError: If the file of a lone run cannot be written.
             plab.runners.RunError: If a lone run cannot be built, or no run can go on.
         """
-        kind = type(self)
-        if kind.build is Runner.build or (kind.step is Runner.step and kind.iterate is Runner.iterate):
-            raise self._unfinished()
         from plab.config.compose import require_runnable
         from plab.sim import DeviceError
 
@@ -198,7 +174,7 @@ class Runner:
                 logs.callback(track.log.close)
             try:
                 try:
-                    with self._waiting("build"), simulation_errors():
+                    with self._progress(" build"), simulation_errors():
                         self.enter("build")
                         for track in self.tracks:
                             require_runnable(track.cfg)
@@ -213,36 +189,38 @@ class Runner:
             finally:
                 self.enter("")
                 self.close()
-            with self._waiting("final evaluation"):
+            with self._progress(" final evaluation"):
                 self._conclude()
 
-    def _heading(self) -> str:
-        return self._note + batch_title([track.cfg for track in self.tracks])
-
-    def _waiting(self, what: str) -> AbstractContextManager[Report]:
+    def _progress(
+        self, what: str = "", done: int = 0, total: int | None = None, every: int = PLAIN_EVERY
+    ) -> AbstractContextManager[Report]:
         from plab.sim.compiler import watch_compiling
 
-        enabled = self.tracks[0].cfg.progress
-        return show_progress(f"{self._heading()} {what}", 0, None, enabled=enabled, compiling=watch_compiling)
+        return show_progress(
+            f"{self._note}{batch_title([track.cfg for track in self.tracks])}{what}",
+            done,
+            total,
+            enabled=self.tracks[0].cfg.progress,
+            plain_every=every,
+            compiling=watch_compiling,
+        )
 
     def _start(self, track: Track) -> None:
         """Have a run begin, or go on from its file; refuse it if the file's state is not one of this run."""
-        from plab.sim import DeviceError, SimulationError
-
         result, scene = track.run.result, self.problem.scenes[0]
         result.labels = self.problem.labels
         if self._family.batching:
             result.provenance["batch"] = len(self.tracks)
-        state = result.resume
         best, shape = track.best_actions, (scene.horizon, scene.action_dim)
-        if state is None:
+        if result.resume is None:
             self.start(track, None)
             return
         try:
             if best is not None and best.shape != shape:
                 raise ValueError(f"the best actions have shape {list(best.shape)}, not {list(shape)}")
-            self.start(track, state)
-        except (DeviceError, SimulationError, RunError, *USER_ERRORS):
+            self.start(track, result.resume)
+        except PlabError:
             raise
         except _MISFITS as error:
             reason, file = " ".join(str(error).split()), track.run.partial_path
@@ -252,19 +230,9 @@ class Runner:
 
     def _optimise(self) -> None:
         """Do the iterations that the files do not hold yet."""
-        from plab.sim.compiler import watch_compiling
-
-        done, total, every = self.extent()
         # The first rollout of a process compiles the kernels.
         phase = "compile"
-        with show_progress(
-            self._heading(),
-            done,
-            total,
-            enabled=self.tracks[0].cfg.progress,
-            plain_every=every,
-            compiling=watch_compiling,
-        ) as self.report:
+        with self._progress("", *self.extent()) as self.report:
             columns = (*episode_columns(self.problem.term_names), *self._family.columns)
             while active := [track for track in self.tracks if track.open and self.has_more(track)]:
                 self.enter(phase, active)
@@ -326,10 +294,8 @@ class Runner:
 
 
 class SimulatorCache:
-    """The last simulator, in whatever it is part of, and what it is for: a sweep over seeds compiles once.
-
-    Whoever carries out several runs makes one and passes it on to each.
-    """
+    """Last simulator of several runs, in whatever it is part of, and its key: a sweep over seeds compiles
+    once."""
 
     def __init__(self) -> None:
         self._kept: dict[Any, Any] = {}
@@ -342,8 +308,7 @@ class SimulatorCache:
             if key in self._kept:
                 check(self._kept[key])
                 return self._kept[key]
-        # Let go of the old one before there is a new one: only then does Taichi find its compiled kernels
-        # again.
+        # Before there is a new one: only then does Taichi find its compiled kernels again.
         self.clear()
         self._kept[key] = build()
         return self._kept[key]
@@ -390,7 +355,7 @@ def shared_problem(cache: SimulatorCache, cfgs: Sequence[Config]) -> Problem:
 
 
 def simulator_key(cfg: Config, scene: Scene) -> Hashable:
-    """Return what is the same for configurations whose simulators differ in their scenes alone."""
+    """Return a key that is the same for configurations whose simulators differ in their scenes alone."""
     from plab.sim.batch import scene_kind
 
     sim, method = cfg.sim, cfg.method

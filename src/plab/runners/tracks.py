@@ -12,17 +12,10 @@ import numpy as np
 
 from plab.config import Config
 from plab.config.families import SOLVED, family
-from plab.errors import TRACEBACK, ConfigError, PlabError, tell, traceback_wanted
+from plab.errors import TRACEBACK, PlabError, tell, traceback_wanted
 from plab.results import BUDGETS, ResultsError, RunFile
 from plab.results.schema import counts_last
 from plab.runners.loggers import RunLog
-from plab.scenes import SceneError
-from plab.targets import TargetError
-
-__all__ = ["USER_ERRORS", "Outcome", "RunError", "Step", "TogetherError", "Track", "batch_title", "report"]
-
-USER_ERRORS = (ConfigError, SceneError, TargetError, ResultsError)
-"""Errors for the user to put right: mistakes in the configuration, files that cannot be read or written."""
 
 
 class RunError(PlabError, RuntimeError):
@@ -32,8 +25,18 @@ class RunError(PlabError, RuntimeError):
 
 
 class TogetherError(RuntimeError):
-    """Runs that cannot be simulated together: for the reason that is the cause of this error, or as one of
-    them has failed and the others have to begin again without it."""
+    """Runs that cannot be simulated together: for the error's cause, or as one has failed and the others have
+    to begin again without it."""
+
+
+def is_refusal(error: Exception) -> bool:
+    """Return whether an error is for the user to put right: a mistake, or a file that cannot be used."""
+    return isinstance(error, PlabError) and error.exit_code == PlabError.exit_code
+
+
+def describe(error: Exception) -> str:
+    """Return an error's message, of a bug with its type."""
+    return str(error) if isinstance(error, PlabError) else f"{type(error).__name__}: {error}"
 
 
 @dataclass(frozen=True)
@@ -118,12 +121,13 @@ class Track:
         """One-line summary of a finished run: its score, and the score of its rows if that differs."""
         result = self.run.result
         text = f"score {result.score:.4f}"
-        if counts_last(result.config) and "train_score" in result.columns:
+        if counts_last(result.config):
             shown = float(result.columns["score"][-1])
-            if shown != result.score:
+            if "train_score" in result.columns and shown != result.score:
                 return f"{text} in its last training episodes ({shown:.4f} without exploration)"
+            return text
         # Runners that do everything themselves may have rows without a score.
-        if counts_last(result.config) or self.contact == "hard" or "score" not in result.columns:
+        if self.contact == "hard" or "score" not in result.columns:
             return text
         shown = float(result.columns["score"][result.best_iteration])
         if f"{shown:.4f}" == f"{result.score:.4f}":
@@ -136,11 +140,10 @@ class Track:
         if error is None:
             status = "before" if self.finished_before else "finished"
             return Outcome.of(self.cfg, status, self.run.result.score)
-        refused, foreseen = isinstance(error, USER_ERRORS), isinstance(error, (RunError, *USER_ERRORS))
-        what = str(error) if foreseen else f"{type(error).__name__}: {error}"
-        if not (foreseen or traceback_wanted()):
+        what = describe(error)
+        if not (isinstance(error, PlabError) or traceback_wanted()):
             what += f"; a bug: {TRACEBACK}=1 shows where"
-        return Outcome.of(self.cfg, "refused" if refused else "failed", message=what)
+        return Outcome.of(self.cfg, "refused" if is_refusal(error) else "failed", message=what)
 
     def fail(self, why: str | Exception) -> None:
         """Break the run off, also in its file, which keeps what it computed; the others of the batch go on.
@@ -151,18 +154,14 @@ class Track:
             why: An error, or what went wrong in the current iteration.
         """
         self.error = error = RunError(f"iteration {self.iteration}: {why}") if isinstance(why, str) else why
-        if isinstance(error, ResultsError) or (isinstance(error, USER_ERRORS) and not self.run.advanced):
+        if isinstance(error, ResultsError) or (is_refusal(error) and not self.run.advanced):
             # Of a ResultsError the file itself is what failed: nothing more can be written to it.
             self.run.withdraw()
-            return
-        if isinstance(error, USER_ERRORS) and not self.run.result.rows:
-            # Nothing has been computed that a file could keep.
-            return
-        foreseen = isinstance(error, (RunError, *USER_ERRORS))
-        try:
-            self.run.close("failed", str(error) if foreseen else f"{type(error).__name__}: {error}")
-        except ResultsError as another:
-            self.error = another
+        elif self.run.result.rows or not is_refusal(error):
+            try:
+                self.run.close("failed", describe(error))
+            except ResultsError as another:
+                self.error = another
 
     def record(self, step: Step, columns: Sequence[str]) -> dict[str, float]:
         """Write an iteration to the file; return its row.
@@ -189,39 +188,29 @@ class Track:
         # Of several with the highest score the one of lowest loss.
         if self._by_score and row["score"] != self._best_score:
             better = row["score"] > self._best_score
-        better = better and step.whole
-        best: dict[str, Any] = {
-            "best_actions": step.actions,
-            "best_iteration": self.iteration,
-            "best_loss": row["loss"],
-        }
-        self.run.record(row, step.state, keep=step.keep, **(best if better else {}))
+        best: dict[str, Any] = {}
+        if better and step.whole:
+            self.best_loss, self.best_actions, self._best_score = row["loss"], step.actions, row["score"]
+            best = {"best_actions": step.actions, "best_iteration": self.iteration, "best_loss": row["loss"]}
+        self.run.record(row, step.state, keep=step.keep, **best)
         self.log.write({name: row[name] for name in row if name not in ("iteration", "steps")}, steps)
         self.iteration += 1
-        if better:
-            self.best_loss, self.best_actions = row["loss"], step.actions
-            self._best_score = row["score"]
         return row
 
 
 def title(cfg: Config) -> str:
-    """Return what tells a run from others, in a few words."""
+    """Return task, variant, method and seed."""
     return f"{cfg.task.name}-v{cfg.variant} {cfg.method.name} seed {cfg.seed}"
 
 
 def batch_title(cfgs: Sequence[Config]) -> str:
-    """Return what the runs of a batch have in common, and how many they are; of one run its title."""
+    """Return the task and number of runs of a batch; of one run its title."""
     if len(cfgs) == 1:
         return title(cfgs[0])
     return f"{cfgs[0].task.name}, {len(cfgs)} runs"
 
 
-_UNFINISHED = {
-    "failed": "failed",
-    "refused": "refused",
-    "elsewhere": "under way in another process",
-    "lost": "not under way",
-}
+_UNFINISHED = {"elsewhere": "under way in another process", "lost": "not under way"}
 
 
 @dataclass(frozen=True)
@@ -255,14 +244,15 @@ class Outcome:
 
 
 def report(outcomes: Sequence[Outcome]) -> int:
-    """Say how a sweep ended: in a line, and in one more on standard error per run without a result.
+    """Print how a sweep ended in a line, and a line on standard error per run without a result.
 
     Returns:
         Exit code: 0 if every result is there, 2 if something is the user's to put right, else 1.
     """
     count = Counter(one.status for one in outcomes)
     parts = [f"{count['finished']} finished", f"{count['before']} finished before"]
-    parts += [f"{count[status]} {text}" for status, text in _UNFINISHED.items() if count[status]]
+    unfinished = ("failed", "refused", *_UNFINISHED)
+    parts += [f"{count[status]} {_UNFINISHED.get(status, status)}" for status in unfinished if count[status]]
     print(f"{len(outcomes)} runs: {', '.join(parts)}", flush=True)
     for one in outcomes:
         if not one.finished:
