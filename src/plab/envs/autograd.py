@@ -117,8 +117,8 @@ def simulate(
             gradient.
         actions: Actions, shape [batch, T, A], on any device; integers become floating-point numbers of the
             simulator's precision.
-        every_step: Whether to return the state after every environment step, or the last one alone.
-        mass: Whether to return mass tensors.
+        every_step: Return the state after every environment step, not the last one alone.
+        mass: Return mass tensors, too.
         material: Young's modulus, Poisson ratio and yield stress, shape [batch, 3], or [batch, body, 3] where
             bodies have materials of their own; as they are if None.
         **initial: Parts of the initial state, by the fields of :class:`plab.sim.State`. The simulator keeps

@@ -17,10 +17,10 @@ class Term:
 
     Attributes:
         name: Name of its weight; ``loss_<name>`` is its column in results and its entry in ``info``.
-        label: What it measures, for reports.
+        label: Description of the measure, for reports.
         unit: Unit of the measure, for reports.
         weight: Weight in the loss; with 0 the term is not compiled.
-        weighted: Whether it is part of the loss; if not, it is measured only, and has no gradient.
+        weighted: Part of the loss; if not, the term is measured only, and has no gradient.
         sim: The simulator's kernels, after :meth:`attach`: numbers such as ``batch``, ``particles``, ``n``,
             ``dx``, ``mass`` (of a particle) and ``real``, Taichi's type of the simulation's numbers.
     """
@@ -89,7 +89,7 @@ class DistanceTerm(Term):
     float64, the tally; tallies of parts of the particles are joined.
 
     Attributes:
-        nearest_only: Whether the derivative by a distance is 0 for all particles but one, whose number is the
+        nearest_only: The derivative by a distance is 0 for all particles but one, whose number is the
             tally's second entry.
     """
 

@@ -39,7 +39,7 @@ def run_config(cfg: Config, cache: SimulatorCache | None = None) -> float:
 
     Args:
         cfg: The composed and checked configuration.
-        cache: Simulators of earlier runs, for whoever runs several; None: a new one.
+        cache: Simulators of earlier runs; None: a new one.
 
     Returns:
         The run's score in [0, 1], as its protocol counts it.
@@ -65,11 +65,11 @@ def run_batch(cfgs: Sequence[Config], note: str = "", cache: SimulatorCache | No
 
     Args:
         cfgs: The composed and checked configurations.
-        note: How far the sweep has come, shown before the progress.
-        cache: Simulators of earlier batches, for whoever runs several; None: a new one.
+        note: Progress of the sweep, shown before that of the batch.
+        cache: Simulators of earlier batches; None: a new one.
 
     Returns:
-        How each run ended, in the order of ``cfgs``.
+        End of each run, in the order of ``cfgs``.
     """
     ended: list[Outcome | Track] = []
     for cfg in cfgs:
@@ -121,7 +121,6 @@ def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> Non
                     if track.open:
                         track.fail(error)
     except (KeyboardInterrupt, BrokenPipeError):
-        # Nobody waits for it any more.
         for track in party:
             if track.open:
                 # The others are to be closed even if this one's file cannot be written.
@@ -134,7 +133,8 @@ def _carry_out(tracks: Sequence[Track], note: str, cache: SimulatorCache) -> Non
 
 
 def _groups(tracks: Sequence[Track], own: Family) -> list[Sequence[Track]]:
-    """Return the runs that can be carried out together, by group: alone, or those at the same iteration."""
+    """Return groups of runs that can be carried out together: each alone, all, or those at the same
+    iteration."""
     if not own.batching:
         return [[track] for track in tracks]
     if not own.in_step:

@@ -18,10 +18,8 @@ from plab.runners.policy import (
     PolicyConfig,
     Spaces,
     first_policy,
-    module_arrays,
-    optimizer_arrays,
-    restore_module,
-    restore_optimizer,
+    packed,
+    unpacked,
 )
 from plab.runners.training import Learned, PolicyRunner, Training
 
@@ -117,11 +115,9 @@ class ActorTraining(Training):
 
     @property
     def steps(self) -> int:
-        """Transitions so far."""
         return self._steps
 
     def cycle(self) -> None:
-        """Run a round of episodes of all environments, and learn from them."""
         self.learn(1.0 - self.steps / self.total_steps)
         self._steps += self.round_episodes[0] * self.batch.size * self._horizon
         self.report()
@@ -132,16 +128,13 @@ class ActorTraining(Training):
         training."""
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
-        """Return the deterministic policy's action for an observation, shape [1, entry]."""
         policy = Policy(self.network, *self.moments(0))
         return torch.as_tensor(policy(observations.cpu().numpy()))
 
     def policy(self, run: int) -> BasePolicy:
-        """Return the policy."""
         return self.network
 
     def moments(self, run: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return means and variances by which observations are scaled, shape [entry] each."""
         return self.statistics.mean, np.maximum(self.statistics.var, DEVIATION_MIN**2)
 
     def hold_moments(self) -> None:
@@ -159,7 +152,6 @@ class ActorTraining(Training):
             self._measured.setdefault(name, []).extend(torch.as_tensor(entries).tolist())
 
     def take(self) -> list[Learned]:
-        """Return the training since the last call."""
         known, self._measured = self._measured, {}
         broken, self.broken = self.broken, []
         ended, self._evaluated = self.episodes - self._evaluated, self.episodes
@@ -167,36 +159,34 @@ class ActorTraining(Training):
         return [Learned(means, ended, broken)]
 
     def states(self) -> list[dict[str, Any]]:
-        """Return everything that the next episodes depend on, as arrays and numbers."""
-        moments = {"mean": self.statistics.mean, "var": self.statistics.var, "count": self.statistics.count}
-        return [
-            {
-                "steps": self.steps,
-                "generator": self._generator.get_state().cpu().numpy(),
-                "statistics": {name: np.array(values) for name, values in moments.items()},
-                **{name: module_arrays(module) for name, module in self._modules().items()},
-                **{name: optimizer_arrays(one) for name, one in self._optimizers().items()},
-            }
-        ]
+        return [{"torch": packed(self.state())}]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Return to a state; RuntimeError if it is that of other networks."""
-        for name, module in self._modules().items():
-            restore_module(module, state[name])
-        for name, one in self._optimizers().items():
-            restore_optimizer(one, state[name])
-        known = state["statistics"]
-        self.statistics.mean, self.statistics.var = known["mean"].copy(), known["var"].copy()
-        self.statistics.count = float(known["count"])
-        self._generator.set_state(torch.from_numpy(np.array(state["generator"], np.uint8)))
-        self._steps = int(state["steps"])
-        self._evaluated = self.episodes
+        self.load(unpacked(state["torch"]))
 
-    def _modules(self) -> dict[str, torch.nn.Module]:
-        return {"policy": self.network}
+    def learners(self) -> dict[str, Any]:
+        """Return networks and optimisers by name."""
+        return {"policy": self.network, "optimizer": self._optimizer}
 
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return {"policy_optimizer": self._optimizer}
+    def state(self) -> dict[str, Any]:
+        """Return everything that the next episodes depend on, as tensors and numbers."""
+        moments = self.statistics.mean, self.statistics.var, self.statistics.count
+        return {
+            "steps": self.steps,
+            "generator": self._generator.get_state(),
+            "statistics": [torch.as_tensor(values, dtype=torch.float64) for values in moments],
+            **{name: one.state_dict() for name, one in self.learners().items()},
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Return to a :meth:`state`; RuntimeError if it is that of other networks."""
+        for name, one in self.learners().items():
+            one.load_state_dict(state[name])
+        mean, var, count = state["statistics"]
+        self.statistics.mean, self.statistics.var = mean.numpy(), var.numpy()
+        self.statistics.count = float(count)
+        self._generator.set_state(state["generator"])
+        self._steps, self._evaluated = state["steps"], state["steps"] // self._horizon
 
 
 class ActorRunner(PolicyRunner):

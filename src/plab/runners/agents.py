@@ -35,7 +35,7 @@ class RlConfig(PolicyConfig):
     """Keys of all reinforcement-learning methods.
 
     Attributes:
-        profile: Which of the profiles gives the values that are not overridden; None: there are none.
+        profile: Profile that gives the values that are not overridden; None: there are no profiles.
         num_envs: Environments simulated together.
         gamma: Discount factor.
         profiles: Values by profile. Empty in a run's configuration: what was used is in the fields.
@@ -55,7 +55,7 @@ class OffPolicyConfig(RlConfig):
         buffer_size: Transitions kept for replay.
         batch_size: Transitions per update.
         learning_starts: Steps of uniformly random actions before the first update.
-        tau: How far the target networks follow at each update.
+        tau: Update rate of the target networks.
         gradient_steps: Updates per step of all environments; -1 makes one per transition.
     """
 
@@ -129,8 +129,8 @@ class Agents:
         updates: Updates of each so far.
         networks: Their parameters.
         optimizers: Adam of parts of them, by name.
-        tensors: What else a checkpoint has to hold, by name, each of shape [agent, ...].
-        watched: Whether losses are kept for :meth:`take_losses`.
+        tensors: Further tensors of a checkpoint, by name, each of shape [agent, ...].
+        watched: Losses are kept for :meth:`take_losses`.
     """
 
     PARTS: ClassVar[Mapping[str, Sequence[str]]]

@@ -19,11 +19,9 @@ from plab.config.families import GRADIENT, Appearance, Family
 from plab.runners.libraries import torch
 from plab.runners.policy import (
     Spaces,
-    module_arrays,
-    optimizer_arrays,
-    restore_module,
-    restore_optimizer,
+    packed,
     torch_settings,
+    unpacked,
 )
 from plab.runners.runner import Runner, Step, Track
 from plab.runners.training import shared_batches
@@ -75,8 +73,9 @@ class ApgRunner(Runner):
         self._policy = torch.nn.Sequential(*layers).to(track.cfg.sim.device)
         self._optimizer = torch.optim.Adam(self._policy.parameters(), lr=self.method.lr)
         if state is not None:
-            restore_module(self._policy, state["policy"])
-            restore_optimizer(self._optimizer, state["optimizer"])
+            known = unpacked(state["torch"])
+            self._policy.load_state_dict(known["policy"])
+            self._optimizer.load_state_dict(known["optimizer"])
 
     def step(self, track: Track) -> Step:
         """Run an episode of the policy, and improve the policy by the gradient of its loss."""
@@ -101,8 +100,8 @@ class ApgRunner(Runner):
             "score": float(problem.scores_of(last.iou)[0][0]),
             "gradient_norm": float(norm),
         }
-        state = {"policy": module_arrays(self._policy), "optimizer": optimizer_arrays(self._optimizer)}
-        return Step(measured, actions, state, steps_forward=0, steps_gradient=len(actions))
+        state = {"policy": self._policy.state_dict(), "optimizer": self._optimizer.state_dict()}
+        return Step(measured, actions, {"torch": packed(state)}, steps_forward=0, steps_gradient=len(actions))
 
 
 FAMILY = Family(

@@ -23,7 +23,7 @@ Write = Callable[[Mapping[str, float], int], object]
 
 
 class RunLog:
-    """Log of a run, opened when the first numbers come, or none."""
+    """Log of a run, opened at the first numbers, or none."""
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
         """Keep the run's configuration and file."""
@@ -32,7 +32,7 @@ class RunLog:
 
     @property
     def wanted(self) -> bool:
-        """Whether the run has a logger."""
+        """Return whether the run has a logger."""
         return self._cfg.logger != "none"
 
     def write(self, values: Mapping[str, float], steps: int) -> None:

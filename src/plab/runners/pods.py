@@ -20,8 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from plab.config import Config, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule
 from plab.runners.actors import ActorConfig, ActorRunner, set_rate, training_scenes
@@ -39,11 +37,10 @@ class PodsConfig(ActorConfig):
     Attributes:
         updates: Updates of the actions by their gradient in a round.
         action_lr: Learning rate of these, in units of an action.
-        epochs: How often, after a round, the policy sees as many actions as the round has.
+        epochs: Passes of the policy, after a round, over as many actions as the round has.
         batch_size: Actions per update of the policy.
         observation_noise: Standard deviation of noise on the observations of these, in units of theirs.
-        shift: Where all that is observed of them stands is moved along x and along z by so much at most
-            [domain units].
+        shift: Largest shift of all positions in these observations along x and along z [domain units].
     """
 
     updates: int = field(metadata=ranges.COUNT)
@@ -133,21 +130,12 @@ class PodsTraining(Imitation):
         self._failed |= set(failures)
         self.broken += failures.values()
 
-    def states(self) -> list[dict[str, Any]]:
-        """Return everything that the next episodes depend on, as arrays and numbers."""
-        (state,) = super().states()
-        rounds = {
-            str(k): {"seen": seen.cpu().numpy(), "wanted": wanted.cpu().numpy()}
-            for k, (seen, wanted) in enumerate(self._rounds)
-        }
-        return [state | {"rounds": rounds}]
+    def state(self) -> dict[str, Any]:
+        return super().state() | {"rounds": self._rounds}
 
-    def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Return to a state; RuntimeError if it is that of other networks."""
-        super().restore(run, state)
-        kept = [state["rounds"][str(k)] for k in range(len(state["rounds"]))]
-        parts = [[torch.from_numpy(np.array(one[name])) for name in ("seen", "wanted")] for one in kept]
-        self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in parts]
+    def load(self, state: Mapping[str, Any]) -> None:
+        super().load(state)
+        self._rounds = [(seen.to(self._device), wanted.to(self._device)) for seen, wanted in state["rounds"]]
 
 
 class PodsRunner(ActorRunner):

@@ -1,4 +1,4 @@
-"""Trained policies: their keys, their states as arrays, and the file that keeps one.
+"""Trained policies: their keys, settings of torch, and the file that keeps a policy.
 
 The file beside a result, ``<name>.policy.npz``, is arrays alone: the networks' parameters by their names, the
 bounds of observations and actions, and a header in JSON with the section ``method`` of the run, from which
@@ -33,7 +33,6 @@ from plab.scenes import DEVICES
 if TYPE_CHECKING:
     from gymnasium.spaces import Box
     from stable_baselines3.common.policies import BasePolicy
-    from torch.optim import Optimizer
 
     from plab.envs.core import EpisodeBatch
 
@@ -57,7 +56,7 @@ class PolicyConfig(MethodConfig):
         algorithm: Learning algorithm, one of the family's.
         episodes: Episodes of training.
         evaluate_every: Episodes between two evaluations of the deterministic policy.
-        torch_device: Where the networks are, ``cpu`` or ``cuda``.
+        torch_device: Device of the networks, ``cpu`` or ``cuda``.
         torch_threads: CPU threads of torch.
         lr: Learning rate.
         hidden: Widths of the hidden layers.
@@ -113,28 +112,16 @@ def torch_settings(threads: int, *, tf32: bool = False) -> Iterator[None]:
         torch.distributions.Distribution.set_default_validate_args(checks)
 
 
-def module_arrays(module: torch.nn.Module) -> dict[str, np.ndarray]:
-    """Return copies of a module's parameters and buffers by their names."""
-    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in module.state_dict().items()}
+def packed(state: Mapping[str, Any]) -> np.ndarray:
+    """Return tensors and numbers in nested dictionaries and lists as torch saves them, as bytes."""
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return np.frombuffer(buffer.getvalue(), np.uint8)
 
 
-def restore_module(module: torch.nn.Module, arrays: Mapping[str, np.ndarray]) -> None:
-    """Give a module the parameters of :func:`module_arrays`; RuntimeError if they are another module's."""
-    module.load_state_dict({name: torch.tensor(np.asarray(array)) for name, array in arrays.items()})
-
-
-def optimizer_arrays(optimizer: Optimizer) -> dict[str, dict[str, np.ndarray]]:
-    """Return copies of what an optimiser keeps of its parameters, by their numbers; rates are left out."""
-    states = optimizer.state_dict()["state"]
-    return {str(k): {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in states.items()}
-
-
-def restore_optimizer(optimizer: Optimizer, arrays: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Give an optimiser what :func:`optimizer_arrays` has of the same parameters."""
-    states = {
-        int(k): {name: torch.tensor(np.asarray(v)) for name, v in own.items()} for k, own in arrays.items()
-    }
-    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+def unpacked(array: np.ndarray) -> dict[str, Any]:
+    """Return what :func:`packed` was given, on the CPU; nothing is executed."""
+    return torch.load(io.BytesIO(array.tobytes()), "cpu", weights_only=True)
 
 
 def first_policy(method: PolicyConfig, spaces: Spaces, seed: int = 0) -> BasePolicy:
@@ -196,10 +183,10 @@ def save_policy(
         arrays |= {f"{name}_low": space.low, f"{name}_high": space.high}
     if moments is not None:
         arrays |= {"mean": np.asarray(moments[0]), "variance": np.asarray(moments[1])}
-    arrays |= {f"{_PARAMETER}{name}": values for name, values in module_arrays(policy).items()}
-    packed = io.BytesIO()
-    np.savez(packed, **arrays)
-    replace_file(policy_path(result), packed.getvalue(), sync=True)
+    arrays |= {f"{_PARAMETER}{name}": values.cpu().numpy() for name, values in policy.state_dict().items()}
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    replace_file(policy_path(result), buffer.getvalue(), sync=True)
 
 
 def load_policy(result: str | Path, device: str = "cpu") -> Policy:
@@ -207,7 +194,7 @@ def load_policy(result: str | Path, device: str = "cpu") -> Policy:
 
     Args:
         result: The run's result file, as in the column ``path`` of a table of results.
-        device: Where the network is to be, ``cpu`` or ``cuda``.
+        device: Device of the network, ``cpu`` or ``cuda``.
 
     Raises:
         ResultsError: If there is no policy beside the result, its file is broken, or it is of a family
@@ -241,16 +228,16 @@ def _policy(path: Path) -> Policy:
 
     spaces = Spaces(*(Box(arrays[f"{n}_low"], arrays[f"{n}_high"]) for n in ("observation", "action")))
     own = [name for name in arrays if name.startswith(_PARAMETER)]
-    parameters = {name.removeprefix(_PARAMETER): arrays[name] for name in own}
+    parameters = {name.removeprefix(_PARAMETER): torch.tensor(arrays[name]) for name in own}
     # Before networks of that size are made.
     observed, actions = spaces.sizes
     widths = [observed, *getattr(method, "hidden", ()), actions]
     needed = sum(math.prod(pair) for pair in itertools.pairwise(widths))
-    there = sum(values.size for values in parameters.values())
+    there = sum(values.numel() for values in parameters.values())
     if needed > there:
         raise ValueError(f"it has {there} parameters, its networks at least {needed}")
     network = first_policy(method, spaces)
-    restore_module(network, parameters)
+    network.load_state_dict(parameters)
     return Policy(network, arrays.get("mean"), arrays.get("variance"))
 
 

@@ -90,7 +90,6 @@ class Population(Training):
 
     @property
     def steps(self) -> int:
-        """Transitions of each agent so far."""
         return self.stacks[0].steps
 
     def place(self, run: int) -> tuple[Agents, int]:
@@ -99,7 +98,6 @@ class Population(Training):
         return self.stacks[stack], number
 
     def cycle(self) -> None:
-        """Train for a batch of episodes, or an update."""
         if self._observations is None:
             self._observations = self._start()
         for _ in range(self._cycle_steps // self._envs):
@@ -108,12 +106,10 @@ class Population(Training):
                 self.report()
 
     def decide(self, observations: Tensor) -> Tensor:
-        """Return the deterministic policies' actions, shape [run, A], for an observation of each."""
         parts = zip(self.stacks, self._split(self._own(observations, 1)), strict=True)
         return torch.cat([stack.decide(part) for stack, part in parts]).squeeze(1)
 
     def take(self) -> list[Learned]:
-        """Return each agent's training since the last call."""
         broken, ended = self._broken, self._ended
         self._broken, self._ended = {}, []
         losses = [own for stack in self.stacks for own in stack.take_losses()]
@@ -127,37 +123,31 @@ class Population(Training):
         return learned
 
     def states(self) -> list[dict[str, Any]]:
-        """Return each agent's state: all that further training depends on, except a replay buffer."""
         states = [state for stack in self.stacks for state in stack.states()]
         shape = (0, len(states), self._envs, self.stacks[0].sizes.actions)
         acted = torch.stack(self._actions).cpu().numpy() if self._actions else np.zeros(shape, np.float32)
         return [state | {"episode_actions": acted[:, k]} for k, state in enumerate(states)]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Return an agent to one of :meth:`states`."""
         stack, number = self.place(run)
         stack.restore(number, state)
         self._restored[run] = state["episode_actions"]
 
     def write(self, run: int, path: Path) -> None:
-        """Write an agent's replay buffer, if it has one."""
         stack, number = self.place(run)
         if isinstance(stack, OffPolicyAgents):
             stack.replay.write(number, path)
 
     def read(self, run: int, path: Path) -> None:
-        """Read an agent's replay buffer, if it has one."""
         stack, number = self.place(run)
         if isinstance(stack, OffPolicyAgents):
             stack.replay.read(number, path, stack.steps // self._envs)
 
     def policy(self, run: int) -> BasePolicy:
-        """Return an agent's policy as Stable-Baselines3 has it."""
         stack, number = self.place(run)
         return stack.policy(number)
 
     def moments(self, run: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return means and variances that scale an agent's observations, if any do."""
         stack, number = self.place(run)
         return stack.moments(number)
 

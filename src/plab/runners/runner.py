@@ -48,9 +48,9 @@ class Runner:
 
     Attributes:
         tracks: The runs; there is one where runs cannot share a simulator.
-        problem: What the best actions are judged in, an environment per run; :meth:`build` sets it.
+        problem: Problem in which the best actions are judged, an environment per run; :meth:`build` sets it.
         cache: Simulators of earlier runs.
-        report: Takes how far the batch has come and a short text; see :mod:`plab.progress`.
+        report: Function of the batch's progress and a short text; see :mod:`plab.progress`.
     """
 
     problem: Problem
@@ -74,11 +74,11 @@ class Runner:
     # ------------------------------------------------------------------------------------------------ hooks
 
     def build(self) -> None:
-        """Find out what is missing, then make what the runs share, :attr:`problem` at least."""
+        """Refuse what cannot run, then make the runs' shared objects, :attr:`problem` at least."""
         raise NotImplementedError(f"{type(self).__name__} needs build")
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make what a run has of its own, from a :attr:`Step.state` if there is one, else from nothing."""
+        """Make a run's own objects, from a :attr:`Step.state` if there is one, else from nothing."""
 
     def has_more(self, track: Track) -> bool:
         """Return whether a run has iterations left; by default up to ``method.iterations``."""
@@ -110,10 +110,10 @@ class Runner:
         raise NotImplementedError(f"{type(self).__name__} needs step or iterate")
 
     def close(self) -> None:
-        """Let go of what the iterations needed, even if they broke off."""
+        """Release the iterations' objects, even if they broke off."""
 
     def conclude(self, track: Track) -> None:
-        """Keep what the run has beside its result, before the final evaluation."""
+        """Write a run's files beside its result, before the final evaluation."""
 
     def judge(self, actions: np.ndarray) -> Episodes:
         """Run actions, shape [batch, T, A], in the hard contact model."""
@@ -121,17 +121,16 @@ class Runner:
         return self.problem.rollout(actions, gradient=False, strict=False)
 
     def context(self) -> AbstractContextManager[Any]:
-        """Return what surrounds everything, such as the threads of a library."""
+        """Return a context for the whole batch, such as the threads of a library."""
         return nullcontext()
 
     def extent(self) -> tuple[int, int, int]:
-        """Return, for the progress, what is done, what there is to do, and how often to say so without a
-        terminal."""
+        """Return the progress: count done, total, and interval of reports without a terminal."""
         total = max(self.iterations(track) for track in self.tracks)
         return min(track.iteration for track in self.tracks), total, PLAIN_EVERY
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report how it goes after an iteration, of several runs on average."""
+        """Report loss and score after an iteration, of several runs on average."""
         loss, score = (np.mean([row[name] for row in rows]) for name in ("loss", "score"))
         best = np.mean([track.best_loss for track in tracks])
         contact = " and ".join(dict.fromkeys(track.contact for track in tracks))

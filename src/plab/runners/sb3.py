@@ -114,11 +114,9 @@ class Sb3Training(Training):
 
     @property
     def steps(self) -> int:
-        """Transitions of training so far."""
         return self.model.num_timesteps
 
     def cycle(self) -> None:
-        """Train for a batch of episodes, or an update."""
         # What the library would log stays with its logger.
         self.model.learn(
             self._cycle_steps, callback=self._watch, log_interval=None, reset_num_timesteps=False
@@ -134,11 +132,9 @@ class Sb3Training(Training):
             self.episode_actions.append(np.array(actions))
 
     def decide(self, observations: torch.Tensor) -> torch.Tensor:
-        """Return the deterministic policy's action for an observation, shape [1, entry]."""
         return torch.as_tensor(Policy(self.model.policy, None, None)(observations.cpu().numpy()))
 
     def take(self) -> list[Learned]:
-        """Return the training since the last call."""
         ended, self._ended = self._ended, []
         values = [float(info["episode"]["r"]) for info in ended], [info["score"] for info in ended]
         means = {n: float(np.mean(v)) if v else math.nan for n, v in zip(self.columns, values, strict=True)}
@@ -147,7 +143,6 @@ class Sb3Training(Training):
         return [Learned(means, len(ended), [i["broken"] for i in ended if "broken" in i], losses)]
 
     def states(self) -> list[dict[str, Any]]:
-        """Return everything that further training depends on, except a replay buffer."""
         model, written = self.model, io.BytesIO()
         model.save(written)
         random = {
@@ -166,7 +161,7 @@ class Sb3Training(Training):
         ]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        """Return to a state: the model, its random numbers, and the episodes that were under way."""
+        # The model, its random numbers, and the episodes that were under way.
         self._env.reset()
         for actions in state["episode_actions"]:
             self._env.step(actions)
@@ -182,17 +177,14 @@ class Sb3Training(Training):
         self.model.action_space.np_random.bit_generator.state = random["actions"]
 
     def write(self, run: int, path: Path) -> None:
-        """Write the replay buffer, if there is one."""
         if self._replay is not None:
             self._replay.kept.write(0, path)
 
     def read(self, run: int, path: Path) -> None:
-        """Read the replay buffer, if there is one."""
         if self._replay is not None:
             self._replay.kept.read(0, path, self.steps // self._sizes.envs)
 
     def policy(self, run: int) -> BasePolicy:
-        """Return the policy."""
         return self.model.policy
 
     @property
@@ -207,7 +199,7 @@ class Sb3Runner(PolicyRunner):
 
 
 class _Replay(LibraryBuffer):
-    """The library's replay buffer, of episodes that are all equally long and end by truncation only.
+    """Replay buffer of the library's interface, of episodes that are all equally long and end by truncation.
 
     Attributes:
         kept: Its transitions.
@@ -220,38 +212,28 @@ class _Replay(LibraryBuffer):
         action_space: Box,
         device: torch.device | str = "cpu",
         n_envs: int = 1,
-        optimize_memory_usage: bool = False,
         *,
         sizes: Sizes,
         capacity: int,
+        **options: Any,
     ) -> None:
         # The base class allocates arrays of its own, here of one row each.
-        super().__init__(n_envs, observation_space, action_space, device, n_envs, optimize_memory_usage)
+        super().__init__(n_envs, observation_space, action_space, device, n_envs, **options)
         window = max(buffer_size // n_envs, 1)
         # The library's save makes a list of the tuple.
         self.kept = ReplayBuffer(1, Sizes(*sizes), capacity, window, torch.device(self.device))
 
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Append one step of all environments; ``done`` and ``infos`` say nothing new."""
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
         parts = (obs, action, reward, next_obs)
         self.kept.add(*(torch.as_tensor(part, dtype=torch.float32)[None] for part in parts))
 
     def size(self) -> int:
-        """Return how many steps of all environments can be sampled."""
         return self.kept.count
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        """Draw transitions uniformly. Truncation is no end: the value of the next observation counts."""
         numbers = torch.as_tensor(np.random.randint(LARGEST, size=(1, batch_size)))  # noqa: NPY002
         observations, actions, after, rewards = self.kept.sample(numbers.to(self.device))
+        # Truncation is no end: the value of the next observation counts.
         ends = torch.zeros((batch_size, 1), device=self.device)
         return ReplayBufferSamples(observations[0], actions[0], after[0], ends, rewards[0][:, None])
 

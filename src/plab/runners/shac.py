@@ -45,7 +45,7 @@ class ShacConfig(ActorConfig):
         value_lr: Learning rate of the value function.
         lr_decay: Let the learning rates fall linearly to 0 over the run.
         td_lambda: Lambda of the value function's targets.
-        tau: How far the value function in use follows at each window.
+        tau: Update rate of the target value function at each window.
         value_epochs: Passes of the value function over a window.
         minibatches: Minibatches of each pass.
         noise: Standard deviation of the actions at first, before the hyperbolic tangent.
@@ -147,11 +147,9 @@ class ShacTraining(ActorTraining):
             for follower, leader in zip(self._target.parameters(), self._value.parameters(), strict=True):
                 follower.lerp_(leader, method.tau)
 
-    def _modules(self) -> dict[str, torch.nn.Module]:
-        return super()._modules() | {"value": self._value, "target": self._target}
-
-    def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        return super()._optimizers() | {"value_optimizer": self._value_optimizer}
+    def learners(self) -> dict[str, Any]:
+        own = {"value": self._value, "target": self._target, "value_optimizer": self._value_optimizer}
+        return super().learners() | own
 
 
 class ShacRunner(ActorRunner):

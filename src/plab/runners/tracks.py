@@ -44,10 +44,10 @@ class Step:
     """Result of an iteration of a run.
 
     Attributes:
-        measures: What the actions are measured by: :func:`plab.runners.runner.episode_columns`, and the
-            columns of the family. Others are left out.
+        measures: Measures of the actions: :func:`plab.runners.runner.episode_columns`, and the columns of the
+            family. Others are left out.
         actions: Actions that it ran, in [-1, 1], shape [T, A].
-        state: What the next iteration starts from: nested dictionaries of arrays, numbers and strings.
+        state: Start of the next iteration: nested dictionaries of arrays, numbers and strings.
         episodes: Episodes that the actions have cost, those of this iteration not included; None: one per
             iteration.
         steps: Environment steps that they have cost; None: those of the episodes.
@@ -56,7 +56,7 @@ class Step:
         steps_gradient: Those that it has simulated with a gradient.
         seconds: The run's share of the wall time; None: all of it.
         keep: Write the state to the file now, instead of every ``checkpoint_seconds``.
-        whole: Whether the actions were run to the end; those that were not are never the best.
+        whole: Actions were run to the end; those that were not are never the best.
     """
 
     measures: Mapping[str, float]
@@ -72,18 +72,18 @@ class Step:
 
 
 class Track:
-    """One run of a batch: configuration, file, place in the batch, how far it has come, and how it ended.
+    """One run of a batch: configuration, file, place in the batch, progress, and end.
 
     Attributes:
-        cfg: Its configuration.
-        run: Its file.
+        cfg: Configuration.
+        run: File.
         number: Number of the run in its batch, and of its environment in a simulator that they share.
-        error: Why it broke off, if it did.
-        iteration: Number of the iteration that is next.
+        error: Reason for which it broke off, if it did.
+        iteration: Number of the next iteration.
         best_loss: Loss of the best actions so far, NaN before the first iteration.
         best_actions: The best actions so far by the family's ranking, shape [T, A]; None before the first
             iteration.
-        log: Takes what ``logger`` is to show beside the rows, which it is given.
+        log: Log of rows and further numbers, as ``logger`` says.
     """
 
     def __init__(self, cfg: Config, run: RunFile) -> None:
@@ -103,12 +103,12 @@ class Track:
 
     @property
     def open(self) -> bool:
-        """Whether it has neither finished nor broken off."""
+        """Return whether the run has neither finished nor broken off."""
         return self.error is None and not self.run.finished
 
     @property
     def solved(self) -> bool:
-        """Whether its score is the highest there is, where that is what it looks for."""
+        """Return whether the run ranks actions by score and has reached the highest."""
         return self._best_score >= SOLVED
 
     @property
@@ -167,8 +167,8 @@ class Track:
         """Write an iteration to the file; return its row.
 
         Args:
-            step: What the iteration gave.
-            columns: Which of the measures.
+            step: Result of the iteration.
+            columns: Names of the measures to keep.
 
         Raises:
             ResultsError: If the file cannot be written.
@@ -239,7 +239,7 @@ class Outcome:
 
     @property
     def finished(self) -> bool:
-        """Whether the result is there."""
+        """Return whether the result is there."""
         return self.status in ("finished", "before")
 
 

@@ -132,7 +132,7 @@ class Training(ABC):
     Attributes:
         batch: Environments of the training.
         total_steps: Transitions of each policy in the whole training, in whole cycles.
-        watched: Whether losses of the updates are asked for.
+        watched: Losses of the updates are asked for.
         report: Function to call when episodes have ended.
     """
 

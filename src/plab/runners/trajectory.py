@@ -1,8 +1,8 @@
 """Open-loop trajectory optimisation: sequences of actions, improved by the gradient through the simulator.
 
 The methods ``adam``, ``gd`` and ``adam_h`` differ in their configuration only. The runs of a batch share one
-simulator, an environment each; nothing else of them is shared, so that each gives the numbers that it would
-give alone. To reproduce a result:
+simulator, an environment each, and nothing else: each gives the numbers that it gives alone. To reproduce a
+result:
 
     python -m plab.run task=Rope variant=1 method=adam seed=0
 """
@@ -20,16 +20,6 @@ import numpy as np
 from plab.config import MethodConfig, ranges
 from plab.config.families import GRADIENT, Appearance, Family, Rule, family
 from plab.runners.runner import Runner, Step, Track, measures, shared_problem
-
-__all__ = [
-    "FAMILY",
-    "ActionSequence",
-    "Adam",
-    "Momentum",
-    "TrajectoryConfig",
-    "TrajectoryRunner",
-    "UpdateRule",
-]
 
 
 @dataclass
@@ -65,7 +55,6 @@ class TrajectoryConfig(MethodConfig):
     action_init: float = field(metadata=ranges.UNIT)
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for a value out of range."""
         super().check(path)
         ranges.one_of(f"{path}.optimizer", self.optimizer, tuple(family(self.family).rules))
 
@@ -122,8 +111,8 @@ class UpdateRule:
 
     Attributes:
         method: Rates.
-        state: What is kept between updates, by its names: arrays of the actions' shape or numbers. An update
-            puts new ones in the place of the old.
+        state: Arrays of the actions' shape or numbers that are kept between updates, by name. An update
+            replaces them.
     """
 
     def __init__(self, method: TrajectoryConfig) -> None:
@@ -140,7 +129,6 @@ class Adam(UpdateRule):
     """Adam (arXiv:1412.6980), in the order of ``torch.optim.Adam``'s operations, which agrees to rounding."""
 
     def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the actions after a step."""
         zeros = np.zeros_like(actions)
         first, second = self.method.betas
         step = self.state.get("step", np.zeros(())) + 1
@@ -156,7 +144,6 @@ class Momentum(UpdateRule):
     """Gradient descent: v <- m v + (1 - m) g, v = 0 at first; actions <- actions - lr v."""
 
     def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the actions after a step."""
         m = self.method.momentum
         v = m * self.state.get("momentum_buffer", np.zeros_like(actions)) + (1 - m) * gradient
         self.state = {"momentum_buffer": v}

@@ -11,11 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from plab.config import ConfigError, ranges
 from plab.runners.libraries import torch
 from plab.runners.planners.planner import Asking, CandidateStart, Planner, PlannerConfig, Request
+from plab.runners.policy import packed, unpacked
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -130,17 +129,15 @@ class Multistart(Planner):
         self._put(torch.cat([moved, fresh]), worse.tolist())
 
     def state(self) -> dict[str, Any]:
-        held = {str(k): self._adam.state[p] for k, p in enumerate(self._places) if p in self._adam.state}
-        moments = {k: {name: v.cpu().numpy().copy() for name, v in own.items()} for k, own in held.items()}
-        return super().state() | {"actions": self._actions().cpu().numpy(), "moments": moments}
+        moments = {k: self._adam.state[p] for k, p in enumerate(self._places) if p in self._adam.state}
+        kept = packed({"actions": self._actions(), "moments": moments})
+        return super().state() | {"torch": kept}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self._put(torch.tensor(state["actions"]), range(len(self._places)))
-        for k, own in state.get("moments", {}).items():
-            place = self._places[int(k)]
+        kept = unpacked(state["torch"])
+        self._put(kept["actions"], range(len(self._places)))
+        for k, own in kept["moments"].items():
             # The number of steps stays on the CPU, as Adam has it.
-            self._adam.state[place] = {
-                name: torch.tensor(np.asarray(v), device="cpu" if name == "step" else place.device)
-                for name, v in own.items()
-            }
+            on = {name: v if name == "step" else v.to(self._places[k].device) for name, v in own.items()}
+            self._adam.state[self._places[k]] = on

@@ -35,10 +35,10 @@ class PlannerConfig(MethodConfig):
     """Keys of all planners.
 
     Attributes:
-        algorithm: How it searches, one of the family's rules.
+        algorithm: Search algorithm, one of the family's rules.
         iterations: Rows of the result; what one costs is up to the planner.
         population: Candidates, each a sequence of actions.
-        objective: What candidates are ranked by: ``loss``, that of the whole episode; ``final``, that of its
+        objective: Ranking of candidates: ``loss``, that of the whole episode; ``final``, that of its
             last step; or ``score``, and the loss where the score is 0.
         action_init: Random candidates are uniform in +- this.
         contact_starts: Share of the candidates to start from that drive manipulators to the body and push or
@@ -64,7 +64,7 @@ class Request:
     Attributes:
         actions: Actions in [-1, 1], shape [P, T, A].
         softness: Decay rate of the soft contact [1 / domain unit]; None: the hard one.
-        gradient: Whether their gradient is asked for.
+        gradient: Ask for their gradient.
     """
 
     actions: Tensor
@@ -80,7 +80,7 @@ class Answer:
         measures: ``loss`` and its terms, ``reward``, ``iou``, ``score``: shape [P] each.
         final_loss: Loss of the last step, shape [P].
         gradient: Gradient of ``loss``, shape [P, T, A], 0 for what broke off; None if it was not asked for.
-        broken: Whether a candidate broke off, shape [P]; its numbers mean nothing.
+        broken: Candidates that broke off, shape [P], bool; their numbers mean nothing.
     """
 
     measures: dict[str, Tensor]
@@ -113,7 +113,7 @@ class CandidateStart:
 
     Attributes:
         shape: Steps T and length A of the action vector.
-        device: Where tensors are.
+        device: Device of tensors.
     """
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
@@ -139,7 +139,7 @@ class Planner(ABC):
 
     Attributes:
         method: Its numbers.
-        start: Where candidates start from.
+        start: Source of the first candidates.
         memory: Tensors that the next iteration depends on.
         iteration: Number of the iteration that is next.
     """
@@ -156,7 +156,7 @@ class Planner(ABC):
 
         Args:
             random: Source of random numbers.
-            found: What the stage before has found, the best first, shape [N, T, A]; N is 0 if there is none.
+            found: Candidates of the stage before, the best first, shape [N, T, A]; N is 0 if there is none.
         """
 
     @abstractmethod

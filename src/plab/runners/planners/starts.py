@@ -73,7 +73,7 @@ class ContactStarts:
         """Draw starts, pushing and carrying in turn.
 
         Args:
-            count: How many.
+            count: Number of starts.
             seed: Seed of the draws.
 
         Returns:
