@@ -80,6 +80,7 @@ class Population(Training):
         size = len(cfgs) if self._device.type == "cuda" else 1
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
         self.stacks: list[Agents] = [kind(part, spaces, self._device) for part in parts]
+        self._places = [(stack, number) for stack in self.stacks for number in range(stack.count)]
         self._reward = torch.zeros((len(cfgs), self._envs), dtype=torch.float64, device=self._device)
         self._observations: Any = None
         self._broken: dict[int, list[str]] = {}
@@ -91,11 +92,6 @@ class Population(Training):
     @property
     def steps(self) -> int:
         return self.stacks[0].steps
-
-    def place(self, run: int) -> tuple[Agents, int]:
-        """Return the stack that a run's agent is in, and its number there."""
-        stack, number = divmod(run, self.stacks[0].count)
-        return self.stacks[stack], number
 
     def cycle(self) -> None:
         if self._observations is None:
@@ -129,26 +125,26 @@ class Population(Training):
         return [state | {"episode_actions": acted[:, k]} for k, state in enumerate(states)]
 
     def restore(self, run: int, state: Mapping[str, Any]) -> None:
-        stack, number = self.place(run)
+        stack, number = self._places[run]
         stack.restore(number, state)
         self._restored[run] = state["episode_actions"]
 
     def write(self, run: int, path: Path) -> None:
-        stack, number = self.place(run)
+        stack, number = self._places[run]
         if isinstance(stack, OffPolicyAgents):
             stack.replay.write(number, path)
 
     def read(self, run: int, path: Path) -> None:
-        stack, number = self.place(run)
+        stack, number = self._places[run]
         if isinstance(stack, OffPolicyAgents):
             stack.replay.read(number, path, stack.steps // self._envs)
 
     def policy(self, run: int) -> BasePolicy:
-        stack, number = self.place(run)
+        stack, number = self._places[run]
         return stack.policy(number)
 
     def moments(self, run: int) -> tuple[np.ndarray, np.ndarray] | None:
-        stack, number = self.place(run)
+        stack, number = self._places[run]
         return stack.moments(number)
 
     def _start(self) -> Tensor:
