@@ -20,11 +20,11 @@ from plab.envs.autograd import policy_gradient
 from plab.objective import scores
 from plab.problem import Problem
 from plab.results import ResultsError, RunFile, RunResult, read
-from plab.runners import RunError, run_config, trajectory
+from plab.runners import FAMILIES, RunError, run_config, trajectory
 from plab.runners.loggers import RunLog
 from plab.runners.runner import SimulatorCache, measures, shared_problem
 from plab.runners.training import shared_batches
-from plab.runners.trajectory import ActionSequence
+from plab.runners.trajectory import UpdateRule
 from plab.sim import SimulationError, Simulator
 from same_runs import assert_same_numbers, finished_as, stopped_at
 
@@ -74,17 +74,21 @@ def method() -> MethodConfig:
     return load_config(COARSE).method
 
 
+def rule(method: MethodConfig, steps: int, size: int, seed: int = 0) -> UpdateRule:
+    return FAMILIES["trajectory"].rules[method.optimizer].what(method, (steps, size), seed)
+
+
 @pytest.mark.parametrize("seed", [0, 7, 2**32 + 5])
 def test_first_actions_are_drawn_as_torch_draws(method, seed: int) -> None:
     unit = torch.rand((50, 6), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).numpy()
-    drawn = ActionSequence(method, 50, 6, seed).actions
+    drawn = rule(method, 50, 6, seed).actions
     assert np.array_equal(drawn, (2.0 * unit - 1.0) * method.action_init)
 
 
 def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
     def moved(largest: float | None, gradient: np.ndarray) -> np.ndarray:
         settings = replace(method, optimizer="gd", lr=0.1, momentum=0.0, max_gradient_norm=largest)
-        actions = ActionSequence(settings, 2, 2, seed=0)
+        actions = rule(settings, 2, 2)
         before = actions.actions
         actions.step(gradient)
         return before - actions.actions
@@ -99,7 +103,7 @@ def test_long_gradients_are_scaled_down_if_asked_for(method) -> None:
 def test_rules_are_adam_and_momentum(method, optimizer: str) -> None:
     """Adam as published; v <- m v + (1 - m) g from v = 0, actions <- actions - lr v."""
     settings = replace(method, optimizer=optimizer, lr=0.1, momentum=0.8, betas=[0.9, 0.99], eps=1e-6)
-    actions, rng = ActionSequence(settings, 5, 4, seed=0), np.random.default_rng(0)
+    actions, rng = rule(settings, 5, 4), np.random.default_rng(0)
     expected, m, s, v = actions.actions, *np.zeros((3, 5, 4))
     for step in range(1, 101):
         gradient = rng.normal(size=(5, 4)) * 10.0 ** rng.integers(-6, 3)
@@ -141,7 +145,7 @@ def test_rows_are_those_of_the_rule_by_the_simulators_gradient(tmp_path: Path, w
     result, problem = run(cfg), shared_problem(CACHE, [cfg])
     simulator = problem.simulator
     simulator.set_contact(cfg.method.contact, cfg.method.softness)
-    sequence, tried, rows = ActionSequence(cfg.method, 3, 6, cfg.seed), [], result.iterations
+    sequence, tried, rows = rule(cfg.method, 3, 6, cfg.seed), [], result.iterations
     for _, row in rows.iterrows():
         tried.append(sequence.actions)
         done = problem.rollout(sequence.actions[None], gradient=True)

@@ -91,18 +91,17 @@ class PodsTraining(Imitation):
     def _episode(self, actions: torch.Tensor | None, name: str) -> tuple[torch.Tensor, torch.Tensor]:
         """Run an episode of given actions, shape [env, T, A], or of the policy, and note reward and score
         under a name; return observations before each step, shape [env, T, entry], and actions."""
-        batch = self.batch
-        like = torch.empty(0, device=self._device) if self._device.type == "cuda" else None
-        observed, taken, total = [], [], 0.0
-        observation, _ = batch.reset(like)
-        for t in range(batch.horizon):
-            seen = torch.as_tensor(observation, dtype=torch.float32)
+        from plab.envs.tensors import TensorEnv
+
+        env, observed, taken, total = TensorEnv(self.batch), [], [], 0.0
+        seen = env.reset()
+        for t in range(self._horizon):
             with torch.no_grad():
                 chosen = self.network(self.scaled(seen)) if actions is None else actions[:, t]
-            step = batch.step(chosen if like is not None else chosen.numpy(), strict=False)
+            step = env.step(chosen.double(), strict=False)
             observed.append(seen)
             taken.append(chosen)
-            observation, total = step.observation, total + torch.as_tensor(step.reward)
+            seen, total = step.observation, total + step.reward
         self._note_failures(step.failures)
         self.note(**{f"{name}_reward": total, f"{name}_score": step.info["score"]})
         return torch.stack(observed, 1), torch.stack(taken, 1)

@@ -70,23 +70,24 @@ class TrajectoryRunner(Runner):
         self.problem = shared_problem(self.cache, [track.cfg for track in self.tracks])
         methods = [track.cfg.method_as(TrajectoryConfig) for track in self.tracks]
         self.problem.simulator.set_contact([m.contact for m in methods], [m.softness for m in methods])
-        self._sequences: dict[int, ActionSequence] = {}
+        self._rules: dict[int, UpdateRule] = {}
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
         """Draw the first actions, or take those of the file."""
         scene = self.problem.scenes[track.number]
         method = track.cfg.method_as(TrajectoryConfig)
-        sequence = ActionSequence(method, scene.horizon, scene.action_dim, track.cfg.seed)
+        kind: type[UpdateRule] = family(method.family).rules[method.optimizer].what
+        rule = self._rules[track.number] = kind(method, (scene.horizon, scene.action_dim), track.cfg.seed)
         if state is not None:
-            sequence.restore(state)
-        self._sequences[track.number] = sequence
+            rule.actions = np.array(state["actions"])
+            rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
         """Run the actions of all, and improve those of each by their gradient."""
         start = time.perf_counter()
         tried = self.actions_at_rest()
         for track in tracks:
-            tried[track.number] = self._sequences[track.number].actions
+            tried[track.number] = self._rules[track.number].actions
         episodes = self.problem.rollout(tried, gradient=True, strict=False, exact=False)
         share = (time.perf_counter() - start) / len(tracks)
         for track in tracks:
@@ -96,33 +97,42 @@ class TrajectoryRunner(Runner):
                 continue
             start = time.perf_counter()
             gradient = cast(np.ndarray, episodes.gradient)[number]
-            sequence = self._sequences[number]
-            sequence.step(gradient)
+            rule = self._rules[number]
+            rule.step(gradient)
             measured = measures(episodes, number) | {"gradient_norm": float(np.linalg.norm(gradient))}
-            done = measured, tried[number], sequence.state()
+            done = measured, tried[number], {"actions": rule.actions, "optimizer": dict(rule.state)}
             seconds = share + time.perf_counter() - start
             yield track, Step(*done, steps_forward=0, steps_gradient=len(gradient), seconds=seconds)
 
 
 class UpdateRule:
-    """Change of actions by their gradient, as :class:`ActionSequence` applies it.
+    """The actions of an episode, and their change by a gradient.
 
     In NumPy, not as ``torch.optim``: importing torch takes 1.5 s of CPU time before the first progress line.
 
     Attributes:
         method: Rates.
-        state: Arrays of the actions' shape or numbers that are kept between updates, by name. An update
-            replaces them.
+        actions: Each in [-1, 1], shape [T, A], float64.
+        state: Arrays of the actions' shape or numbers that are kept between updates, by name.
     """
 
-    def __init__(self, method: TrajectoryConfig) -> None:
-        """Keep the rates, and nothing yet."""
+    def __init__(self, method: TrajectoryConfig, shape: tuple[int, int], seed: int) -> None:
+        """Draw the first actions, uniform in +-``method.action_init``."""
         self.method = method
+        self.actions = (2.0 * uniform(seed, shape) - 1.0) * method.action_init
         self.state: dict[str, np.ndarray] = {}
+
+    def step(self, gradient: np.ndarray) -> None:
+        """Replace the actions by updated ones, clipped to [-1, 1]; a gradient, shape [T, A], that is longer
+        than ``method.max_gradient_norm`` is scaled down to that."""
+        gradient = np.array(gradient, dtype=np.float64)
+        if (largest := self.method.max_gradient_norm) is not None:
+            gradient *= min(1.0, largest / (float(np.linalg.norm(gradient)) + 1e-6))
+        self.actions = np.clip(self.update(self.actions, gradient), -1.0, 1.0)
 
     @abstractmethod
     def update(self, actions: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the actions after a step, and keep what the next one needs; all of shape [T, A], float64."""
+        """Return the actions after a step, and replace :attr:`state`; all of shape [T, A], float64."""
 
 
 class Adam(UpdateRule):
@@ -148,37 +158,6 @@ class Momentum(UpdateRule):
         v = m * self.state.get("momentum_buffer", np.zeros_like(actions)) + (1 - m) * gradient
         self.state = {"momentum_buffer": v}
         return actions - self.method.lr * v
-
-
-class ActionSequence:
-    """The actions of an episode and the rule that improves them.
-
-    Attributes:
-        actions: Each in [-1, 1], shape [T, A], float64. A step puts new ones in their place.
-    """
-
-    def __init__(self, method: TrajectoryConfig, horizon: int, action_dim: int, seed: int) -> None:
-        """Draw the first actions, uniform in +-``method.action_init``."""
-        self.actions = (2.0 * uniform(seed, (horizon, action_dim)) - 1.0) * method.action_init
-        self._rule = family(method.family).rules[method.optimizer].what(method)
-        self._largest = method.max_gradient_norm
-
-    def step(self, gradient: np.ndarray) -> None:
-        """Update the actions by a gradient of shape [T, A], no longer than ``method.max_gradient_norm``, and
-        clip them to [-1, 1]."""
-        gradient = np.array(gradient, dtype=np.float64)
-        if self._largest is not None:
-            gradient *= min(1.0, self._largest / (float(np.linalg.norm(gradient)) + 1e-6))
-        self.actions = np.clip(self._rule.update(self.actions, gradient), -1.0, 1.0)
-
-    def state(self) -> dict[str, Any]:
-        """Return everything that the next steps depend on, as arrays."""
-        return {"actions": self.actions, "optimizer": dict(self._rule.state)}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a :meth:`state`."""
-        self._rule.state = {name: np.array(value) for name, value in state["optimizer"].items()}
-        self.actions = np.array(state["actions"])
 
 
 def uniform(seed: int, shape: tuple[int, ...]) -> np.ndarray:
