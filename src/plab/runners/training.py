@@ -215,11 +215,11 @@ class PolicyRunner(Runner):
     The runs stand at the same evaluation; once one has failed, the others begin again without it.
 
     Attributes:
-        training: Type of the training.
+        training: Subclass of :class:`Training`, made of configurations and environments.
         policies: The policies in training.
     """
 
-    training: ClassVar[type[Training]]
+    training: ClassVar[type[Any]]
     policies: Training
     _pace = 0.0
     _shown = ""
