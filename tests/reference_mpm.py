@@ -21,17 +21,6 @@ from torch import Tensor
 
 from plab.scenes import MANIPULATOR_SHAPES, Manipulator, Scene, sample_particles
 
-__all__ = [
-    "State",
-    "env_step",
-    "initial_state",
-    "loss_terms",
-    "mass_tensor",
-    "rollout_loss",
-    "signed_distance",
-    "substep",
-]
-
 BOUND = 3  # grid layers of each wall
 MASS_THRESHOLD = 1e-12  # nodes with at most this mass are skipped
 MIN_SINGULAR_VALUE = 0.05

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from plab.bench.accuracy import COLUMNS, QUICK, TASKS, Attempt, Plan, lattice, rows
+from plab.bench.accuracy import QUICK, TASKS, Attempt, Plan, lattice, rows
 from plab.bench.stability import main
-from plab.report.accuracy import diagrams
-from plab.report.figures import save, style
 from plab.scenes import Body
 
 
@@ -36,26 +33,6 @@ def test_lattices_fill_bodies_evenly_and_every_setting_has_a_scene() -> None:
             # As many particles per cell on every grid, but for whole numbers of them across a thin body.
             per_cell = [len(attempt.start(s)[1]) / s.grid**3 for s in settings if s.axis == "grid"]
             assert max(per_cell) < spread * min(per_cell)
-
-
-def test_diagrams_show_what_diverges(tmp_path: Path) -> None:
-    common = {"axis": "substeps", "task": "Move", "material": "series", "grid": 64, "particles": 100}
-    common |= {"contact": "soft", "precision": "float32"}
-    names = ("positions", "mass", "score", "gradient", "angle_deg")
-    table = [
-        {**common, "substeps": n, "ms_per_step": f"{n}.0", "outcome": "stable" if n > 5 else "broke off"}
-        | dict.fromkeys(names, f"{1 / n}" if n > 5 else "nan")
-        for n in (5, 10, 20)
-    ]
-    with style():
-        (drawing,) = diagrams(pd.DataFrame(table, columns=COLUMNS))
-    assert len(drawing.figure.axes) == 5
-    for panel in drawing.figure.axes:
-        # A line and what broke off.
-        assert [tuple(line.get_xdata()) for line in panel.get_lines()] == [(10.0, 20.0), (5.0,)]
-        assert [text.get_text() for text in panel.texts] == ["10", "20", "5"]
-    save([drawing], tmp_path, {"footer": []})
-    assert all((tmp_path / f"Move_substeps.{kind}").stat().st_size > 5000 for kind in ("png", "pdf"))
 
 
 @pytest.mark.nightly

@@ -289,17 +289,6 @@ def test_ranges(kind):
             assert ".".join([*path, field]) in str(info.value) and "\n" not in str(info.value), (key, value)
 
 
-def test_manipulators_start_within_their_bounds():
-    left, path = section("left")
-    dataclasses.replace(left, lower_bound=left.position, upper_bound=left.position).check(*path)
-    for axis, name in enumerate("xyz"):
-        for bound, way in (("lower_bound", 0.001), ("upper_bound", -0.001)):
-            values = list(left.position)
-            values[axis] += way
-            with pytest.raises(ConfigError, match=rf"left.position: {name} "):
-                dataclasses.replace(left, **{bound: values}).check(*path)
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [

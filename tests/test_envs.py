@@ -26,7 +26,6 @@ import plab
 import plab.envs.core as core
 import plab.sim.runtime as runtime
 from plab.config import Config, ConfigError, choices, conf_folder
-from plab.config.suite import suite_tasks
 from plab.envs.sb3 import PlabVecEnv
 from plab.envs.single import PlabEnv
 from plab.envs.vector import PlabVectorEnv
@@ -377,21 +376,4 @@ def test_worker_processes() -> None:
     observed, _ = env.reset(seed=0)
     np.testing.assert_array_equal(observed[0], observed[1])
     assert not env.step(np.zeros((2, 6), np.float32))[3].any()
-    env.close()
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("task", suite_tasks())
-def test_every_task(task: str, tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
-    env = gymnasium.make(f"plab/{task}-v1", overrides=COARSE)
-    observed, _ = env.reset(seed=0)
-    assert env.action_space.shape == (env.unwrapped.batch.problem.scenes[0].action_dim,)
-    env.action_space.seed(0)
-    for _ in range(HORIZON):
-        action = env.action_space.sample()
-        action[-1] = -1.0  # opens chopsticks all the way
-        assert env.observation_space.contains(observed)
-        observed, *_ = env.step(action)
-    assert env.observation_space.contains(observed)
     env.close()

@@ -103,6 +103,8 @@ def until(section: str, instead: str = "") -> tuple[str, str]:
         (("[0.0, -30.0, 0.0]", "[0.0, -30.0, 0.0"), [], "Dumbbell.yaml, line"),
         (("floor_friction: 1.5", "gravity: 3"), [], "gravity"),
         (("name: Dumbbell", "name: my task"), [], "task.name"),
+        (("name: Dumbbell", "colour: red"), [], "colour"),
+        (("yield_stress: 200.0", "yield_stress: ${nowhere}"), [], "nowhere"),
         (("yield_stress: 200.0", "#"), [], "task.yield_stress"),
         (("yield_stress: 200.0", "yield_stress: soft"), [], "task.yield_stress"),
         (('  "1":', "  1:"), [], "task.variants.1"),

@@ -13,7 +13,7 @@ import torch
 from cmaes import CMA
 
 import reference_mpm as reference
-from plab.config import Config, ConfigError, MethodConfig, build_scene, load_config
+from plab.config import Config, MethodConfig, build_scene, load_config
 from plab.objective import spread_mass
 from plab.problem import Problem
 from plab.results import BUDGETS, RunFile, RunResult, checking, read
@@ -444,17 +444,6 @@ def carried(task: str, variant: str, target: np.ndarray, scale: float) -> np.nda
     return carry.reshape(len(carry), -1, 2, 3).sum(axis=0).mean(axis=1) * scale
 
 
-def test_what_no_manipulator_is_near_to_stays() -> None:
-    """On Assembly ways of points are shortest if the block goes up and the ball takes its place."""
-    target = np.zeros((64, 64, 64))
-    solid(target, np.array([0.6, 0.08, 0.5]), 0.08, 0.6)
-    solid(target, np.array([0.6, 0.21, 0.5]), 0.05, 0.4)
-    np.testing.assert_allclose(carried("Assembly", "1", target, 0.009), [[0.3, 0.15, 0.0]], atol=0.02)
-    few = load_config(["task=Assembly", "task.bodies.block.particles=10000", "task.bodies.ball.particles=3"])
-    starts = ContactStarts(build_scene(few), target).draw(4, seed=0)
-    assert np.isfinite(starts).all() and (np.abs(starts).max(axis=(1, 2)) > 0.0).all()
-
-
 @pytest.mark.parametrize("variant", "15")
 def test_each_body_is_carried_whole_to_a_place_of_its_own(variant: str) -> None:
     """On TripleMove some ways of points are shortest from two boxes to one place."""
@@ -487,18 +476,3 @@ def test_candidates_start_at_the_body_as_often_as_asked_for() -> None:
 
 
 # ---------------------------------------------------------------- mistakes
-
-
-def test_mistakes_name_their_key(tmp_path: Path) -> None:
-    wrong = {
-        "mppi": ("method.objective=reward", "method.objective"),
-        "solve": ("method.stages.polish.softness_end=900", "method.stages.polish.softness_end"),
-        "hybrid": ("+method.stages.last={knots: 3}", "method.stages.last"),
-    }
-    for method, (word, key) in wrong.items():
-        with pytest.raises(ConfigError, match=key):
-            make_config(tmp_path, method, word)
-    method = make_config(tmp_path, "hybrid").method
-    method.stages["search"].loss_weights = {"density": 1.0, "contact": 1.0}
-    with pytest.raises(ConfigError, match=r"method\.stages\.search\.loss_weights"):
-        method.check("method")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from plab.config import ConfigError, TaskConfig, build_scene, choices, load_config
+from plab.config import ConfigError, TaskConfig, choices, load_config
 from plab.config.compose import compose
 from plab.config.variants import FIRST_TARGET_SEED, draw_variant
 
@@ -92,14 +92,6 @@ def test_the_scene_depends_on_seed_scene_only():
     assert draw(3) == draw(3, *rest, "sim.particles_scale=0.25")
     move = [draw(k, task="Move") for k in (3, 3, 4)]
     assert move[0] == move[1] != move[2]
-
-
-def test_a_random_variant_is_a_configuration_like_any_other():
-    cfg = load_config(["variant=random", "seed_scene=7", "task.yield_stress=100"])
-    assert (cfg.variant, cfg.seed_scene, cfg.task.yield_stress, cfg.task.random) == ("random7", 7, 100, {})
-    assert build_scene(cfg).manipulators[2].position == tuple(draw(7).manipulators["pillar"].position)
-    assert cfg.path.parent.as_posix() == "results/Rope-vrandom7/adam"
-    assert cfg.path != load_config(["variant=random", "seed_scene=7"]).path
 
 
 def test_ranges_can_be_overridden():

@@ -35,9 +35,6 @@ from suite import scene
 
 ROOT = Path(__file__).parents[1]
 MISSING = graphics.missing_graphics
-DUMBBELL = (ROOT / "examples" / "own_task" / "conf" / "task" / "Dumbbell.yaml").read_text(encoding="utf-8")
-
-
 @pytest.fixture(autouse=True)
 def on_some_computer(tmp_path, monkeypatch):
     """In an empty folder of a computer with 16 GB of memory, and with graphics."""
@@ -134,27 +131,6 @@ def test_refusals_of_overrides(argv):
 @pytest.mark.parametrize("argv", RUN)
 def test_refusals_of_run(refused, argv):
     assert RUN[argv] in refused(argv.split(" "))
-
-
-BROKEN_TASKS: dict[str, tuple[str | bytes, str]] = {
-    "a list": ("- 1\n- 2\n", "Broken"),
-    "an open bracket": (DUMBBELL.replace("[0.39, 0.4, 0.5]", "[0.39, 0.4, 0.5", 1), "Broken.yaml"),
-    "an unknown key": (DUMBBELL + "\ncolour: red\n", "colour"),
-    "a wrong reference": (DUMBBELL.replace("yield_stress: 200.0", "yield_stress: ${nowhere}", 1), "nowhere"),
-    "a defaults list of itself": ("defaults: [Broken]\n", "defaults"),
-    "bytes": (b"\xff\xfe\x00\x01\x80", "Broken.yaml"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN_TASKS)
-def test_broken_task_files(refused, tmp_path, case):
-    content, named = BROKEN_TASKS[case]
-    path = tmp_path / "mine" / "task" / "Broken.yaml"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    assert named in refused(["--config-dir", "mine", "task=Broken"])
-    path.rename(path.with_name("Rope.yaml"))
-    assert "Rope.yaml" in refused(["--config-dir", "mine", "task=Rope"])
 
 
 # ------------------------------------------------------------------------------------------------ the others

@@ -15,7 +15,7 @@ import torch
 import reference_mpm
 from plab import results
 from plab.cli.rollouts import render as main
-from plab.config import build_scene, choices, load_config
+from plab.config import choices, load_config
 from plab.objective import spread_mass
 from plab.render import graphics
 from plab.render.camera import VIEWS, View, fit_camera, scene_camera
@@ -241,23 +241,6 @@ def test_plasticine_is_seen_through_manipulators_and_ghosts_through_plasticine()
     assert ghost[0] < plain[0] - 15 and ghost[2] > plain[2] + 15
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_manipulator_is_drawn_at_its_pose(kind):
-    tilt = (math.cos(0.3), 0.0, 0.0, math.sin(0.3))
-    manipulator = Manipulator(kind, SIZES[kind], (0.7, 0.3, 0.5), rotation=tilt, scale=SCALES[kind], gap=0.1)
-    world = scene(manipulator)
-    pose = start_poses(world)
-    with closing(Renderer(world, None, SIZE)) as renderer:
-        picture = renderer.frame(sample_particles(world), pose)
-        for part in manipulator_parts(manipulator):
-            vertices = transform(pose_matrix(pose[0], part.side), part.vertices)
-            nearest = vertices[np.argmax(vertices @ renderer.camera.axes()[2])]
-            # A pixel inwards: the nearest vertex may be at the rim.
-            inwards = nearest + 0.2 * (vertices.mean(axis=0) - nearest) * (kind != "Torus")
-            column, row = np.floor(renderer.camera.project(inwards, SIZE)).astype(int)
-            assert is_metal(picture[row, column].astype(float)), part.side
-
-
 # ------------------------------------------------------------------------------------------------------ files
 
 
@@ -370,22 +353,3 @@ def test_known_demonstrations_are_replayed_and_others_are_of_zeros(monkeypatch, 
     assert "4 action components" in line and "6" in line
     Path("file").touch()
     assert "file/rope.png" in told(*argv, "--output", "file/rope.png")
-
-
-@pytest.mark.nightly
-def test_the_contact_sheet_and_the_film_strip(monkeypatch):
-    some = {name: path for name, path in choices("task").items() if name in ("Move", "Rope", "Torus")}
-    monkeypatch.setattr("plab.cli.rollouts.choices", lambda group, config_dir: some)
-    monkeypatch.setattr(
-        "plab.demonstrations.known_actions", lambda cfg: np.zeros((2, build_scene(cfg).action_dim))
-    )
-    words = ["sim.grid_size=32", "sim.particles_scale=0.03"]
-    assert main(["--contact-sheet", "sheet.png", "--size", "80x40", *words]) == 0
-    with Image.open("sheet.png") as sheet:
-        assert sheet.width > 5 * 80 and sheet.height > 3 * 40 and sheet.mode == "P"
-        assert np.asarray(sheet.convert("RGB")).std() > 10
-    assert main(["--film-strip", "strip.jpg", "--size", "80x60", *words]) == 0
-    with Image.open("strip.jpg") as strip:
-        # Two rows of two: four frames each, a caption above, a gap between.
-        assert strip.size == (2 * 4 * 80 + 10, 2 * (60 + 2 * 10))
-        assert np.asarray(strip)[:60, :320].std() > 10 and np.asarray(strip)[80:, 330:].std() < 10

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 from functools import reduce
@@ -360,18 +359,6 @@ def test_files_are_as_they_were(written: Path, form: str) -> None:
             golden.parent.mkdir(parents=True, exist_ok=True)
             golden.write_text(text, encoding="utf-8", newline="\n")
         assert text == golden.read_text(encoding="utf-8")
-
-
-def test_every_file_names_command_and_runs(written: Path, folder: Path) -> None:
-    digest = gather(folder, "method=adam,gd,adam_h").digest
-    for suffix in (".tex", ".md", ".csv", ".json"):
-        text = (written / "comparison" / f"iou_per_configuration{suffix}").read_text(encoding="utf-8")
-        assert "python -m plab.report tables" in text and digest in text
-    beside = json.loads((written / "ours" / "iou_per_task.json").read_text(encoding="utf-8"))
-    runs = json.loads((written / "ours" / beside["runs"]).read_text(encoding="utf-8"))
-    assert len(runs) == 44 and all(Path(run["path"]).is_file() for run in runs)
-    data = pd.read_csv(written / "ours" / "iou_per_task.csv", comment="#").set_index(["task", "method"])
-    assert data.loc[("Rope", "adam"), "std"] == pytest.approx(np.std(ADAM), rel=1e-12)
 
 
 def test_numbers_have_two_decimals_and_a_minus_sign() -> None:

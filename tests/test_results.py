@@ -249,7 +249,11 @@ def test_reading_needs_neither_torch_nor_taichi() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_last_score_is_of_the_last_training_episodes_or_of_the_last_iteration() -> None:
+def test_last_score_is_of_the_last_training_episodes_or_of_the_last_iteration(tmp_path: Path) -> None:
+    run = synthetic.run(tmp_path)
+    run.config["protocol"]["score"] = "last"
+    (row,) = load(synthetic.save(run)).to_dict("records")
+    assert run.score == row["score"] == run.columns["score"][-1] != row["score_best"]
     score = np.array([0.2, 0.9, 0.4])
     assert last_score({"score": score}) == 0.4
     assert last_score({"score": score, "train_score": np.array([np.nan, 0.1, 0.3])}) == 0.3

@@ -1,4 +1,4 @@
-"""Scenes as data: volumes, advice on time steps, entries of observations."""
+"""Scenes as data: volumes, advice on time steps, entries of observations, shapes of manipulators."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import pytest
 
 from plab.config import build_scene, load_config
 from plab.envs.observations import level_entries
-from plab.scenes import Camera, SceneError, make_body
+from plab.scenes import MANIPULATOR_SHAPES, Camera, SceneError, make_body
+from plab.sim import shapes
 
 
 def test_the_volume_of_a_sphere_is_that_of_its_formula():
@@ -52,3 +53,15 @@ def test_a_camera_projects_what_it_sees_back_from_any_side():
     ):
         with pytest.raises(SceneError, match=next(iter(wrong))):
             Camera(**{"position": (0.5, 1, 0.5), "target": (0.5, 0, 0.5), **wrong})
+
+
+def test_unfinished_shapes_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes.require_surfaces(MANIPULATOR_SHAPES)
+    assert set(shapes.SURFACES) == set(MANIPULATOR_SHAPES)
+    box = shapes.Surface(shapes.box_distance, shapes.box_hessian_product)
+    for like, surface in (("Box", None), ("Chopsticks", box)):
+        monkeypatch.setitem(MANIPULATOR_SHAPES, "New", MANIPULATOR_SHAPES[like])
+        if surface:
+            monkeypatch.setitem(shapes.SURFACES, "New", surface)
+        with pytest.raises(SceneError, match=r"SURFACES\['New'\]"):
+            shapes.require_surfaces(["New"])

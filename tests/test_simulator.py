@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-import plab
 import reference_mpm as reference
 from plab.losses import make_terms
 from plab.scenes import Body, Manipulator, Scene, SceneError
@@ -282,9 +281,3 @@ def test_results_do_not_depend_on_threads_batch_or_checkpoints(sim: Simulator) -
         np.testing.assert_array_equal(got.step_terms, want.step_terms[:count])
         np.testing.assert_array_equal(got.gradient, want.gradient[:count])
         np.testing.assert_array_equal(state.x, final.x[:count])
-
-
-def test_a_simulator_of_a_configuration_has_its_precision() -> None:
-    cfg = plab.load_config(["task=Move", "sim=reference", "sim.grid_size=32", "sim.particles_scale=0.03"])
-    simulator = plab.make_simulator([cfg] * 2, terms=())
-    assert (simulator.precision, simulator.batch, simulator.terms) == ("float64", 2, ())

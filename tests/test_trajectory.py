@@ -283,17 +283,6 @@ def test_tensorboard_shows_the_rows_as_one_curve(finished, tmp_path: Path, monke
     finished_as(cfg, finished)
 
 
-def test_a_log_that_cannot_be_written_ends_the_run(tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    cfg = make_config(tmp_path, "logger=tensorboard")
-    folder = cfg.path.with_suffix(".tensorboard")
-    folder.parent.mkdir(parents=True)
-    folder.write_text("no folder")
-    with pytest.raises(ResultsError, match="logger=tensorboard fails: ") as caught:
-        run_config(cfg, CACHE)
-    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatch) -> None:
     began, logged = [], []
     log = SimpleNamespace(log=logged.append, define_metric=lambda *_, **__: None, finish=lambda: None)

@@ -10,7 +10,6 @@ import json
 import re
 import urllib.parse
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from browsing import BROWSER, DRIVER, browsing
+from browsing import browsing
 from plab import results
 from plab.cli.rollouts import view as main
 from plab.config import build_scene, load_config
@@ -192,22 +191,6 @@ def test_a_notebook_shows_actions_of_a_configuration_a_result_and_a_task(simulat
 # ---------------------------------------------------------------------------------------- in the browser
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator:
-    selenium = pytest.importorskip("selenium.webdriver")
-    options = selenium.ChromeOptions()
-    options.binary_location = BROWSER
-    # WebGL without a graphics card.
-    software = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-    for argument in ("--headless=new", "--no-sandbox", "--window-size=1000,800", *software):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "SEVERE", "performance": "ALL"})
-    driver = selenium.Chrome(options, selenium.ChromeService(DRIVER))
-    driver.set_script_timeout(60)
-    yield driver
-    driver.quit()
-
-
 def seen(browser) -> tuple[bool, bool]:
     """Return whether red plasticine is seen, and whether the blue target is."""
     canvas = browser.find_element("id", "canvasTarget").screenshot_as_png
@@ -240,7 +223,7 @@ def test_the_page_plays_in_a_browser(browser, page, tmp_path, framed):
     browser.switch_to.default_content()
     if framed:
         return
-    assert browser.get_log("browser") == []
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
     sent = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [one["params"]["request"]["url"] for one in sent if one["method"] == "Network.requestWillBeSent"]
     assert asked and {urllib.parse.urlsplit(url).scheme for url in asked} <= {"file", "data", "blob"}

@@ -33,30 +33,6 @@ def screen(monkeypatch) -> io.StringIO:
     return text
 
 
-def test_a_bar_shows_which_kernel_is_compiled(screen) -> None:
-    @contextmanager
-    def compiler(tell: Callable[[str], None]) -> Iterator[None]:
-        tell("step_kernel")
-        assert "compiling step_kernel" in screen.getvalue()
-        yield tell
-
-    with progress.show_progress("Rope build", 0, None, compiling=compiler):
-        pass
-    tells: list[Callable[[str], None]] = []
-
-    @contextmanager
-    def quiet(tell: Callable[[str], None]) -> Iterator[None]:
-        tells.append(tell)
-        yield
-
-    with progress.show_progress("Rope", 0, 8, compiling=quiet) as report:
-        tells[0]("losses_kernel")
-        tells[0]("")
-        report(1, "loss 2")
-    last = screen.getvalue().split("compiling losses_kernel")[-1]
-    assert "loss 2" in last and "compiling" not in last.rsplit("Rope", 1)[1]
-
-
 def test_a_run_from_its_bar_to_its_last_lines(tmp_path, screen, monkeypatch, capsys) -> None:
     kept: list[tuple[int, int]] = []
     compiled: list[str] = []
