@@ -35,6 +35,8 @@ from suite import scene
 
 ROOT = Path(__file__).parents[1]
 MISSING = graphics.missing_graphics
+
+
 @pytest.fixture(autouse=True)
 def on_some_computer(tmp_path, monkeypatch):
     """In an empty folder of a computer with 16 GB of memory, and with graphics."""
