@@ -107,6 +107,16 @@ def test_the_page_holds_the_target_as_a_ghost_and_the_scores(recording, page):
     assert content(without)["scores"] is None and 'data-group="target"' not in without
 
 
+def test_surfaces_stand_for_particles_and_are_bounded(recording, monkeypatch):
+    monkeypatch.setattr(viewer, "_VERTICES", 400)
+    (rope,) = things(surfaces := viewer.page(recording, surface=True))["plasticine"]
+    assert content(surfaces)["interpolate"] is False
+    for step, points in frames(rope["vertices"]).items():
+        points = points.reshape(-1, 3)
+        assert 40 < len(points) <= 110 and frames(rope["indices"])[step].max() == len(points) - 1
+        assert points.mean(axis=0) == pytest.approx(recording.x[step].mean(axis=0), abs=0.02)
+
+
 def test_the_page_is_reproducible_and_asks_for_nothing(recording, page):
     assert viewer.page(recording) == page
     assert not re.search(r"""(src|href)\s*=\s*["']""", page)
@@ -162,7 +172,7 @@ def test_results_are_shown_beside_their_files_and_runs_of_archives_here(capsys, 
 
 
 def test_the_gallery_has_a_page_of_every_task(monkeypatch, simulated, page, capsys):
-    monkeypatch.setattr("plab.view.page.page", lambda *_: page)
+    monkeypatch.setattr("plab.view.page.page", lambda *_, **__: page)
     assert main(["--gallery"]) == 0 and capsys.readouterr().out.endswith("gallery/index.html\n")
     index = Path("gallery/index.html").read_text(encoding="utf-8")
     names = [f"{task}-v1.html" for task in suite_tasks()]
@@ -203,6 +213,7 @@ def seen(browser) -> tuple[bool, bool]:
 @browsing
 @pytest.mark.parametrize("framed", [False, True], ids=["page", "notebook"])
 def test_the_page_plays_in_a_browser(browser, page, tmp_path, framed):
+    from selenium.webdriver.common.keys import Keys
     from selenium.webdriver.support.ui import WebDriverWait
 
     wait = WebDriverWait(browser, 60, poll_frequency=0.05)
@@ -214,6 +225,9 @@ def test_the_page_plays_in_a_browser(browser, page, tmp_path, framed):
     told = browser.find_element("id", "told")
     wait.until(lambda _: told.text == "step 0 of 3, score 0.00")
     wait.until(lambda _: seen(browser) == (True, True))
+    for key, step in () if framed else ((Keys.ARROW_RIGHT, 1), (Keys.END, 3), (Keys.HOME, 0)):
+        browser.find_element("tag name", "body").send_keys(key)
+        wait.until(lambda _, step=step: told.text.startswith(f"step {step} of 3"))
     browser.find_element("id", "play").click()
     wait.until(lambda _: told.text == "step 3 of 3, score 0.30")
     faded = "arguments[0].value = 0; arguments[0].dispatchEvent(new Event('input'))"

@@ -94,7 +94,8 @@ def view(argv: Sequence[str]) -> None:
     plab view KEY=VALUE ... [--output FILE.html]
     plab view --gallery [KEY=VALUE ...] [--output FOLDER]     a page of every task, and index.html
 
-    It plays in any browser: particles, manipulators, and the target as a ghost.
+    It plays in any browser: plasticine, manipulators, and the target as a ghost. Space plays and pauses,
+    arrow keys go by one step.
 
     EXAMPLES
       plab view results/Rope-v1/adam/seed0-12ab34cd.h5
@@ -104,6 +105,8 @@ def view(argv: Sequence[str]) -> None:
     what = "by default a .html named like the result or the task; of --gallery a folder, gallery by default"
     parser.add_argument("--output", type=folder, metavar="FILE", help=what)
     parser.add_argument("--gallery", action="store_true", help="the best actions known for every task")
+    what = "show plasticine as smooth surfaces instead of its particles"
+    parser.add_argument("--surface", action="store_true", help=what)
     options = parser.parse_intermixed_args(argv)
     if options.gallery:
         _refuse_choice(options, ("task=",))
@@ -122,11 +125,13 @@ def view(argv: Sequence[str]) -> None:
         pages = []
         for task, (cfg,) in _of_all_tasks(options, variants=False):
             recording, file = record_with_motion(cfg, demonstration(cfg)), f"{task}-v{cfg.variant}.html"
-            output.with_name(file).write_text(page(recording, options.every), encoding="utf-8")
+            shown = page(recording, options.every, surface=options.surface)
+            output.with_name(file).write_text(shown, encoding="utf-8")
             pages.append((task, file, recording.score))
         output.write_text(gallery(pages), encoding="utf-8")
     else:
-        output.write_text(page(record_with_motion(*rollout(options)), options.every), encoding="utf-8")
+        shown = page(record_with_motion(*rollout(options)), options.every, surface=options.surface)
+        output.write_text(shown, encoding="utf-8")
     print(output)
 
 
@@ -229,7 +234,8 @@ def _best(sources: Sequence[Path], words: Sequence[str]) -> tuple[Path, str]:
     one_protocol(row.config for row in rows)
     if not rows:
         raise RenderError(f"there is no finished run to show in {', '.join(map(str, sources))}: no run fits")
-    best = max(rows, key=lambda row: row.values["score"])
+    # Of runs with the same score the one that the page of results shows.
+    best = min(rows, key=lambda row: (-row.values["score"], row.values["config_hash"]))
     task, variant, method, seed = (best.values[name] for name in names)
     return best.path, f"{task}-v{variant}-{method}-seed{seed}"
 

@@ -44,6 +44,7 @@ def show(
     actions: np.ndarray | None = None,
     *,
     every: int | None = None,
+    surface: bool = False,
     height: int = _HEIGHT,
 ) -> Viewer:
     """Simulate a rollout in the hard contact model, and return it for a notebook to show in 3-D.
@@ -57,6 +58,7 @@ def show(
             task, or an episode of zeros where none are.
         every: Environment steps from one frame to the next, between which the viewer interpolates; None: so
             many that there are no more than 60 frames.
+        surface: Show plasticine as smooth surfaces instead of its particles.
         height: Height of the viewer [pixels].
 
     Raises:
@@ -82,4 +84,4 @@ def show(
         sim = dataclasses.replace(cfg.sim, device=runtime.device, precision=runtime.precision)
         cfg = dataclasses.replace(cfg, sim=sim)
     shown = rollouts.record_with_motion(cfg, actions)
-    return Viewer(page(shown, every), shown.score, height)
+    return Viewer(page(shown, every, surface=surface), shown.score, height)

@@ -23,14 +23,16 @@ from plab.render.renderer import (
     PAPER,
     TARGET_COLOR,
     part_mesh,
+    surface_mesh,
     target_mesh,
 )
 from plab.render.rollouts import RecordedRollout
 from plab.render.shapes import manipulator_parts, pose_matrix
-from plab.render.surface import body_slices
+from plab.render.surface import body_slices, body_surfaces
 
 _FRAMES = 60
 _POSITIONS = 600_000  # of particles in all frames together: some 6 MB of the page
+_VERTICES = 300_000  # of surfaces, likewise
 _LEVELS = 2**16  # per domain unit, to which positions are rounded: what is not there need not be packed
 _STEPS_PER_SECOND = 10
 _ASPECT = 4 / 3  # of the window that the camera is fitted to; the page moves it away in a narrower one
@@ -42,15 +44,17 @@ _PHONES = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 _LICENCES = ("LICENSE.txt", "require.js.LICENSE.txt", "standalone.js.LICENSE.txt")
 
 
-def page(recording: RecordedRollout, every: int | None = None) -> str:
+def page(recording: RecordedRollout, every: int | None = None, *, surface: bool = False) -> str:
     """Return a page that plays a rollout, below 10 MB whatever its length.
 
-    Positions are rounded to 16 bits per domain unit. Of very many particles every second or third is shown.
+    Positions are rounded to 16 bits per domain unit. Of very many particles every second or third is shown;
+    large surfaces are simplified.
 
     Args:
         recording: The rollout.
-        every: Environment steps from one frame to the next, between which the page interpolates; None: so
-            many that there are no more than 60 frames.
+        every: Environment steps from one frame to the next, between which the page interpolates particles;
+            None: so many that there are no more than 60 frames.
+        surface: Show plasticine as smooth surfaces instead of its particles.
 
     Returns:
         HTML.
@@ -76,7 +80,8 @@ def page(recording: RecordedRollout, every: int | None = None) -> str:
         axes_helper=0,
         menu_visibility=False,
     )
-    things = [*_bodies(recording, steps), *_manipulators(recording, steps), *_ghost(recording), _floor()]
+    bodies = (_surfaces if surface else _particles)(recording, steps)
+    things = [*bodies, *_manipulators(recording, steps), *_ghost(recording), _floor()]
     for number, thing in enumerate(things, start=1):
         # Not where it lies in memory: the same rollout gives the same page.
         thing.id = number
@@ -84,7 +89,7 @@ def page(recording: RecordedRollout, every: int | None = None) -> str:
     snapshot = plot.get_snapshot(additional_js_code="play(K3DInstance);")
     # The page sets the camera itself, when it knows how wide its window is.
     seen = [*camera.position, *camera.target, 0.0, 1.0, 0.0]
-    return _with_bar(snapshot, recording, seen, {thing.group for thing in things})
+    return _with_bar(snapshot, recording, seen, {thing.group for thing in things}, interpolate=not surface)
 
 
 def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
@@ -92,7 +97,7 @@ def gallery(pages: Sequence[tuple[str, str, float]]) -> str:
     return _template("gallery.html").render(pages=pages)
 
 
-def _bodies(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
+def _particles(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
     """Yield the particles of each body."""
     scene = recording.scene
     stride = -(-len(steps) * scene.particle_count // _POSITIONS)
@@ -103,6 +108,28 @@ def _bodies(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
             {str(step): frame for step, frame in zip(steps, x.astype(np.float32), strict=True)},
             color=_number(BODY_COLORS[number % len(BODY_COLORS)]),
             point_size=_OVERLAP * spacing,
+            roughness=0.9,
+            group="plasticine",
+        )
+
+
+def _surfaces(recording: RecordedRollout, steps: Sequence[int]) -> Iterator[Any]:
+    """Yield the surface of each body."""
+    scene = recording.scene
+    largest = _VERTICES / (len(steps) * len(scene.bodies))
+    for number, (surface, at) in enumerate(zip(body_surfaces(scene), body_slices(scene), strict=True)):
+        vertices, triangles = {}, {}
+        for step in steps:
+            mesh = surface_mesh(surface.field(recording.x[step, at]))
+            if mesh.n_points > largest:
+                mesh = mesh.decimate(1.0 - largest / mesh.n_points)
+            vertices[str(step)] = (np.round(np.asarray(mesh.points) * _LEVELS) / _LEVELS).astype(np.float32)
+            triangles[str(step)] = mesh.regular_faces.astype(np.uint32)
+        yield k3d.mesh(
+            vertices,
+            triangles,
+            color=_number(BODY_COLORS[number % len(BODY_COLORS)]),
+            flat_shading=False,
             roughness=0.9,
             group="plasticine",
         )
@@ -155,7 +182,14 @@ def _mesh(mesh: pv.PolyData, color: str, group: str) -> Any:
     )
 
 
-def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float], groups: set[str]) -> str:
+def _with_bar(
+    snapshot: str,
+    recording: RecordedRollout,
+    camera: Sequence[float],
+    groups: set[str],
+    *,
+    interpolate: bool,
+) -> str:
     """Return K3D-jupyter's page with a title, the bar, and the licences of what is in it."""
     scores = recording.scores
     content = {
@@ -164,6 +198,7 @@ def _with_bar(snapshot: str, recording: RecordedRollout, camera: Sequence[float]
         "scores": None if scores is None else [round(float(score), 3) for score in scores],
         "camera": [round(float(number), 4) for number in camera],
         "aspect": _ASPECT,
+        "interpolate": interpolate,
     }
     title = f"{recording.task}, variant {recording.variant}"
     bar = _template("bar.html").render(
