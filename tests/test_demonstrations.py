@@ -9,12 +9,13 @@ import pytest
 
 import plab.demonstrations as demonstrations
 import synthetic
-from plab.cli.suite import demonstrations as main
 from plab.cli.suite import replay
 from plab.config import Config, build_scene, load_config
-from plab.demonstrations import action_names, known_actions, load_actions, recorded_scores, save_actions
+from plab.demonstrations import known_actions, load_actions, recorded_scores
 from plab.results import config_dict
+from plab.results.table import rows
 from plab.targets import demonstration
+from record_demonstrations import action_names, save_actions
 from synthetic_runs import synthetic_run
 
 TASKS = (
@@ -96,7 +97,7 @@ def test_a_scripted_demonstration_reaches_its_target_and_rest_does_not(device):
         assert item.idle.score < 0.5
 
 
-def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records, capsys):
+def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstration(device, records):
     coarse = [*COARSE[:-1], f"sim.device={device}"]
     better = load_actions("Move", "1")
     results = records / "results"
@@ -109,7 +110,5 @@ def test_the_best_run_of_a_configuration_takes_the_place_of_a_worse_demonstratio
     worse = {v: 0.0 * load_actions("Move", v) for v in VARIANTS}
     for variant, actions in worse.items():
         save_actions("Move", variant, actions, MOVE_NAMES, 0.0)
-    assert main(["--task", "Move", str(results), *coarse]) == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines()[-5:]]
-    assert [float(row[-2]) > 0 for row in rows] == [True, False, False, False, False]
-    assert np.array_equal(load_actions("Move", "1"), worse["1"])  # only --record writes
+    found = better([config("Move", variant, *coarse) for variant in VARIANTS], rows(results)[0])
+    assert [item.scores.score > 0 for item in found] == [True, False, False, False, False]

@@ -163,7 +163,6 @@ TOOLS = [
     (targets, "--task Rope sim.grid_size=7", "sim.grid_size"),
     (targets, "--task Rope method.lr=0.1", "method.lr=0.1"),
     (targets, "--task Rope --rebuild targets.source=files", "--rebuild"),
-    (demonstrations, "--task Move --record sim.grid_size=32", "resolution"),
     (demonstrations, "--task Move nowhere", "nowhere"),
     (submit, "a.h5 --card nowhere.yaml --output a.txt", "nowhere.yaml"),
     (verify, "nowhere", "nowhere"),

@@ -205,7 +205,6 @@ def test_tables_of_several_sources_are_those_of_each(tmp_path: Path) -> None:
 def test_sql_refuses_in_a_line(folder: Path, told) -> None:
     load(folder)
     for sql, named in (
-        ("delete from runs", "select"),
         ("select lr from runs", "lr"),
         ("select * from scores", "evaluations"),
     ):

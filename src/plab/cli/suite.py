@@ -10,22 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from plab.cli.command import Parser, command_line, sources_and_words, task_list, to_write
+from plab.cli.command import Parser, command_line, task_list, to_write
 from plab.cli.tables import print_table, write_csv
-from plab.config import Config, ConfigError, build_scene, load_config
+from plab.config import Config, build_scene, load_config
 from plab.config.compose import check_sources
 from plab.config.run import IDLE
 from plab.config.suite import SUITE_VARIANTS, suite_tasks
 from plab.config.words import require_effect
-from plab.demonstrations import action_names, known_actions, save_actions
+from plab.demonstrations import known_actions
 from plab.files import cache_dir
 from plab.objective import Scores, mass_change, target_sdf
 from plab.problem import Problem, make_targets
-from plab.render.rollouts import stored
-from plab.results.table import Row, readable_rows
 from plab.sim import Simulator
 from plab.targets import EPISODE_STEPS
-from plab.targets.scripted import DECIMALS
 
 
 def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str) -> Namespace:
@@ -34,14 +31,15 @@ def _options(parser: Parser, argv: Sequence[str], idle: Sequence[str], what: str
     add("overrides", nargs="*", help="of the configuration, such as sim.device=cuda")
     add("--task", type=task_list, default=suite_tasks(), help="only these: Torus,Rope")
     options = parser.parse_intermixed_args(argv)
-    options.sources, options.overrides = sources_and_words(options.overrides, default=None)
+    if wrong := [word for word in options.overrides if "=" not in word]:
+        parser.error(f"'{wrong[0]}' is no override: write key=value")
     if taken := [word for word in options.overrides if word.partition("=")[0] in ("task", "variant")]:
         parser.error(f"all variants of the tasks of --task are taken: leave out '{taken[0]}'")
     require_effect(options.overrides, idle, what)
     return options
 
 
-def _configs(task: str, overrides: Sequence[str]) -> list[Config]:
+def variants(task: str, overrides: Sequence[str]) -> list[Config]:
     """Return the configurations of a task's variants, the first of them checked."""
     cfgs = [load_config([f"task={task}", f"variant={variant}", *overrides]) for variant in SUITE_VARIANTS]
     check_sources(cfgs[0])
@@ -53,8 +51,7 @@ def _configs(task: str, overrides: Sequence[str]) -> list[Config]:
 
 @dataclass(frozen=True)
 class ReplayedDemonstration:
-    """A demonstration, actions of shape [T, A], what they reach in the hard contact model, and what doing
-    nothing reaches."""
+    """Actions, shape [T, A], their scores in the hard contact model, and those without motion."""
 
     cfg: Config
     actions: np.ndarray
@@ -64,41 +61,23 @@ class ReplayedDemonstration:
 
 @command_line
 def demonstrations(argv: Sequence[str]) -> None:
-    """Replay and record demonstrations.
+    """Replay the best known actions of the suite and print their scores.
 
-    plab demonstrations                          replay all and print a table
+    plab demonstrations                          all of them
     plab demonstrations --task Torus,Rope        only these
-    plab demonstrations results                  the best runs of some results where they score more
-    plab demonstrations --record                 record what is replayed and what it reaches
 
     Overrides of the configuration, such as sim.device=cuda, may follow.
     """
     parser = Parser("plab demonstrations", demonstrations.__doc__)
-    parser.add_argument("--record", action="store_true", help="record what is replayed")
     options = _options(parser, argv, ("method", "seed", *IDLE), "demonstrations")
-    tasks = [_configs(task, options.overrides) for task in options.task]
-    runs = readable_rows(options.sources)[0] if options.sources else []
-    rows = []
-    for cfgs in tasks:
-        own = [f"task={cfgs[0].task.name}", f"variant={cfgs[0].variant}"]
-        if options.record and build_scene(cfgs[0]) != build_scene(load_config(own)):
-            why = "demonstrations are recorded at the suite's own resolution: leave out what changes it"
-            raise ConfigError(why)
-        replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
-        found = [_found(cfg, runs) for cfg in cfgs]
-        if any(actions is not None for actions in found):
-            pairs = zip(replays, replay(cfgs, found), strict=True)
-            replays = [max(pair, key=lambda item: item.scores.score) for pair in pairs]
-        for item in replays if options.record else ():
-            names = action_names(build_scene(item.cfg))
-            save_actions(item.cfg.task.name, item.cfg.variant, item.actions, names, item.scores.score)
-        rows += [_row(item) for item in replays]
+    tasks = [variants(task, options.overrides) for task in options.task]
+    replays = [item for cfgs in tasks for item in replay(cfgs, [known_actions(cfg) for cfg in cfgs])]
+    rows = [_row(item) for item in replays]
     print_table(list(rows[0]), [list(row.values()) for row in rows])
 
 
 def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list[ReplayedDemonstration]:
-    """Replay actions, shape [T, A] each, of configurations that fit into one batch, and an episode without
-    motion, which takes the place of actions that are None."""
+    """Replay actions, shape [T, A] each, of configurations that fit into one batch; None is no motion."""
     problem = Problem(cfgs)
     problem.simulator.set_contact("hard")
     still = np.zeros((EPISODE_STEPS, problem.simulator.action_dim))
@@ -106,22 +85,6 @@ def replay(cfgs: Sequence[Config], actions: Sequence[np.ndarray | None]) -> list
     reached = problem.rollout(tried, gradient=False).scores
     idle = problem.rollout(np.zeros_like(tried), gradient=False).scores
     return [ReplayedDemonstration(*item) for item in zip(cfgs, tried, reached, idle, strict=True)]
-
-
-def _found(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
-    """Return the actions of the run with the highest score that has a configuration's scene and target,
-    rounded as they are recorded; None without one, or where a script's actions are the demonstration."""
-    if "seed" in cfg.task.target:
-        return None
-    names = cfg.task.name, cfg.variant
-    fitting = [row for row in runs if (row.values["task"], row.values["variant"]) == names]
-    for row in sorted(fitting, key=lambda row: np.nan_to_num(row.values["score_best"]), reverse=True):
-        own = row.config["targets"]["source"] is None and row.config["task"]["target"] == cfg.task.target
-        if own and row.values["status"] == "finished":
-            run, actions = stored(row.path)
-            if build_scene(run) == build_scene(cfg):
-                return np.round(actions, DECIMALS)
-    return None
 
 
 def _row(item: ReplayedDemonstration) -> dict[str, str]:
@@ -181,7 +144,7 @@ def moments(task: str, overrides: Sequence[str] = (), rebuild: bool = False) -> 
         mean distance of the start's mass from the target [domain units], seconds that building took on
         average.
     """
-    cfgs = _configs(task, overrides)
+    cfgs = variants(task, overrides)
     for cfg in cfgs:
         check_sources(cfg)
     sim = cfgs[0].sim

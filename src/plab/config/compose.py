@@ -180,7 +180,7 @@ def _without_hydra(composed: DictConfig) -> DictConfig:
 
 
 def _sets_a_value(override: Override) -> bool:
-    """Whether an override is ``key=value``: no choice of files, addition, removal or setting of Hydra's."""
+    """Return whether an override is ``key=value``: no choice of files, addition, removal or Hydra's key."""
     group = override.key_or_group in GROUPS or "/" in override.key_or_group or override.package is not None
     return override.type is OverrideType.CHANGE and not group and not override.is_hydra_override()
 

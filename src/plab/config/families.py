@@ -58,18 +58,18 @@ class Family:
     """A family of methods: what they have in common, and who carries them out.
 
     Attributes:
-        label: What the methods of the family do, in a few words.
+        label: Short description of its methods.
         config: Type of the section ``method``, a subclass of :class:`plab.config.MethodConfig`.
         runner: Subclass of :class:`plab.runners.Runner`, or its ``module:NAME`` if that module imports a
             large library.
         columns: Columns of the results beside those that all methods have.
         may_be_nan: Those of them with entries for which there is no number.
-        ranking: What the best actions of a run are chosen by: ``loss``, the lowest, or ``score``, the highest
-            (and of several the one of lowest loss).
+        ranking: Criterion of the best actions of a run: ``loss``, the lowest, or ``score``, the highest, and
+            of several the one of lowest loss.
         batching: Whether runs can share a simulator; else each runs alone.
         in_step: Whether those that share one must have the same section ``method``, as agents that learn in
             step with each other.
-        rules: What ``method.algorithm`` or ``method.optimizer`` may say, where there is such a choice.
+        rules: Choices of ``method.algorithm`` or ``method.optimizer``, if there is such a key.
         contact: Contact model in which rows are measured, ``soft`` or ``hard``; None: ``method.contact``.
         kind: :data:`RL`, :data:`GRADIENT`, or empty.
         methods: Appearance of methods by name; others appear in grey, by their names.

@@ -35,8 +35,8 @@ class MethodConfig(ranges.Section):
             hard one.
         softness: Decay rate alpha of the soft contact [1 / domain unit].
         loss_weights: Weights of the step loss by the names of its terms; a term of weight 0 is left out.
-        loss_terms: Which term a weight's name stands for: a key of ``plab.losses.TERMS``, or a class of your
-            own as ``module:Class``.
+        loss_terms: Term of a weight's name: a key of ``plab.losses.TERMS``, or a class of your own as
+            ``module:Class``.
     """
 
     name: str = field(metadata=ranges.NAME)

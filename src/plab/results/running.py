@@ -171,12 +171,12 @@ class RunFile:
 
     @property
     def finished(self) -> bool:
-        """Whether the run is complete, by this process or an earlier one."""
+        """True if the run is complete, by this process or an earlier one."""
         return self._state[0].status == "finished"
 
     @property
     def advanced(self) -> bool:
-        """Whether this process has computed an iteration of the run."""
+        """True if this process has computed an iteration of the run."""
         return self.result.rows > self._known
 
     def release(self) -> None:

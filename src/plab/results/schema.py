@@ -87,7 +87,7 @@ class RunResult:
         best_iteration: Iteration that ran them, -1 if none has.
         best_loss: Their trajectory loss in the contact model of the rollouts.
         evaluation: Scalars of the final evaluation in the hard contact model; empty before it.
-        labels: What the columns of the loss's terms measure, with unit, by column.
+        labels: Meaning and unit of the loss's terms, by column.
         masses: Mass tensors by name (``initial``, ``final``, ``target``), each of shape [n, n, n].
         resume: Nested state from which the run goes on: arrays, numbers, strings; None in finished files.
         path: File this was read from.

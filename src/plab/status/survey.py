@@ -6,22 +6,19 @@ import itertools
 import math
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
-from plab.config.selection import Selection, SelectionError, one_protocol, require_possible
+from plab.config.selection import Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_METHODS, PAPER_SEEDS, SUITE_VARIANTS, suite_tasks
 from plab.results import ResultsError, Row, row_count
 from plab.results.run_file import columns_of, opened, read_progress, split_archive, summary_of
 from plab.results.running import held
 from plab.results.schema import parse_member
 from plab.results.table import readable_rows, sources_of
-
-MOST_RUNS = 100_000
-"""Largest number of runs of a selection."""
 
 STATES = ("done", "running", "interrupted", "failed", "missing")
 """States of a run, best first; ``interrupted`` resumes when its command is given again."""
@@ -149,21 +146,25 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
     Args:
         source: Folder of results, archive, or several.
-        chosen: Which runs: all combinations of what it names with what the results have of the rest.
+        chosen: Choice of runs: all combinations of the values that it names with the existing values of the
+            rest.
         missing: Ask for the suite's tasks and variants, too, where ``chosen`` leaves them open, with the
             methods and seeds that the results have, or the paper's if there are none.
 
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
-        SelectionError: If there are runs of several protocols, or more are asked for than a sweep has.
-        plab.config.ConfigError: If no run can be of the choice.
+        SelectionError: If there are runs of several protocols, or no run can be of the choice.
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
     fitting = [row for row in found if chosen(row.values, row.config)]
     protocol = one_protocol(row.config for row in fitting)
-    begun = [key for root in sources_of(source) for key in _begun(root)]
-    runs = {key: Run(*key) for key in _expected(fitting, begun, chosen, missing)}
+    begun = {key for root in sources_of(source) for key in _begun(root)}
+    present = {_key(row.values) for row in fitting}
+    if not chosen.keys:
+        # Of a run without a file only its name is known.
+        present |= {key for key in begun if chosen(dict(zip(NAMES, key, strict=True)), {})}
+    runs = {key: Run(*key) for key in _expected(present, chosen, missing)}
     others = 0
     for row in fitting:
         run = runs.get(_key(row.values))
@@ -171,11 +172,10 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
         others += run is None or run.state != "missing"
         if run is not None:
             _take(run, row)
-    for key in begun:
-        if key in runs and runs[key].state not in ("done", "running"):
-            runs[key].state = "running"
     groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
-    for run in runs.values():
+    for key, run in runs.items():
+        if key in begun and run.state != "done":
+            run.state = "running"
         groups[run.task, run.method].append(run)
     return Survey(
         list(runs.values()),
@@ -186,47 +186,27 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
     )
 
 
-def _expected(found: Sequence[Row], begun: Sequence[Key], chosen: Selection, missing: bool) -> list[Key]:
-    present = list(dict.fromkeys(_key(row.values) for row in found))
-    if not chosen.keys:
-        # Of a run without a file only its name is known.
-        present += [
-            key
-            for key in dict.fromkeys(begun)
-            if key not in present and chosen(dict(zip(NAMES, key, strict=True)), {})
-        ]
+def _expected(present: Collection[Key], chosen: Selection, missing: bool) -> list[Key]:
+    """Return the runs that are asked for, by task, method, variant and seed."""
+    tasks, free = suite_tasks(), [[[part] for part in key] for key in present]
     if missing or (not present and chosen.choices):
         methods, seeds = ({key[number] for key in present} for number in (2, 3))
-        free = {
-            "task": suite_tasks(),
-            "variant": list(SUITE_VARIANTS),
-            "method": sorted(methods, key=lambda name: _place(name, PAPER_METHODS)) or list(PAPER_METHODS),
-            "seed": sorted(seeds, key=int) or list(PAPER_SEEDS),
-        }
-        asked = {tuple(tuple(chosen.choices.get(name, free[name])) for name in NAMES)}
-    else:
-        # Values on the command line take the place of those that a run has.
-        asked = {
-            tuple(tuple(chosen.choices.get(name, [own])) for name, own in zip(NAMES, key, strict=True))
-            for key in present
-        }
-    count = sum(math.prod(map(len, names)) for names in asked)
-    if count > MOST_RUNS:
-        raise SelectionError(f"that is a choice of {count} runs: at most {MOST_RUNS} do, give fewer values")
-    keys = dict.fromkeys(cast(Key, key) for names in asked for key in itertools.product(*names))
-    return list(keys) if len(asked) == 1 else sorted(keys, key=_rank)
+        free = [[tasks, list(SUITE_VARIANTS), list(methods or PAPER_METHODS), list(seeds or PAPER_SEEDS)]]
 
+    def place(name: str, known: Sequence[str]) -> tuple[int, str]:
+        return known.index(name) if name in known else len(known), name
 
-def _place(name: str, known: Sequence[str]) -> tuple[int, str]:
-    return (known.index(name), "") if name in known else (len(known), name)
+    def rank(key: Key) -> tuple[Any, ...]:
+        task, variant, method, seed = key
+        orders = place(task, tasks), place(method, PAPER_METHODS), place(variant, SUITE_VARIANTS)
+        return *orders, len(seed), seed
 
-
-def _rank(key: Key) -> tuple[Any, ...]:
-    """Return the position of a run in tables: by task, method, variant and seed."""
-    task, variant, method, seed = key
-    number = int(seed) if seed.isdecimal() else -1
-    orders = (task, suite_tasks()), (method, PAPER_METHODS), (variant, SUITE_VARIANTS)
-    return *(_place(name, list(known)) for name, known in orders), number, seed
+    # Values on the command line take the place of those that a run has.
+    asked = (
+        [chosen.choices.get(name, own) for name, own in zip(NAMES, values, strict=True)] for values in free
+    )
+    keys = {cast(Key, key) for values in asked for key in itertools.product(*values)}
+    return sorted(keys, key=rank)
 
 
 def _key(values: Mapping[str, Any]) -> Key:
@@ -255,7 +235,7 @@ def _take(run: Run, row: Row) -> None:
 
 
 def _begun(source: Path) -> Iterable[Key]:
-    """Yield runs that somebody computes, also those that have no file yet."""
+    """Yield runs under way, also those that have no file yet."""
     for lock in source.rglob("*.lock") if source.is_dir() else ():
         names = parse_member(lock)
         if names is not None and held(lock.with_suffix(".h5")):

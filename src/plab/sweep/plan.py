@@ -29,10 +29,10 @@ def plan(
 
     Args:
         cfgs: The composed and checked configurations.
-        size: Runs of a batch, at most; if None as many as fit: trajectories and planners ``sim.memory_mb``,
-            agents half of the device's memory.
-        processes: How many carry out batches at a time: each is to have one, if there are runs enough.
-        sharing: How many of these share a device, and its memory.
+        size: Largest number of runs in a batch; None: as many as fit, trajectories and planners in
+            ``sim.memory_mb``, agents in half of the device's memory.
+        processes: Number of processes, each of which is to have a batch if there are runs enough.
+        sharing: Number of processes that share a device, and its memory.
 
     Returns:
         Batches, each as evenly filled as the others of its kind.
@@ -48,7 +48,7 @@ def plan(
 
 
 def _kind(cfg: Config, scene: Scene) -> list[Any]:
-    """Return what has to be the same in runs that come one after the other or, in one batch, together."""
+    """Return the settings that runs of a batch, or successive batches of one, have in common."""
     method = asdict(cfg.method)
     loss = [method["loss_weights"], method["loss_terms"]]
     shared = [asdict(cfg.protocol), asdict(cfg.sim), asdict(cfg.targets)]

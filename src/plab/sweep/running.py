@@ -172,9 +172,9 @@ def run_batches(
     Args:
         cfgs: Their configurations.
         carry: Carries out batches.
-        size: Runs of a batch, at most; None: as many as fit the memory.
-        processes: Batches that are carried out at a time.
-        sharing: How many of these use one device.
+        size: Largest number of runs in a batch; None: as many as fit the memory.
+        processes: Number of batches carried out at a time.
+        sharing: Number of these that use one device.
     """
     # The same run given twice is one run.
     wanted = {str(cfg.path): cfg for cfg in cfgs}
