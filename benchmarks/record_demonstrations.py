@@ -26,7 +26,7 @@ from plab.results.table import Row, readable_rows
 from plab.scenes import MANIPULATOR_SHAPES, Scene
 from plab.targets.scripted import DECIMALS
 
-__all__ = ["action_names", "best_actions", "main", "save_actions"]
+__all__ = ["action_names", "best_actions", "best_known", "main", "save_actions"]
 
 
 def best_actions(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
@@ -45,7 +45,7 @@ def best_actions(cfg: Config, runs: Sequence[Row]) -> np.ndarray | None:
     return None
 
 
-def better(cfgs: Sequence[Config], runs: Sequence[Row]) -> list[ReplayedDemonstration]:
+def best_known(cfgs: Sequence[Config], runs: Sequence[Row]) -> list[ReplayedDemonstration]:
     """Replay known actions and those of runs, and return the better ones of each configuration."""
     replays = replay(cfgs, [known_actions(cfg) for cfg in cfgs])
     found = [best_actions(cfg, runs) for cfg in cfgs]
@@ -105,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         cfgs = variants(task, words)
         if build_scene(cfgs[0]) != build_scene(load_config([f"task={task}", "variant=1"])):
             raise ConfigError("only the suite's own resolution is recorded: leave out what changes it")
-        for item in better(cfgs, runs):
+        for item in best_known(cfgs, runs):
             names, score = action_names(build_scene(item.cfg)), item.scores.score
             save_actions(task, item.cfg.variant, item.actions, names, score)
             print(f"{task}-v{item.cfg.variant}: {score:.3f}")

@@ -80,7 +80,7 @@ COMPOSED = {
     # syntax
     "Rope": "'Rope'",
     "seed='": "seed='",
-    "~seed": "~seed",
+    "~seed": "seed",
     # no effect
     "seed_scene=3": "seed_scene=3",
     "task.random.ranges.pillar.low=[0,0,0]": "task.random.ranges.pillar.low",

@@ -16,7 +16,8 @@ from scipy import stats
 import synthetic
 from plab.cli.report import main
 from plab.config import load_config
-from plab.config.selection import SelectionError, select
+from plab.config.selection import select
+from plab.errors import ArgumentError
 from plab.report.collect import NAMES, MixedRunsError, Runs, Setting, changed_settings, collect
 from plab.report.formats import NOTHING, Table, number
 from plab.report.hyperparameters import hyperparameters
@@ -201,7 +202,7 @@ def test_protocols_are_not_mixed(tmp_path: Path) -> None:
         "task.yield_stress": own.task.yield_stress,
     }
     save(tmp_path, released, seed=1)
-    with pytest.raises(SelectionError, match=r"plab and release: .* protocol\.name=plab"):
+    with pytest.raises(ArgumentError, match=r"plab and release: .* protocol\.name=plab"):
         gather(tmp_path)
     ours, theirs = gather(tmp_path, "protocol.name=plab"), gather(tmp_path, "protocol.name=release")
     assert (len(ours.table), ours.protocol) == (1, "plab")

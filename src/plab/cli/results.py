@@ -24,8 +24,8 @@ from plab.cli.command import (
     sources_and_words,
 )
 from plab.cli.tables import print_table
-from plab.config.selection import Selection, SelectionError, require_possible, select
-from plab.errors import tell
+from plab.config.selection import Selection, require_possible, select
+from plab.errors import ArgumentError, tell
 from plab.results.archive import pack, unpack
 from plab.results.checking import check
 from plab.results.query import query, scores
@@ -110,7 +110,7 @@ def _pack(argv: Sequence[str]) -> None:
     chosen = select(words, SELECTABLE)
     for text in chosen.choices.get("status", ()):
         if text not in (*STATUSES, "all"):
-            raise SelectionError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
+            raise ArgumentError(f"status '{text}' does not exist; choose from: {', '.join(STATUSES)}, all")
     if words:
         others = {name: texts for name, texts in chosen.choices.items() if name != "status"}
         require_possible(Selection(others, chosen.keys), readable_rows(sources)[0])

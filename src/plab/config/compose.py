@@ -186,7 +186,7 @@ def _sets_a_value(override: Override) -> bool:
 
 
 def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) -> None:
-    """Refuse what Hydra takes but what makes no sense here, before it composes anything.
+    """Refuse choices of files that Hydra would misread, before it composes anything.
 
     Args:
         words: Prepared overrides.
@@ -194,24 +194,18 @@ def check_overrides(words: Sequence[str], config_dir: str | Path | None = None) 
             see :mod:`plab.plugins`.
 
     Raises:
-        ConfigError: If a key is to be removed, a group is not given exactly one choice, or the folder does
-            not do.
+        ConfigError: If a group is not given exactly one choice, or the folder cannot be used.
     """
     if config_dir is not None:
         _check_config_dir(config_dir)
         search_in(Path(config_dir).expanduser())
     for override in parse(words):
         key, text = override.key_or_group, str(override.input_line)
-        if not key:
-            raise ConfigError(f"cannot read '{text}': write key=value")
-        if override.is_delete():
-            raise ConfigError(f"'{text}': keys cannot be removed, only set")
-        if key in GROUPS and override.package is None and override.type is not OverrideType.CHANGE:
-            raise ConfigError(f"'{text}': write {text.lstrip('+')}")
-        if key == EXPERIMENT and not override.is_add():
-            raise ConfigError(f"'{text}': write +{text}")
-        one = isinstance(override.value(), str) or (override.is_sweep_override() and key != EXPERIMENT)
-        if key in (*GROUPS, EXPERIMENT) and override.package is None and not one:
+        if key not in (*GROUPS, EXPERIMENT) or override.package is not None:
+            continue
+        if override.is_add() != (key == EXPERIMENT):
+            raise ConfigError(f"'{text}': write {'+' * (key == EXPERIMENT)}{text.lstrip('+')}")
+        if not isinstance(override.value(), str) and (key == EXPERIMENT or not override.is_sweep_override()):
             raise ConfigError(f"'{text}': name one {key}; choose from: {', '.join(choices(key, config_dir))}")
 
 
@@ -384,7 +378,7 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
         raise ConfigError(f"{path}.family has no value: name the family, or its module:NAME")
     if isinstance(stages := method.get("stages"), DictConfig):
         for name in stages:
-            stages[name] = _typed_method(stages[name], f"{path}.stages.{name}")
+            stages[name] = _typed_method(stages[name], f"{path}.stages.{name!s}")
     kind = family(str(method.family)).config_type(method.get("algorithm"))
     # Below a root, so that what is wrong is named by its whole key.
     root = OmegaConf.create({})

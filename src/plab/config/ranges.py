@@ -36,30 +36,10 @@ def at_least(path: str, value: float, low: float, *, finite: bool = False) -> No
         raise ConfigError(f"{path} must be at least {limit}, not {value:g}")
 
 
-def _interval(path: str, value: float, text: str, holds: Callable[[float], bool]) -> None:
-    if not holds(value):
-        raise ConfigError(f"{path} must be in {text}, not {value:g}")
-
-
-def _is_fraction(value: float) -> bool:
-    return 0 <= value < 1
-
-
 def vector(path: str, value: Sequence[float], length: int) -> None:
     """Raise :class:`ConfigError` unless there are ``length`` finite numbers."""
     if len(value) != length or not all(math.isfinite(entry) for entry in value):
         raise ConfigError(f"{path} must be {length} finite numbers, not {list(value)}")
-
-
-def _decays(path: str, value: Sequence[float]) -> None:
-    vector(path, value, 2)
-    for decay in value:
-        _interval(path, decay, "[0, 1)", _is_fraction)
-
-
-def _widths(path: str, value: Sequence[int]) -> None:
-    for width in value:
-        at_least(path, width, 1)
 
 
 def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str, Any]:
@@ -67,14 +47,23 @@ def within(check: Callable[..., None], *limits: Any, **options: Any) -> dict[str
     return {"check": lambda path, value: check(path, value, *limits, **options)}
 
 
-POSITIVE = within(positive)
+def _in_range(text: str, holds: Callable[[Any], bool]) -> dict[str, Any]:
+    def check(path: str, value: Any) -> None:
+        if not holds(value):
+            raise ConfigError(f"{path} must be {text}, not {value}")
+
+    return {"check": check}
+
+
+POSITIVE, POINT, NAME = within(positive), within(vector, 3), within(folder_name)
 COUNT, NOT_NEGATIVE = within(at_least, 1), within(at_least, 0)
 FINITE = within(at_least, 0, finite=True)
-FRACTION = within(_interval, "[0, 1)", _is_fraction)
-SHARE = within(_interval, "(0, 1]", lambda value: 0 < value <= 1)
-UNIT = within(_interval, "[0, 1]", lambda value: 0 <= value <= 1)
-POINT, DECAYS = within(vector, 3), within(_decays)
-NAME, THREADS, WIDTHS = within(folder_name), COUNT, within(_widths)
+FRACTION = _in_range("in [0, 1)", lambda value: 0 <= value < 1)
+SHARE = _in_range("in (0, 1]", lambda value: 0 < value <= 1)
+UNIT = _in_range("in [0, 1]", lambda value: 0 <= value <= 1)
+DECAYS = _in_range("two numbers in [0, 1)", lambda value: len(value) == sum(0 <= v < 1 for v in value) == 2)
+WIDTHS = _in_range("numbers of at least 1", lambda value: all(width >= 1 for width in value))
+THREADS = COUNT
 """Metadata of fields; FINITE is at least 0, too, THREADS and WIDTHS are of torch and of its layers."""
 
 

@@ -9,14 +9,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from plab.config.suite import SUITE_VARIANTS, group_names
-from plab.errors import PlabError, pick
+from plab.errors import ArgumentError, pick
 
 OBSERVED = ("observe_particles", "observe_target")
 """Keys of a configuration that say which numbers an observation holds."""
-
-
-class SelectionError(PlabError, ValueError):
-    """Words that select nothing meaningful; the message is one line that says what would do."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
         names: Names that runs are chosen by; every dotted name is a key of the configuration.
 
     Raises:
-        SelectionError: If a word is of another name, or changes more than a value.
+        ArgumentError: If a word is of another name, or changes more than a value.
         ConfigError: If a word cannot be read, or gives no value.
     """
     if not words:
@@ -61,22 +57,20 @@ def select(words: Sequence[str], names: Sequence[str]) -> Selection:
     for override in parse(prepared(words)):
         name, word = override.key_or_group, override.input_line
         if "." not in name and name not in names:
-            raise SelectionError(
-                f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key"
-            )
+            raise ArgumentError(f"'{word}' selects nothing; choose from: {', '.join(names)}, or a dotted key")
         if override.type is not OverrideType.CHANGE or override.package is not None:
-            raise SelectionError(f"'{word}' selects nothing: write name=value or name=value,value")
+            raise ArgumentError(f"'{word}' selects nothing: write name=value or name=value,value")
         (chosen.keys if "." in name else chosen.choices)[name] = swept(override, group_names(name))
     return chosen
 
 
 def one_protocol(configs: Iterable[Mapping[str, Any]]) -> str:
     """Return the name of the protocol that runs have in common, plab's own where there are none;
-    SelectionError if there are several: they are not to be pooled."""
+    ArgumentError if there are several: they are not to be pooled."""
     names = sorted({str(lookup(config, "protocol.name")) for config in configs}) or ["plab"]
     if len(names) > 1:
         advice = f"choose one, for example protocol.name={names[0]}"
-        raise SelectionError(f"there are runs of the protocols {' and '.join(names)}: {advice}")
+        raise ArgumentError(f"there are runs of the protocols {' and '.join(names)}: {advice}")
     return names[0]
 
 
@@ -99,7 +93,7 @@ def _same(value: Any, text: str) -> bool:
 
 
 def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
-    """Raise SelectionError for a value that none of the :class:`plab.results.Row` has and no run of the suite
+    """Raise ArgumentError for a value that none of the :class:`plab.results.Row` has and no run of the suite
     could have, such as a misspelt task: it is a mistake, not an empty table."""
     for name, texts in chosen.choices.items():
         present = {str(run.values[name]) for run in runs}
@@ -108,10 +102,10 @@ def require_possible(chosen: Selection, runs: Sequence[Any]) -> None:
             if text in present or text in known or re.fullmatch(_OPEN.get(name, "(?!)"), text):
                 continue
             advice = pick(text, sorted({*known, *present})) if known or present else "there are no runs"
-            raise SelectionError(f"{name} '{text}' does not exist; {advice}")
+            raise ArgumentError(f"{name} '{text}' does not exist; {advice}")
     for key in chosen.keys:
         if runs and not any(lookup(run.config, key) == lookup(run.config, key) for run in runs):
-            raise SelectionError(f"no run has the key '{key}'")
+            raise ArgumentError(f"no run has the key '{key}'")
 
 
 _OPEN = {"variant": r"random\d+", "seed": r"\d+"}

@@ -13,9 +13,9 @@ from typing import Any
 
 import pandas as pd
 
-from plab.config.selection import OBSERVED, Selection, SelectionError, one_protocol, require_possible
+from plab.config.selection import OBSERVED, Selection, one_protocol, require_possible
 from plab.config.suite import PAPER_SEEDS, SUITE_VARIANTS, shipped_file, suite_tasks
-from plab.errors import PlabError
+from plab.errors import ArgumentError, PlabError
 from plab.report.methods import method, ordered, part
 from plab.results import Row, lookup, rows
 from plab.results.running import held
@@ -159,7 +159,7 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
 
     Raises:
         MixedRunsError: If runs of one mean differ in their settings, or there are two of one seed.
-        plab.config.selection.SelectionError: If there are runs of several protocols, or no runs differ in
+        plab.errors.ArgumentError: If there are runs of several protocols, or no runs differ in
             ``split``.
         plab.config.ConfigError: If no run can be of the choice.
         plab.results.ResultsError: If there is nothing at ``source``, or files or archives of which none
@@ -256,7 +256,7 @@ def _split(found: Sequence[Row], key: str, places: Sequence[Path]) -> tuple[list
         (name, text) for name, own in seen.items() if len(own) > 1 for text in sorted(own, key=_by_number)
     ]
     if not several:
-        raise SelectionError(
+        raise ArgumentError(
             f"no method has runs that differ in {key}: split by a key in which they do, such as method.lr, "
             "or by folder or seed"
         )
@@ -282,7 +282,7 @@ def _split_value(row: Row, key: str, places: Sequence[Path]) -> str:
     if key == "folder":
         return next(str(place) for place in places if row.path.is_relative_to(place))
     if "." not in key:
-        raise SelectionError(
+        raise ArgumentError(
             f"cannot split by '{key}': give a dotted key such as method.lr, or folder or seed"
         )
     value = lookup(row.config, key)

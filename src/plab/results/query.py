@@ -9,17 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from plab.config.selection import Selection, SelectionError, lookup
-from plab.errors import PlabError
+from plab.config.selection import Selection, lookup
+from plab.errors import ArgumentError
 from plab.results.schema import ResultsError
 from plab.results.table import COLUMNS, Row, read_curves, readable_rows, sources_of, warn_of
 
 if TYPE_CHECKING:
     import duckdb
-
-
-class QueryError(PlabError, ValueError):
-    """A query that cannot be answered; the message is one line that says why."""
 
 
 def connect(
@@ -51,7 +47,7 @@ def query(
         Names of the columns, the rows, and what could not be read, hence is not in them.
 
     Raises:
-        QueryError: If it is no query, or wrong.
+        ArgumentError: If it is no query, or wrong.
         ResultsError: As for :func:`connect`.
     """
     import duckdb
@@ -65,7 +61,7 @@ def query(
     except duckdb.Error as error:
         # Without hints and the drawing of the place in the query.
         first = " ".join(str(error).partition("\n")[0].split())
-        raise QueryError(f"{first}; there are the tables {', '.join(_TABLES)}") from None
+        raise ArgumentError(f"{first}; there are the tables {', '.join(_TABLES)}") from None
 
 
 def scores(
@@ -90,7 +86,7 @@ def scores(
         plab's own), status, score and ``keys``; ``score`` as in :func:`plab.results.load`.
 
     Raises:
-        SelectionError: If no run has one of ``keys``, or there is no column of ``sort``.
+        ArgumentError: If no run has one of ``keys``, or there is no column of ``sort``.
         ResultsError: If there is nothing at ``source``, or files or archives of which none can be read.
     """
     found, unreadable = readable_rows(source)
@@ -98,9 +94,9 @@ def scores(
     columns = list(dict.fromkeys((*_NAMES, *_SETTINGS, "status", "score", *keys)))
     table = pd.DataFrame([[_value(row, name) for name in columns] for row in fitting], columns=columns)
     if strange := [key for key in keys if fitting and table[key].map(lambda value: value is None).all()]:
-        raise SelectionError(f"no run has '{strange[0]}': give columns of plab.results.load, or dotted keys")
+        raise ArgumentError(f"no run has '{strange[0]}': give columns of plab.results.load, or dotted keys")
     if missing := [name for name in sort if name not in columns]:
-        raise SelectionError(
+        raise ArgumentError(
             f"there is no column '{missing[0]}' to sort by; choose from: {', '.join(columns)}"
         )
     by = [*sort, *(name for name in _NAMES if name not in sort)]

@@ -153,7 +153,7 @@ def survey(source: str | Path | Sequence[str | Path], chosen: Selection, *, miss
 
     Raises:
         ResultsError: If there is nothing at ``source``, or it is a file or archive that cannot be read.
-        SelectionError: If there are runs of several protocols, or no run can be of the choice.
+        ArgumentError: If there are runs of several protocols, or no run can be of the choice.
     """
     found, unreadable = readable_rows(source)
     require_possible(chosen, found)
