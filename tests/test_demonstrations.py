@@ -15,7 +15,7 @@ from plab.demonstrations import known_actions, load_actions, recorded_scores
 from plab.results import config_dict
 from plab.results.table import rows
 from plab.targets import demonstration
-from record_demonstrations import action_names, save_actions
+from record_demonstrations import action_names, best_known, save_actions
 from synthetic_runs import synthetic_run
 
 TASKS = (
