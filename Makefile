@@ -35,7 +35,7 @@ BIN := $(VENV)/bin
 # A file of tests stays in one process, which compiles its kernels once. A test that hangs is ended after 15 minutes.
 PARALLEL = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -p no:benchmark --durations=20 -o faulthandler_timeout=900 -o faulthandler_exit_on_timeout=true
 
-.PHONY: run dev test test-all test-gpu lint typecheck coverage benchmark docs docs-serve bitcode build clean system-packages \
+.PHONY: run dev test test-all test-gpu lint typecheck coverage benchmark docs docs-serve build clean system-packages \
 	tex-packages browser-packages tables curves report html
 
 run: $(VENV)/.run.stamp
@@ -79,10 +79,6 @@ docs-serve: $(VENV)/.docs.stamp
 build: $(VENV)/.dev.stamp
 	$(BIN)/python -m build
 	PYTHON=$(BIN)/python tools/check_wheel.sh
-
-# What sim/cuda_sums.py and sim/cpu_tiles.py call.
-bitcode: $(VENV)/.dev.stamp
-	$(BIN)/python tools/bitcode.py
 
 system-packages:
 	apt-get install -y --no-install-recommends libegl1 libgl1-mesa-dri

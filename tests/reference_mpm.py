@@ -14,6 +14,7 @@ particular): differentiate from a start whose deformation gradients have distinc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -82,8 +83,8 @@ def _unit_rotations(poses: Tensor) -> Tensor:
 def substep(scene: Scene, state: State, action: Tensor, alpha: float) -> State:
     """Advance by one substep of an environment step's action [A]; alpha is soft contact's stiffness, or 0."""
     F_trial = (_identity() + scene.dt * state.C) @ state.F
-    F, R = return_mapping(scene, F_trial)
-    momentum, mass = _particles_to_grid(scene, state, kirchhoff_stress(scene, F, R))
+    F, tau = material_update(scene, F_trial, state.C)
+    momentum, mass = _particles_to_grid(scene, state, tau)
     end_poses = move_manipulators(scene, state.poses, action)
     velocity = _grid_update(scene, momentum, mass, state.poses, end_poses, alpha)
     v, C = _grid_to_particles(scene, state.x, velocity)
@@ -124,6 +125,100 @@ def kirchhoff_stress(scene: Scene, F: Tensor, R: Tensor) -> Tensor:
     mu = _of_particles(scene, len(F), [m.shear_modulus for m in scene.materials])[..., None]
     lam = _of_particles(scene, len(F), [m.lame_lambda for m in scene.materials])[..., None]
     return 2.0 * mu * (F - R) @ F.mT + lam * J * (J - 1.0) * _identity()
+
+
+def material_update(scene: Scene, F_trial: Tensor, C: Tensor) -> tuple[Tensor, Tensor]:
+    """F after the substep and Kirchhoff stress, each body's under its law, both [particle, 3, 3]."""
+    if set(scene.laws) == {"von_mises"}:
+        F, R = return_mapping(scene, F_trial)
+        return F, kirchhoff_stress(scene, F, R)
+    counts = [body.particles for body in scene.bodies]
+    parts = []
+    for body, G, c in zip(scene.bodies, F_trial.split(counts), C.split(counts), strict=True):
+        alone = replace(scene, bodies=(body,))
+        if alone.laws == ("von_mises",):
+            parts.append(material_update(alone, G, c))
+        else:
+            parts.append(LAWS[alone.laws[0]](scene.dt, G, c, **alone.materials[0].values))
+    F, tau = (torch.cat(part) for part in zip(*parts, strict=True))
+    return F, tau
+
+
+def _lame(youngs_modulus: float, poisson_ratio: float) -> tuple[float, float]:
+    nu = poisson_ratio
+    return youngs_modulus / (2.0 * (1.0 + nu)), youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+def _elastic(_dt: float, G: Tensor, _C: Tensor, **elasticity: float) -> tuple[Tensor, Tensor]:
+    """Neo-Hookean: tau = mu (b - I) + lambda J (J - 1) I."""
+    mu, lam = _lame(**elasticity)
+    J = torch.linalg.det(G)[:, None, None]
+    return G, mu * (G @ G.mT - _identity()) + lam * J * (J - 1.0) * _identity()
+
+
+def _fluid(_dt: float, G: Tensor, C: Tensor, bulk_modulus: float, viscosity: float) -> tuple[Tensor, Tensor]:
+    """Pressure K (1 - J), viscous stress 2 eta dev D; F = diag(J, 1, 1)."""
+    J = torch.linalg.det(G)
+    D = 0.5 * (C + C.mT)
+    D = D - D.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None] * _identity()
+    tau = J[:, None, None] * (bulk_modulus * (J[:, None, None] - 1.0) * _identity() + 2.0 * viscosity * D)
+    return torch.diag_embed(torch.stack([J, torch.ones_like(J), torch.ones_like(J)], dim=1)), tau
+
+
+def _hencky(G: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """U, V^T, trace and deviator of the Hencky strains, and the deviator's norm."""
+    U, S, Vt = proper_svd(G)
+    e = S.clamp(min=MIN_SINGULAR_VALUE).log()
+    trace = e.sum(dim=-1, keepdim=True)
+    d = e - trace / 3.0
+    return U, Vt, trace, d, ((d * d).sum(dim=-1, keepdim=True) + 1e-16).sqrt()
+
+
+def _returned(
+    G: Tensor, U: Tensor, k: Tensor, d: Tensor, mu: float, pressure: Tensor
+) -> tuple[Tensor, Tensor]:
+    """F and stress of Hencky elasticity after the deviator is scaled by k."""
+    tau = (U * (2.0 * mu * k * d + pressure)[..., None, :]) @ U.mT
+    return (U * ((k - 1.0) * d).exp()[..., None, :]) @ U.mT @ G, tau
+
+
+def _drucker_prager(
+    _dt: float, G: Tensor, _C: Tensor, friction_angle: float, **elasticity: float
+) -> tuple[Tensor, Tensor]:
+    """Deviator of at most alpha times the pressure; nothing in tension."""
+    mu, lam = _lame(**elasticity)
+    U, _Vt, trace, d, norm = _hencky(G)
+    sine = math.sin(math.radians(friction_angle))
+    alpha = math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
+    trace = trace.clamp(max=0.0)
+    k = (-alpha * (3.0 * lam + 2.0 * mu) / (2.0 * mu) * trace / norm).clamp(max=1.0)
+    return _returned(G, U, k, d, mu, (lam + 2.0 * mu / 3.0) * trace)
+
+
+def _viscoplastic(
+    dt: float,
+    G: Tensor,
+    _C: Tensor,
+    yield_stress: float,
+    consistency: float,
+    exponent: float,
+    **elasticity: float,
+) -> tuple[Tensor, Tensor]:
+    """Bingham flow: the overstress falls by 2 mu dt times the plastic rate, overstress / (2 consistency)."""
+    assert exponent == 1.0
+    mu, lam = _lame(**elasticity)
+    U, _Vt, trace, d, norm = _hencky(G)
+    over = (2.0 * mu * norm - yield_stress).clamp(min=0.0)
+    k = 1.0 - (over - over / (1.0 + mu * dt / consistency)) / (2.0 * mu * norm)
+    return _returned(G, U, k, d, mu, (lam + 2.0 * mu / 3.0) * trace)
+
+
+LAWS = {
+    "elastic": _elastic,
+    "fluid": _fluid,
+    "drucker_prager": _drucker_prager,
+    "viscoplastic": _viscoplastic,
+}
 
 
 def _of_particles(scene: Scene, count: int, values: list[float]) -> Tensor:

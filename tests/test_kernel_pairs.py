@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import suite
+from plab.laws import LAWS
 from plab.scenes import Body
 from plab.sim.compiler import address_of, ti
 from plab.sim.cpu_engine import CpuPhases
@@ -23,7 +24,8 @@ pytestmark = pytest.mark.skipif(suite.DEVICE != "cpu", reason="on CUDA the refer
 
 BODIES = [
     Body("box", (0.48, 0.3, 0.5), (0.2, 0.2, 0.2), 40, youngs_modulus=9000.0, yield_stress=math.inf),
-    Body("box", (0.5, 0.3, 0.52), (0.2, 0.2, 0.2), 115, poisson_ratio=0.1),
+    Body("box", (0.5, 0.3, 0.52), (0.2, 0.2, 0.2), 75, poisson_ratio=0.1),
+    *(Body("box", (0.5, 0.3, 0.5), (0.2, 0.2, 0.2), 10, law=law) for law in LAWS if law != "von_mises"),
 ]
 # Most particles of the second environment leave the range of the series.
 SCENES = [

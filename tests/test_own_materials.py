@@ -64,7 +64,7 @@ def test_a_body_has_the_values_of_its_task_and_its_own():
     scene = build_scene(example())
     dough, cushion = scene.materials
     assert (dough.youngs_modulus, dough.poisson_ratio, dough.yield_stress) == (5000.0, 0.2, 50.0)
-    assert vars(cushion) == RUBBER
+    assert cushion.values == RUBBER
     yields = build_scene(example("variant=3", "task.poisson_ratio=0.1")).materials
     assert [m.yield_stress for m in yields] == [50.0, 50.0] and yields[0].poisson_ratio == 0.1
     # Without a value of its own again.

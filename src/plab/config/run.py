@@ -234,8 +234,8 @@ def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
     bodies = lookup(plain, "task.bodies")
     for body in bodies.values() if isinstance(bodies, dict) else ():
-        for key in ("file", "sha256", *MATERIAL_KEYS):
-            if isinstance(body, dict) and body.get(key, "") is None:
+        for key in ("file", "sha256", *MATERIAL_KEYS, "law", "parameters"):
+            if isinstance(body, dict) and body.get(key, "") in (None, {}):
                 del body[key]
     return plain
 

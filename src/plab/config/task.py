@@ -9,6 +9,7 @@ from typing import Any
 from plab.config import ranges
 from plab.errors import ConfigError
 from plab.files import ShapeError, pinned
+from plab.laws import find_law
 from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
 from plab.targets import TargetError, make_recipe
 
@@ -29,6 +30,9 @@ class BodyConfig(ranges.Section):
         youngs_modulus: Young's modulus E; the task's where it is not given, and so on.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` never yields.
+        law: Constitutive law: a key of :data:`plab.laws.LAWS`, or ``module:NAME`` of your own; ``von_mises``
+            where it is not given.
+        parameters: Other parameters of the law, by name; its defaults where they are not given.
     """
 
     shape: str
@@ -40,6 +44,8 @@ class BodyConfig(ranges.Section):
     youngs_modulus: float | None = field(default=None, metadata=ranges.POSITIVE)
     poisson_ratio: float | None = None
     yield_stress: float | None = field(default=None, metadata=ranges.NOT_NEGATIVE)
+    law: str | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
 
     def build(self, particles_scale: float = 1.0) -> Body:
         """Return the scene's body, with ``particles_scale`` times the particles, but at least one.
@@ -49,7 +55,7 @@ class BodyConfig(ranges.Section):
             plab.files.ShapeError: If the file does not do.
         """
         particles = max(1, round(self.particles * particles_scale))
-        material = {key: getattr(self, key) for key in MATERIAL_KEYS}
+        material = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law", "parameters")}
         return make_body(self.shape, self.center, self.size, particles, self.file, self.sha256, **material)
 
 
@@ -217,7 +223,8 @@ class TaskConfig(ranges.Section):
         for name, body in self.bodies.items():
             try:
                 bodies.append(body.build(particles_scale))
-            except (SceneError, ShapeError) as error:
+                find_law(bodies[-1].law or "von_mises")
+            except (ConfigError, SceneError, ShapeError) as error:
                 raise ConfigError(f"task.bodies.{name}: {error}") from None
         return tuple(bodies)
 

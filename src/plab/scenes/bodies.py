@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plab.errors import PlabError
+from plab.laws import Law, find_law
 
 if TYPE_CHECKING:
     from plab.scenes.mesh import Mesh
@@ -30,7 +31,8 @@ BODY_SHAPES = ("sphere", "box", "mesh")
 """Values of :attr:`Body.shape`."""
 
 MATERIAL_KEYS = ("youngs_modulus", "poisson_ratio", "yield_stress")
-"""Fields of a :class:`Material`, in the order in which gradients have them."""
+"""Parameters that bodies share with their scene unless they have their own, as fields of a
+:class:`Material`."""
 
 Vec3 = tuple[float, float, float]
 
@@ -51,17 +53,32 @@ class SceneError(PlabError, ValueError):
 
 @dataclass(frozen=True)
 class Material:
-    """Elastoplastic material of a body.
+    """Material of a body: a law and its parameters.
 
     Attributes:
         youngs_modulus: Young's modulus E.
         poisson_ratio: Poisson ratio nu.
         yield_stress: von Mises yield stress; ``inf`` for a purely elastic body.
+        law: Name of the law, see :func:`plab.laws.find_law`.
+        parameters: Other parameters of the law, by name; defaults where none is given.
     """
 
     youngs_modulus: float
     poisson_ratio: float
     yield_stress: float
+    law: str = "von_mises"
+    parameters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def kind(self) -> Law:
+        """The law."""
+        return find_law(self.law)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The law's parameters, in its order."""
+        given = {key: getattr(self, key) for key in MATERIAL_KEYS} | dict(self.parameters)
+        return {key: given.get(key, default) for key, default in self.kind.defaults.items()}
 
     @property
     def shear_modulus(self) -> float:
@@ -74,20 +91,21 @@ class Material:
         nu = self.poisson_ratio
         return self.youngs_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
-    @property
-    def stiffness(self) -> float:
-        """3 lambda + 2 mu, which limits the time step."""
-        return 3.0 * self.lame_lambda + 2.0 * self.shear_modulus
+    def largest_step(self, dx: float) -> float:
+        """Return the largest stable time step [s] on a grid of spacing dx."""
+        return self.kind.largest_step(self.values, dx)
 
     def validate(self, label: str = "") -> None:
         """Raise SceneError, with a message that begins with ``label``, if a value is out of range."""
-        young, nu = self.youngs_modulus, self.poisson_ratio
-        if not 0 < young < math.inf:
-            raise SceneError(f"{label}youngs_modulus {young:g} must be positive and finite")
-        if not 0 <= nu < 0.5:
-            raise SceneError(f"{label}poisson_ratio {nu:g} is outside [0, 0.5)")
-        if not self.yield_stress >= 0:
-            raise SceneError(f"{label}yield_stress {self.yield_stress:g} must not be negative")
+        for name in dict(self.parameters):
+            if name not in self.kind.keys:
+                raise SceneError(
+                    f"{label}{name} is no parameter of law {self.law}: {', '.join(self.kind.keys)}"
+                )
+        for parameter in self.kind.parameters:
+            value = self.values[parameter.name]
+            if not parameter.admits(value):
+                raise SceneError(f"{label}{parameter.name} {value:g} is outside {parameter.interval}")
 
 
 @dataclass(frozen=True)
@@ -102,6 +120,8 @@ class Body:
         youngs_modulus: Young's modulus E; the scene's if None.
         poisson_ratio: Poisson ratio nu; the scene's if None.
         yield_stress: von Mises yield stress; the scene's if None.
+        law: Name of its law, see :func:`plab.laws.find_law`; ``von_mises`` if None.
+        parameters: Other parameters of the law, by name.
     """
 
     shape: str
@@ -111,12 +131,19 @@ class Body:
     youngs_modulus: float | None = field(default=None, kw_only=True)
     poisson_ratio: float | None = field(default=None, kw_only=True)
     yield_stress: float | None = field(default=None, kw_only=True)
+    law: str | None = field(default=None, kw_only=True)
+    parameters: Mapping[str, float] | tuple[tuple[str, float], ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Make the parameters hashable."""
+        object.__setattr__(self, "parameters", tuple(sorted(dict(self.parameters).items())))
 
     @property
-    def own_material(self) -> dict[str, float]:
-        """Parameters that it does not share with the scene, by the names of :data:`MATERIAL_KEYS`."""
-        values = {key: getattr(self, key) for key in MATERIAL_KEYS}
-        return {key: value for key, value in values.items() if value is not None}
+    def own_material(self) -> dict[str, Any]:
+        """Fields of its :class:`Material` that it does not share with the scene."""
+        values = {key: getattr(self, key) for key in (*MATERIAL_KEYS, "law")}
+        own = {key: value for key, value in values.items() if value is not None}
+        return {**own, "parameters": self.parameters} if self.parameters else own
 
     def half_extent(self) -> np.ndarray:
         """Half of the bounding box's edges, shape [3]."""
@@ -156,7 +183,7 @@ def make_body(
     particles: int,
     file: str | None = None,
     sha256: str | None = None,
-    **material: float | None,
+    **material: Any,
 ) -> Body:
     """Make a body from a configuration's values, reading the file of a mesh.
 
@@ -168,7 +195,7 @@ def make_body(
         particles: Number of particles.
         file: Mesh only: OBJ, STL or PLY file, see :func:`plab.files.pinned`.
         sha256: SHA-256 of the file, likewise.
-        **material: Parameters that it does not share with the scene, by the names of :data:`MATERIAL_KEYS`.
+        **material: Law and parameters that it does not share with the scene, as fields of the body.
 
     Raises:
         SceneError: If a mesh has no file, or something else has one.

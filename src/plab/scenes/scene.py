@@ -264,6 +264,13 @@ class Scene:
         return len(self.bodies) if any(body.own_material for body in self.bodies) else 1
 
     @property
+    def laws(self) -> tuple[str, ...]:
+        """Names of the laws of its materials: 1, or one per body where any body has a material of its own."""
+        return tuple(material.law for material in self.materials[: self.material_count]) or (
+            self.material.law,
+        )
+
+    @property
     def particle_bodies(self) -> np.ndarray:
         """Number of each particle's body, shape [particle]."""
         return np.repeat(np.arange(len(self.bodies)), [body.particles for body in self.bodies])
@@ -280,19 +287,14 @@ class Scene:
 
     @property
     def stable_dt(self) -> float:
-        """Largest admissible time step [s].
-
-        A lone particle that swells and shrinks has the frequency omega = 2 sqrt(3 lambda + 2 mu) / dx: the
-        kernel's second moment is dx^2 / 4 wherever the particle is, and the density is 1. No mode of a body
-        is faster, because the grid's mass is that of the particles, summed (Irons and Treharne, 1971), and
-        symplectic Euler is stable while omega dt < 2. Of several materials the stiffest counts.
-        """
-        return self.dx / math.sqrt(self._stiffest.stiffness)
+        """Largest admissible time step [s], see :meth:`plab.laws.Law.largest_step`: that of the stiffest
+        body."""
+        return self._stiffest.largest_step(self.dx)
 
     @property
     def _stiffest(self) -> Material:
         """Material of the body that limits the time step."""
-        return max(self.materials, key=lambda m: m.stiffness, default=self.material)
+        return min(self.materials, key=lambda m: m.largest_step(self.dx), default=self.material)
 
     def facts(self) -> dict[str, Any]:
         """Return the scene as plain data, apart from meshes, without what a body shares with the scene."""
@@ -300,6 +302,9 @@ class Scene:
         for body in facts["bodies"]:
             for key in MATERIAL_KEYS:
                 if body[key] is None:
+                    del body[key]
+            for key in ("law", "parameters"):
+                if not body[key]:
                     del body[key]
         return facts
 

@@ -1,7 +1,4 @@
-"""Scenes of a batch: what they share, initial poses, and material parameters.
-
-Kernels take a material as shear modulus mu, Lame's lambda and yield strain (yield stress / 2 mu).
-"""
+"""Scenes of a batch: shared properties, initial poses, and material parameters."""
 
 from __future__ import annotations
 
@@ -12,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scenes import Material, Scene, SceneError
+from plab.laws import find_law
+from plab.scenes import MATERIAL_KEYS, Material, Scene, SceneError
 
 SHARED = (
     "particle_count",
     "material_count",
+    "laws",
     "grid_size",
     "dt",
     "substeps",
@@ -24,9 +23,6 @@ SHARED = (
     "floor_stencil",
 )
 """Properties that scenes of one simulator share, beside their manipulators' shapes."""
-
-YIELD_STRAIN_MAX = 1e30
-"""Stands for infinity, which would turn the unused branch into infinity times zero."""
 
 
 def scene_kind(scene: Scene) -> tuple[Any, ...]:
@@ -72,30 +68,28 @@ def _unit(rotation: Sequence[float]) -> list[float]:
     return list(q / np.linalg.norm(q))
 
 
-def with_material(
-    scenes: Sequence[Scene],
-    youngs_modulus: ArrayLike | None,
-    poisson_ratio: ArrayLike | None,
-    yield_stress: ArrayLike | None,
-) -> tuple[Scene, ...]:
+def material_keys(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the parameters of a scene's laws, in the order in which gradients have them."""
+    return tuple(dict.fromkeys(key for law in scene.laws for key in find_law(law).keys))
+
+
+def with_material(scenes: Sequence[Scene], given: Mapping[str, ArrayLike]) -> tuple[Scene, ...]:
     """Return the scenes with other material, not validated.
 
     Args:
         scenes: One scene per environment.
-        youngs_modulus: Young's modulus, one for all scenes or shape [batch]; as it is if None. Where bodies
-            have materials of their own, it is that of all, or of each if the shape is [batch, body].
-        poisson_ratio: Poisson ratio, likewise.
-        yield_stress: von Mises yield stress, likewise.
+        given: Values by the parameters' names, one for all scenes or shape [batch]. Where bodies have
+            materials of their own, they are those of all, or of each if the shape is [batch, body].
 
     Raises:
-        SceneError: If bodies of one material are given one each.
+        SceneError: If bodies of one material are given one each, or no law has such a parameter.
     """
-    given = {"youngs_modulus": youngs_modulus, "poisson_ratio": poisson_ratio, "yield_stress": yield_stress}
     counts = len(scenes), len(scenes[0].bodies)
+    keys = material_keys(scenes[0])
     values = {}
     for name, value in given.items():
-        if value is None:
-            continue
+        if name not in keys:
+            raise SceneError(f"no law of these scenes has a parameter '{name}'; they have: {', '.join(keys)}")
         numbers = np.asarray(value, float)
         if numbers.ndim > 1 and scenes[0].material_count == 1:
             raise SceneError(
@@ -111,40 +105,22 @@ def with_material(
 
 def _with_own(scene: Scene, values: Mapping[str, Sequence[float]]) -> Scene:
     """Return a scene whose bodies have these values, by name and body."""
-    if scene.material_count == 1:
-        # The one material is the scene's, and no body's own.
-        none: dict[str, Any] = dict.fromkeys(values)
-        shared: dict[str, Any] = {name: column[0] for name, column in values.items()}
-        return replace(scene, bodies=tuple(replace(body, **none) for body in scene.bodies), **shared)
-    columns: list[dict[str, Any]] = [
-        {name: column[b] for name, column in values.items()} for b in range(len(scene.bodies))
-    ]
-    bodies = tuple(replace(body, **own) for body, own in zip(scene.bodies, columns, strict=True))
-    return replace(scene, bodies=bodies)
+    shared = {name: column[0] for name, column in values.items() if name in MATERIAL_KEYS}
+    bodies = []
+    for body, material, *numbers in zip(scene.bodies, scene.materials, *values.values(), strict=True):
+        own = {key: value for key, value in zip(values, numbers, strict=True) if key in material.kind.keys}
+        fields: dict[str, Any] = {key: value for key, value in own.items() if key in MATERIAL_KEYS}
+        if scene.material_count == 1:
+            # The one material is the scene's, and no body's own.
+            fields = dict.fromkeys(fields)
+        others = {key: value for key, value in own.items() if key not in MATERIAL_KEYS}
+        bodies.append(replace(body, **fields, parameters={**dict(body.parameters), **others}))
+    return replace(scene, bodies=tuple(bodies), **(shared if scene.material_count == 1 else {}))
 
 
-def material_parameters(material: Material) -> tuple[float, float, float]:
-    """Shear modulus mu, Lame's lambda, and yield strain (yield stress / 2 mu)."""
-    mu = material.shear_modulus
-    return mu, material.lame_lambda, min(material.yield_stress / (2.0 * mu), YIELD_STRAIN_MAX)
-
-
-def parameter_gradient(material: Material, bars: np.ndarray) -> np.ndarray:
-    """Turn derivatives with respect to :func:`material_parameters` into those with respect to the material's.
-
-    Args:
-        material: The material.
-        bars: Derivatives with respect to mu, lambda and yield strain, shape [3].
-
-    Returns:
-        Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [3].
-    """
-    young, nu = material.youngs_modulus, material.poisson_ratio
-    mu, lam, strain = material_parameters(material)
-    by_young = np.array([mu, lam, -strain]) / young
-    lam_by_nu = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
-    by_nu = np.array([-mu / (1.0 + nu), lam_by_nu, strain / (1.0 + nu)])
-    by_yield = np.array([0.0, 0.0, 0.5 / mu])
-    if strain >= YIELD_STRAIN_MAX:
-        by_young[2] = by_nu[2] = by_yield[2] = 0.0
-    return np.stack([by_young, by_nu, by_yield]) @ bars
+def parameter_gradient(material: Material, bars: np.ndarray, keys: Sequence[str]) -> list[float]:
+    """Return derivatives by parameters from those by the coefficients of a material's law, shape
+    [coefficient]; 0 for parameters that it has not."""
+    law = material.kind
+    own = dict(zip(law.keys, law.parameter_gradient(material.values, bars[: law.size]), strict=True))
+    return [own.get(key, 0.0) for key in keys]

@@ -19,8 +19,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from plab.files import cache_dir
-
 QUADRANTS = os.environ.get("PLAB_COMPILER") == "quadrants" or find_spec("taichi") is None
 """True if kernels are compiled by Quadrants: Taichi is missing, or PLAB_COMPILER=quadrants."""
 
@@ -43,9 +41,6 @@ else:
 
     _TRACE = "_get_tree_and_ctx"
     grid_memory_fence = ti.simt.grid.memfence
-
-BITCODE = Path(__file__).with_name("bitcode")
-"""Folder of the files that ``make bitcode`` writes."""
 
 
 # -- definitions of kernels ---------------------------------------------------------------------------------
@@ -200,44 +195,14 @@ def cuda_available() -> bool:
 local_variable = impl.expr_init
 """Makes a local variable within a ``ti.func``, where a list of variables is wanted."""
 
-_ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
 
+def bitcode_function(path: str, symbol: str) -> Callable[..., None]:
+    """Return a function of a file of LLVM bitcode, which Taichi links into its kernels; it takes local
+    variables.
 
-class Bitcode:
-    """Functions of a file of LLVM bitcode, which Taichi links into its kernels: sets ``SourceBuilder.bc`` and
-    ``mode``, as the public way to them compiles C++ with clang.
-
-    Attributes:
-        path: Where it is: a copy in plab's cache folder, if that can be written to. Taichi knows compiled
-            kernels by that place, which is then the same for all environments and checkouts.
+    Sets ``SourceBuilder.bc`` and ``mode``, as the public way to them compiles C++ with clang.
     """
-
-    def __init__(self, name: str) -> None:
-        """Take the file that begins with a name; ImportError if there is none."""
-        found = list(BITCODE.glob(f"{name}-*.bc"))
-        if not found:
-            raise ImportError(
-                f"plab's simulator has no code for {name}: `make bitcode` has to learn its data layout"
-            )
-        self.path = _shared(found[0])
-        self._source = SourceBuilder()
-        self._source.bc, self._source.mode = self.path, "bc"
-
-    def __call__(self, name: str, real: Any) -> Callable[..., None]:
-        """Return a function for numbers of a type; it takes local variables."""
-        found: Callable[..., None] = getattr(self._source, f"{name}_{_ENDINGS[real]}")
-        return found
-
-
-def _shared(path: Path) -> str:
-    code = path.read_bytes()
-    # RuntimeError: there is no home.
-    with contextlib.suppress(OSError, RuntimeError):
-        copied = cache_dir() / path.name
-        if not copied.exists() or copied.read_bytes() != code:
-            copied.parent.mkdir(parents=True, exist_ok=True)
-            own = copied.with_name(f"{path.name}.{os.getpid()}")
-            own.write_bytes(code)
-            own.replace(copied)
-        return str(copied)
-    return str(path)
+    source = SourceBuilder()
+    source.bc, source.mode = path, "bc"
+    found: Callable[..., None] = getattr(source, symbol)
+    return found

@@ -2,34 +2,36 @@
 
 LLVM vectorises what ends in stores to a field, and what begins with loads from one. A transfer therefore
 leaves what a tile's particles need of their stencils in ``stencils`` (lane vectors, one particle per lane),
-and sums over the nodes of one particle after the other take it from there. These sums
-(``tools/stencils.py``) and the parts of the material (``tools/material.py``) are LLVM's bitcode, of which
-Taichi would make slow code. Each part of the material takes its input from ``strains`` and leaves its results
-there.
+and sums over the nodes of one particle after the other take it from there. These sums and the laws are LLVM's
+bitcode (:mod:`plab.sim.codegen`), of which Taichi would make slow code. Each part of von Mises plasticity
+takes its input from ``strains`` and leaves its results there.
 
 ``at`` and ``bases_at`` are the first entries of a thread's shares of ``stencils`` and ``bases``; ``source``,
 ``target`` and ``entry9`` those of a tile in states and in ``affine``; ``state_at`` and ``bar_at`` are the
 addresses of arrays of states.
 """
 
-import platform
-import sys
+from collections.abc import Sequence
 
-from plab.sim.compiler import Bitcode, local_variable, ti
+import numpy as np
+
+from plab.scenes import Scene
+from plab.sim.compiler import local_variable, ti
 from plab.sim.particle_phases import ParticlePhases, at_base, spline, spline_slope
 from plab.sim.storage import (
     ADJOINT_FIELD,
     AT_C,
-    AT_F,
     AT_V,
     BASES,
     INDEX_MASK,
+    LAW_PARAMETER_BARS,
+    LAW_PARAMETERS,
     MOMENTUM_FIELD,
     OFFSETS,
     SLOPES,
     STATE,
     STENCILS,
-    STRAIN_G_BAR,
+    STRAIN_LAW,
     STRAIN_PARAMETER_BARS,
     STRAIN_PARAMETERS,
     STRAINS,
@@ -46,39 +48,46 @@ REACHING = tuple(
 """For each of the 8 blocks around a base node's: bit mask of the kinds of crossing that reach it."""
 
 
-_function = Bitcode(f"{sys.platform}-{platform.machine().lower()}")
-
-
-@ti.func
-def call(
-    name: ti.template(), real: ti.template(), at: ti.template(), sizes: ti.template(), numbers: ti.template()
-):
-    """Call a function of the bitcode with addresses, integers and numbers.
-
-    Addresses are those of a node in a grid, of one particle's number in the first of some lane vectors, and
-    of a tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
-    """
-    a = [local_variable(ti.cast(address, ti.u64)) for address in at]
-    i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
-    n = [local_variable(ti.cast(number, real)) for number in numbers]
-    ti.static(_function(name, real))(*a, *i, *n)
-
-
-@ti.func
-def ask(
-    name: ti.template(), real: ti.template(), at: ti.template(), sizes: ti.template(), numbers: ti.template()
-):
-    """Call a function of the bitcode as :func:`call` does, and return its result, a number."""
-    a = [local_variable(ti.cast(address, ti.u64)) for address in at]
-    i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
-    n = [local_variable(ti.cast(number, real)) for number in numbers]
-    result = ti.cast(0.0, real)
-    ti.static(_function(name, real))(*a, *i, *n, result)
-    return result
-
-
 class TilePhases(ParticlePhases):
-    """Transfers between tiles of particles and the grid, return mapping and stress, and their adjoints."""
+    """Transfers between tiles of particles and the grid, the material, and their adjoints."""
+
+    code_device = "cpu"
+
+    @ti.func
+    def call(
+        self,
+        unit: ti.template(),
+        name: ti.template(),
+        at: ti.template(),
+        sizes: ti.template(),
+        numbers: ti.template(),
+    ):
+        """Call a function of the bitcode with addresses, integers and numbers.
+
+        Addresses are those of a node in a grid, of one particle's number in the first of some lane vectors,
+        and of a tile's first lane vector in a state, in its adjoint, in ``affine`` and in ``strains``.
+        """
+        a = [local_variable(ti.cast(address, ti.u64)) for address in at]
+        i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
+        n = [local_variable(ti.cast(number, self.real)) for number in numbers]
+        ti.static(self.function(unit, name))(*a, *i, *n)
+
+    @ti.func
+    def ask(
+        self,
+        unit: ti.template(),
+        name: ti.template(),
+        at: ti.template(),
+        sizes: ti.template(),
+        numbers: ti.template(),
+    ):
+        """Call a function of the bitcode as :meth:`call` does, and return its result, a number."""
+        a = [local_variable(ti.cast(address, ti.u64)) for address in at]
+        i = [local_variable(ti.cast(size, ti.i64)) for size in sizes]
+        n = [local_variable(ti.cast(number, self.real)) for number in numbers]
+        result = ti.cast(0.0, self.real)
+        ti.static(self.function(unit, name))(*a, *i, *n, result)
+        return result
 
     def _allocate(self) -> None:
         grids = self.batch * self.chunks
@@ -87,6 +96,8 @@ class TilePhases(ParticlePhases):
         self.bases = ti.Vector.field(self.lanes, ti.i32, shape=grids * BASES)
         self.strains = ti.Vector.field(self.lanes, self.real, shape=grids * STRAINS)
         super()._allocate()
+        if len(self.laws) > 1:
+            self.tile_laws = self.share(ti.field(ti.i32, shape=self.batch * self.tiles))
         # Where each chunk's share of an environment's block list begins, and which chunks hold a block.
         self.block_first = ti.field(ti.i32, shape=(self.batch, self.chunks + 1))
         self.block_chunks = ti.field(ti.i32, shape=self.batch * self.blocks)
@@ -161,7 +172,13 @@ class TilePhases(ParticlePhases):
         grid, stencil = ti.get_addr(self.momentum, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + MOMENTUM_FIELD, lane)
         a = self.lane_in(self.affine, entry9, lane)
-        call("scatter", self.real, [grid, stencil, value, a], [self.axis], [self.mass, self.dx])
+        self.call(
+            "transfers",
+            "scatter",
+            [grid, stencil, value, a],
+            [self.axis],
+            [self.mass, self.dx],
+        )
 
     @ti.func
     def scatter_adjoint(self, bar_at, target, lane, grid_node, at):
@@ -170,7 +187,13 @@ class TilePhases(ParticlePhases):
         grid, stencil = ti.get_addr(self.velocity_bar, [grid_node]), self.lane_in(self.stencils, at, lane)
         value = self.lane_in(self.stencils, at + ADJOINT_FIELD, lane)
         c_bar = self.lane_of(bar_at, target + AT_C, lane)
-        call("scatter", self.real, [grid, stencil, value, c_bar], [self.axis], [0.0, 4.0 * self.inv_dx])
+        self.call(
+            "transfers",
+            "scatter",
+            [grid, stencil, value, c_bar],
+            [self.axis],
+            [0.0, 4.0 * self.inv_dx],
+        )
 
     @ti.func
     def gather_particle(self, state_at, source, target, lane, node, e, time, at):
@@ -181,7 +204,13 @@ class TilePhases(ParticlePhases):
             self.lane_of(state_at, source, lane),
             self.lane_of(state_at, target, lane),
         ]
-        speed = ask("gather", self.real, addresses, [self.axis], [self.dt, self.x_max, 4.0 * self.inv_dx])
+        speed = self.ask(
+            "transfers",
+            "gather",
+            addresses,
+            [self.axis],
+            [self.dt, self.x_max, 4.0 * self.inv_dx],
+        )
         self.note_speed(speed, e, time)
 
     @ti.func
@@ -198,7 +227,13 @@ class TilePhases(ParticlePhases):
             self.lane_of(bar_at, target, lane),
         ]
         numbers = [self.dt, self.x_max, self.dx, self.inv_dx, self.mass]
-        call("gather_adjoint", self.real, addresses, [self.axis], numbers)
+        self.call(
+            "transfers",
+            "gather_adjoint",
+            addresses,
+            [self.axis],
+            numbers,
+        )
 
     # -- which blocks hold mass ---------------------------------------------------------------------
 
@@ -242,76 +277,202 @@ class TilePhases(ParticlePhases):
 
     # -- material -----------------------------------------------------------------------------------
 
+    def fill_laws(self, scenes: Sequence[Scene]) -> None:
+        """Write a bit mask of each tile's laws, where there are several."""
+        if len(self.laws) > 1:
+            numbers = np.array([[self.laws.index(m.kind) for m in s.materials] for s in scenes])
+            own = numbers[np.arange(self.batch).reshape(-1, 1, 1, 1), self._bodies]
+            self.write(self.tile_laws, np.bitwise_or.reduce(1 << own, axis=(2, 3)).reshape(-1))
+
     @ti.func
-    def strain_tile(self, state_at, source, e, entry9, at, kind: ti.template()):
-        """Strain of a tile, and its parameters, into ``strains``, in a ``whole_strain`` with what the adjoint
-        needs; whether the series serve all its lanes."""
+    def has_law(self, entry9, number: ti.template()):
+        """Whether any lane of a tile has the law of a number."""
+        if ti.static(len(self.laws) > 1):
+            return self.tile_laws[entry9 // 9] & (1 << number) != 0
+        else:
+            return True
+
+    @ti.func
+    def put_parameters(self, e, entry9, at, first: ti.template(), count: ti.template()):
+        """Write a tile's coefficients into ``strains``, and of several laws the number of each lane's."""
         p = self.parameters_of_tile(e, entry9)
-        for i in ti.static(range(3)):
-            self.strains[at + STRAIN_PARAMETERS + i] = p[i]
-        addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
-        numbers = [self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
-        return ask(kind, self.real, addresses, [], numbers) > 0.0
+        for i in ti.static(range(count)):
+            self.strains[at + first + i] = p[i]
+        if ti.static(len(self.laws) > 1):
+            self.strains[at + STRAIN_LAW] = p[self.coefficients]
 
     @ti.func
     def material_tile(
         self, state: ti.template(), state_at, source, target, entry9, e, at, update: ti.template()
     ):
-        """Return mapping and A = stress_scale tau + mass C for a tile, in the thread's share of ``strains``
-        from entry ``at``; the new F is stored if ``update``."""
-        if self.strain_tile(state_at, source, e, entry9, at, "strain"):
+        """A = stress_scale tau + mass C for a tile, in the thread's share of ``strains`` from entry ``at``;
+        the new F is stored if ``update``."""
+        for number, law in ti.static(enumerate(self.laws)):
+            if self.has_law(entry9, number):
+                if ti.static(self.scheduled(law)):
+                    self.scheduled_tile(state, state_at, source, target, entry9, e, at, law, number, update)
+                else:
+                    self.law_tile(state_at, source, target, entry9, e, at, law, number, update)
+
+    @ti.func
+    def law_tile(
+        self,
+        state_at,
+        source,
+        target,
+        entry9,
+        e,
+        at,
+        law: ti.template(),
+        number: ti.template(),
+        update: ti.template(),
+    ):
+        self.put_parameters(e, entry9, at, LAW_PARAMETERS, law.size)
+        first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
+        affine = self.lane_in(self.affine, entry9, 0)
+        numbers = [number, self.dt, self.stress_scale, self.mass]
+        if ti.static(update):
+            self.call(
+                law,
+                "update",
+                [first, x, affine, self.lane_of(state_at, target, 0)],
+                [],
+                numbers,
+            )
+        else:
+            self.call(law, "stress_only", [first, x, affine], [], numbers)
+
+    @ti.func
+    def strain_tile(
+        self, state_at, source, e, entry9, at, law: ti.template(), number: ti.template(), kind: ti.template()
+    ):
+        """Strain of a tile, and its parameters, into ``strains``, in a ``whole_strain`` with what the adjoint
+        needs; whether the series serve all its lanes."""
+        self.put_parameters(e, entry9, at, STRAIN_PARAMETERS, 3)
+        addresses = [self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)]
+        limits = [number, self.dt, self.series.z_squared_max, self.series.j_min, self.series.j_max]
+        return self.ask(law, kind, addresses, [], limits) > 0.0
+
+    @ti.func
+    def scheduled_tile(
+        self,
+        state: ti.template(),
+        state_at,
+        source,
+        target,
+        entry9,
+        e,
+        at,
+        law: ti.template(),
+        number: ti.template(),
+        update: ti.template(),
+    ):
+        """:meth:`law_tile` by parts, of which the new F comes last."""
+        if self.strain_tile(state_at, source, e, entry9, at, law, number, "strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine = self.lane_in(self.affine, entry9, 0)
-            rigid = ask("stress", self.real, [first, x, affine], [], [self.stress_scale, self.mass])
+            numbers = [number, self.stress_scale, self.mass]
+            rigid = self.ask(law, "stress", [first, x, affine], [], numbers)
             if ti.static(update):
+                addresses = [first, self.lane_of(state_at, target, 0)]
                 if rigid < 1.0:
-                    call("flow", self.real, [first, self.lane_of(state_at, target, 0)], [], [])
+                    self.call(law, "flow", addresses, [], [number])
                 else:
-                    call("copy", self.real, [first, self.lane_of(state_at, target + AT_F, 0)], [], [])
+                    self.call(law, "rest", addresses, [], [number])
         else:
             for lane in range(self.lanes):
-                a = self.spectral_material(state, source, target, lane, e, update)
-                for i in ti.static(range(9)):
-                    self.affine[entry9 + i][lane] = a[i]
+                if self.is_own(entry9, lane, number):
+                    a = self.spectral_material(state, source, target, lane, e, update)
+                    for i in ti.static(range(9)):
+                        self.affine[entry9 + i][lane] = a[i]
+
+    @ti.func
+    def is_own(self, entry9, lane, number: ti.template()):
+        """Whether a particle has the law of a number."""
+        if ti.static(len(self.laws) > 1):
+            row = entry9 // 9 * ti.static(self.place_rows) + self.coefficients
+            return self.place_material[row][lane] == ti.cast(number, self.real)
+        else:
+            return True
 
     @ti.func
     def material_tile_adjoint(
         self, state: ti.template(), state_at, source, bar: ti.template(), bar_at, target, entry9, e, at
     ):
         """Adjoints of C and F of a tile from those of A (in ``affine``) and of the new F (in ``bar``)."""
-        if self.strain_tile(state_at, source, e, entry9, at, "whole_strain"):
+        for number, law in ti.static(enumerate(self.laws)):
+            if self.has_law(entry9, number):
+                if ti.static(self.scheduled(law)):
+                    self.scheduled_tile_adjoint(
+                        state, state_at, source, bar, bar_at, target, entry9, e, at, law, number
+                    )
+                else:
+                    self.law_tile_adjoint(state_at, source, bar_at, target, entry9, e, at, law, number)
+
+    @ti.func
+    def law_tile_adjoint(
+        self, state_at, source, bar_at, target, entry9, e, at, law: ti.template(), number: ti.template()
+    ):
+        self.put_parameters(e, entry9, at, LAW_PARAMETERS, law.size)
+        first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
+        addresses = [first, x, self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)]
+        numbers = [number, self.dt, self.stress_scale, self.mass]
+        self.call(law, "adjoint", addresses, [], numbers)
+        if ti.static(self.full_gradient):
+            self.parameter_tile_adjoint(entry9, at, LAW_PARAMETER_BARS, law.size, number)
+
+    @ti.func
+    def scheduled_tile_adjoint(
+        self,
+        state: ti.template(),
+        state_at,
+        source,
+        bar: ti.template(),
+        bar_at,
+        target,
+        entry9,
+        e,
+        at,
+        law: ti.template(),
+        number: ti.template(),
+    ):
+        if self.strain_tile(state_at, source, e, entry9, at, law, number, "whole_strain"):
             first, x = self.lane_in(self.strains, at, 0), self.lane_of(state_at, source, 0)
             affine, bars = self.lane_in(self.affine, entry9, 0), self.lane_of(bar_at, target, 0)
-            rigid = ask("stress_adjoint", self.real, [first, affine], [], [self.stress_scale])
+            numbers = [number, self.stress_scale]
+            rigid = self.ask(law, "stress_adjoint", [first, affine], [], numbers)
             if rigid < 1.0:
-                call("flow_adjoint", self.real, [first, bars], [], [])
+                self.call(law, "flow_adjoint", [first, bars], [], [number])
             else:
-                f_bar = self.lane_of(bar_at, target + AT_F, 0)
-                call("copy", self.real, [f_bar, self.lane_in(self.strains, at + STRAIN_G_BAR, 0)], [], [])
+                self.call(law, "rest_adjoint", [first, bars], [], [number])
             if ti.static(self.full_gradient):
-                self.parameter_tile_adjoint(entry9, at)
-            call("strain_adjoint", self.real, [first, x, affine, bars], [], [self.dt, self.mass])
+                self.parameter_tile_adjoint(entry9, at, STRAIN_PARAMETER_BARS, 3, number)
+            ends = [number, self.dt, self.mass]
+            addresses = [first, x, affine, bars]
+            self.call(law, "strain_adjoint", addresses, [], ends)
         else:
             for lane in range(self.lanes):
-                a_bar = self.load(self.affine, entry9, lane, 9)
-                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, at // STRAINS)
+                if self.is_own(entry9, lane, number):
+                    a_bar = self.load(self.affine, entry9, lane, 9)
+                    self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, at // STRAINS)
 
     @ti.func
-    def parameter_tile_adjoint(self, entry9, at):
-        """Add a tile's adjoints of the material's parameters, from ``strains``."""
-        mu_bar, lam_bar, yield_bar = [self.strains[at + STRAIN_PARAMETER_BARS + i] for i in range(3)]
+    def parameter_tile_adjoint(
+        self, entry9, at, first: ti.template(), count: ti.template(), number: ti.template()
+    ):
+        """Add a tile's adjoints of the material's coefficients, from ``strains``."""
+        bars = [self.strains[at + first + i] for i in range(count)]
         if ti.static(self.mixed):
             for lane in range(self.lanes):
-                self.accumulate_particle(
-                    at // STRAINS, entry9 // 9 * STATE, lane, mu_bar[lane], lam_bar[lane], yield_bar[lane]
-                )
+                if self.is_own(entry9, lane, number):
+                    shares = [bar[lane] for bar in bars]
+                    self.accumulate_particle(at // STRAINS, entry9 // 9 * STATE, lane, shares)
         else:
-            self.accumulate_material(at // STRAINS, mu_bar.sum(), lam_bar.sum(), yield_bar.sum())
+            self.accumulate_material(at // STRAINS, [bar.sum() for bar in bars])
 
     @ti.func
-    def accumulate_material(self, row, mu_bar, lam_bar, yield_bar):
+    def accumulate_material(self, row, bars: ti.template()):
         """Add to a material's adjoint, where one thread owns it."""
-        bars = (mu_bar, lam_bar, yield_bar)
-        for i in ti.static(range(3)):
+        for i in ti.static(range(len(bars))):
             wide = ti.cast(bars[i], ti.f64)
             self.material_bar[row, i] = self.material_bar[row, i] + wide

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from plab.sim.compiler import grid_memory_fence, ti
-from plab.sim.cuda_sums import LARGEST_MOMENTUM, gather_sums, look, particle, particle_adjoint
+from plab.sim.cuda_sums import LARGEST_MOMENTUM, gather_sums, look, variables
 from plab.sim.cuda_warp import (
     ALL_LANES,
     BLOCK_WARPS,
@@ -51,6 +51,8 @@ class CudaPhases(OrderPhases, PosePhases):
         pose_threads: Manipulators of all environments, and one at least.
     """
 
+    code_device = "cuda"
+
     resident_threads: int
     last_arrival: int
     pose_threads: int
@@ -80,7 +82,7 @@ class CudaPhases(OrderPhases, PosePhases):
         self.adjoint_bound = ti.field(ti.i32, shape=self.batch)
         self.frame_sums = self.sums(self.batch * self.substeps * max(1, self.manipulators) * FRAME_ADJOINT)
         self.pose_sums = self.sums(self.batch * max(1, self.manipulators) * 8)
-        self.material_sums = self.sums(self.material_bar.shape[0] * 3)
+        self.material_sums = self.sums(self.material_bar.shape[0] * self.coefficients)
 
     # -- particles ----------------------------------------------------------------------------------
 
@@ -149,7 +151,8 @@ class CudaPhases(OrderPhases, PosePhases):
         velocity = self.node_address(self.velocity, node)
         momentum = self.node_address(self.momentum_bar, node)
         # Moments of the momentum's adjoint, as in the gather, and the slope of both grids' part in it.
-        m0, mx, my, mz, slope = gather_sums(self.real, velocity, momentum, self.axis, w, dw, q, h)
+        sums = ti.static(self.function("transfers", "gather_sums"))
+        m0, mx, my, mz, slope = gather_sums(sums, self.real, velocity, momentum, self.axis, w, dw, q, h)
         c_bar = self.load(bar, target + AT_C, lane, 9)
         scale = 4.0 * self.inv_dx * self.inv_dx
         open_axes = self.unclamped(x, v_after)
@@ -185,57 +188,112 @@ class CudaPhases(OrderPhases, PosePhases):
     # -- material ------------------------------------------------------------------------------------
 
     @ti.func
-    def material_numbers(self, p: ti.template()):
-        """What bitcode takes of the material with a particle's parameters."""
-        most, low, high = self.series.z_squared_max, self.series.j_min, self.series.j_max
-        # Last: a particle whose factor of return mapping is less than 1 flows.
-        return [p[0], p[1], p[2], self.dt, self.stress_scale, self.mass, most, low, high, 1.0]
+    def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
+        """Material update of one particle, whose new F is stored if ``update``; returns A, row by row."""
+        out = ti.Vector.zero(self.real, 9)
+        p = self.parameters_of_particle(e, source, lane)
+        for number, law in ti.static(enumerate(self.laws)):
+            if ti.static(len(self.laws) == 1):
+                out = self.law_particle(state, source, target, lane, e, p, law, update)
+            else:
+                if p[self.coefficients] == ti.cast(number, self.real):
+                    out = self.law_particle(state, source, target, lane, e, p, law, update)
+        return out
 
     @ti.func
-    def material_particle(self, state: ti.template(), source, target, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle; returns A, row by row."""
+    def law_particle(
+        self,
+        state: ti.template(),
+        source,
+        target,
+        lane,
+        e,
+        p: ti.template(),
+        law: ti.template(),
+        update: ti.template(),
+    ):
         out = ti.Vector.zero(self.real, 9)
-        numbers = self.material_numbers(self.parameters_of_particle(e, source, lane))
-        c = self.load(state, source + AT_C, lane, 9)
-        f = self.load(state, source + AT_F, lane, 9)
-        a, f_new, served = particle(self.real, c, f, numbers)
-        if served:
+        a = variables(self.real, self.load(state, source + AT_C, lane, 9))
+        f_new = variables(self.real, self.load(state, source + AT_F, lane, 9))
+        coefficients = variables(self.real, [p[i] for i in range(law.size)])
+        constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+        function = ti.static(self.function(law, "particle"))
+        served = ti.cast(1.0, self.real)
+        if ti.static(self.scheduled(law)):
+            ends = variables(self.real, ti.static(self.range_of_series()))
+            function(*a, *f_new, *coefficients, *constants, *ends, served)
+        else:
+            function(*a, *f_new, *coefficients, *constants)
+        if served > 0.0:
             for i in ti.static(range(9)):
                 out[i] = a[i]
                 if ti.static(update):
                     state[target + AT_F + i][lane] = f_new[i]
         else:
-            out = self.spectral_material(state, source, target, lane, e, update)
+            if ti.static(self.scheduled(law)):
+                out = self.spectral_material(state, source, target, lane, e, update)
         return out
+
+    def range_of_series(self) -> list[float]:
+        """Return where series serve von Mises plasticity."""
+        return [self.series.z_squared_max, self.series.j_min, self.series.j_max]
 
     @ti.func
     def material_particle_adjoint(
         self, state: ti.template(), source, bar: ti.template(), target, a_bar: ti.template(), lane, e
     ):
-        """:meth:`material_tile_adjoint` for one particle, given the adjoint of A."""
-        numbers = self.material_numbers(self.parameters_of_particle(e, source, lane))
-        c = self.load(state, source + AT_C, lane, 9)
-        f = self.load(state, source + AT_F, lane, 9)
-        f_bar = self.load(bar, target + AT_F, lane, 9)
-        c_out, f_out, p_bar, served = particle_adjoint(self.real, c, f, a_bar, f_bar, numbers)
-        if served:
+        """Adjoint of :meth:`material_particle`, given that of A."""
+        p = self.parameters_of_particle(e, source, lane)
+        for number, law in ti.static(enumerate(self.laws)):
+            if ti.static(len(self.laws) == 1):
+                self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, law)
+            else:
+                if p[self.coefficients] == ti.cast(number, self.real):
+                    self.law_particle_adjoint(state, source, bar, target, a_bar, lane, e, p, law)
+
+    @ti.func
+    def law_particle_adjoint(
+        self,
+        state: ti.template(),
+        source,
+        bar: ti.template(),
+        target,
+        a_bar: ti.template(),
+        lane,
+        e,
+        p: ti.template(),
+        law: ti.template(),
+    ):
+        c_out = variables(self.real, self.load(state, source + AT_C, lane, 9))
+        f_out = variables(self.real, self.load(state, source + AT_F, lane, 9))
+        a, b = variables(self.real, a_bar), variables(self.real, self.load(bar, target + AT_F, lane, 9))
+        p_bar = variables(self.real, [p[i] for i in range(law.size)])
+        constants = variables(self.real, [self.dt, self.stress_scale, self.mass])
+        function = ti.static(self.function(law, "particle_adjoint"))
+        served = ti.cast(1.0, self.real)
+        if ti.static(self.scheduled(law)):
+            ends = variables(self.real, ti.static(self.range_of_series()))
+            function(*c_out, *f_out, *a, *b, *p_bar, *constants, *ends, served)
+        else:
+            function(*c_out, *f_out, *a, *b, *p_bar, *constants)
+        if served > 0.0:
             if ti.static(self.full_gradient):
                 if ti.static(self.mixed):
-                    self.accumulate_particle(e, source, lane, p_bar[0], p_bar[1], p_bar[2])
+                    self.accumulate_particle(e, source, lane, p_bar)
                 else:
-                    self.accumulate_material(e, p_bar[0], p_bar[1], p_bar[2])
+                    self.accumulate_material(e, p_bar)
             for i in ti.static(range(9)):
                 bar[target + AT_C + i][lane] = c_out[i]
                 bar[target + AT_F + i][lane] = f_out[i]
         else:
-            self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
+            if ti.static(self.scheduled(law)):
+                self.spectral_material_adjoint(state, source, bar, target, a_bar, lane, e, e)
 
     @ti.func
-    def accumulate_material(self, row, mu_bar, lam_bar, yield_bar):
+    def accumulate_material(self, row, bars: ti.template()):
         """Add to a material's adjoint, which all threads of an environment share."""
-        bars = (mu_bar, lam_bar, yield_bar)
-        for i in ti.static(range(3)):
-            self.add_up(self.material_sums, row * 3 + i, ti.cast(bars[i], ti.f64))
+        for i in ti.static(range(len(bars))):
+            self.add_up(self.material_sums, row * self.coefficients + i, ti.cast(bars[i], ti.f64))
 
     # -- grid ---------------------------------------------------------------------------------------
 
@@ -315,8 +373,8 @@ class CudaPhases(OrderPhases, PosePhases):
     @ti.func
     def take_material(self, row):
         """Add what an environment step has added up for a material to its adjoint."""
-        for i in ti.static(range(3)):
-            self.material_bar[row, i] += self.take_sum(self.material_sums, row * 3 + i)
+        for i in ti.static(range(self.coefficients)):
+            self.material_bar[row, i] += self.take_sum(self.material_sums, row * self.coefficients + i)
 
     @ti.func
     def note_distances(self, e, particle, x):

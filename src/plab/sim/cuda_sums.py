@@ -7,13 +7,17 @@ different units each, which together hold any number to some 1e-29.
 
 Bitcode is for what Taichi would make slow code of, or compile slowly. Of a float's address Taichi does not
 know that it is in global memory: its atomic addition asks the device, and waits for the answer;
-``tools/cuda_global.ll`` knows. The material of a particle and its sums over 27 nodes are some thousand
-statements, each of which Taichi looks for in all others; ``tools/particle.py`` writes them.
+``codegen/cuda_global.ll`` knows. A particle's law and its sums over 27 nodes are some thousand statements,
+each of which Taichi looks for in all others; :mod:`plab.sim.codegen` writes them.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
-from plab.sim.compiler import Bitcode, local_variable, ti
+from plab.sim.codegen.bitcode import bitcode_file, symbol
+from plab.sim.compiler import bitcode_function, local_variable, ti
+from plab.sim.particle_phases import ENDINGS
 from plab.sim.storage import Storage
 
 MOMENTUM_BITS, MASS_BITS = 36, 42
@@ -39,21 +43,23 @@ LEAST_EXPONENT = -80
 """Adjoints below 2^-80 have the units of that."""
 
 
-_function = Bitcode("cuda")
+def atomic(name: str, kind: Any) -> Callable[..., None]:
+    """Return a function of ``cuda_global.ll`` for numbers of a type."""
+    return bitcode_function(bitcode_file("cuda", "", "atomics"), symbol("atomics", name, ENDINGS[kind]))
 
 
 @ti.func
 def add(kind: ti.template(), address, value):
     """Add to a number at an address, which nobody waits for."""
     place, number = ti.cast(address, ti.u64), ti.cast(value, kind)
-    ti.static(_function("add", kind))(place, number)
+    ti.static(atomic("add", kind))(place, number)
 
 
 @ti.func
 def look(address):
     """The 32-bit integer at an address, which others change meanwhile."""
     place, number = ti.cast(address, ti.u64), 0
-    ti.static(_function("look", ti.i32))(place, number)
+    ti.static(atomic("look", ti.i32))(place, number)
     return number
 
 
@@ -64,35 +70,8 @@ def variables(real: ti.template(), values: ti.template()):
 
 
 @ti.func
-def particle(real: ti.template(), c: ti.template(), f: ti.template(), numbers: ti.template()):
-    """Return A and F after the substep of a particle whose C and F are given, 9 numbers each, and whether the
-    series served it; else nothing is changed. ``numbers`` are those of ``tools/particle.py``, in its order:
-    three parameters, constants, bounds."""
-    a, f_new, rest = variables(real, c), variables(real, f), variables(real, numbers)
-    served = ti.cast(0.0, real)
-    ti.static(_function("particle", real))(*a, *f_new, *rest, served)
-    return a, f_new, served > 0.0
-
-
-@ti.func
-def particle_adjoint(
-    real: ti.template(),
-    c: ti.template(),
-    f: ti.template(),
-    a_bar: ti.template(),
-    f_bar: ti.template(),
-    numbers: ti.template(),
-):
-    """Return the adjoints of C and F of a particle, 9 numbers each, and of its three parameters, from those
-    of A and of the new F, and whether the series served it; else nothing is changed."""
-    c_bar, old_bar, rest = variables(real, c), variables(real, f), variables(real, numbers)
-    a, b, served = variables(real, a_bar), variables(real, f_bar), ti.cast(0.0, real)
-    ti.static(_function("particle_adjoint", real))(*c_bar, *old_bar, *a, *b, *rest, served)
-    return c_bar, old_bar, rest[:3], served > 0.0
-
-
-@ti.func
 def gather_sums(
+    function: ti.template(),
     real: ti.template(),
     velocity,
     momentum,
@@ -112,7 +91,7 @@ def gather_sums(
     momenta = variables(real, [q[k][i] for k in range(4) for i in range(4)])
     adjoints = variables(real, [h[k][i] for k in range(4) for i in range(4)])
     m, t = variables(real, [0.0 for _ in range(12)]), variables(real, [0.0 for _ in range(3)])
-    ti.static(_function("gather_sums", real))(v, p, n, *weights, *slopes, *momenta, *adjoints, *m, *t)
+    ti.static(function)(v, p, n, *weights, *slopes, *momenta, *adjoints, *m, *t)
     return m[:3], m[3:6], m[6:9], m[9:], t
 
 

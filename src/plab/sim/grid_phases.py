@@ -286,9 +286,9 @@ class GridPhases(Storage):
         p = self.material[e]
         return ti.Vector(
             [
-                total[0] / total[3] + self.dt * p[4],
-                total[1] / total[3] + self.dt * p[5],
-                total[2] / total[3] + self.dt * p[6],
+                total[0] / total[3] + self.dt * p[1],
+                total[1] / total[3] + self.dt * p[2],
+                total[2] / total[3] + self.dt * p[3],
             ]
         )
 
@@ -310,7 +310,7 @@ class GridPhases(Storage):
             v = self.free_velocity(e, total)
             if near != 0:
                 v = self.after_manipulators(e, s, self.position(i), v, near, self.manipulators)
-            v = self.walls(i, v, self.material[e][3])
+            v = self.walls(i, v, self.material[e][0])
         return v
 
     @ti.func
@@ -329,7 +329,7 @@ class GridPhases(Storage):
             v = free
             if near != 0:
                 v = self.after_manipulators(e, s, x, free, near, self.manipulators)
-            friction = self.material[e][3]
+            friction = self.material[e][0]
             v_out = self.walls(i, v, friction)
             v_bar = self.walls_adjoint(i, v, friction, bar)
             if near != 0:

@@ -5,7 +5,12 @@ the particle (APIC, moving least squares). Such a field is a 4-vector at the bas
 one per axis, also 4-vectors: three components of momentum or velocity and the mass (or nothing).
 """
 
-from plab.sim.compiler import ti
+from collections.abc import Callable
+from typing import Any
+
+from plab.laws import LAWS, Law
+from plab.sim.codegen.bitcode import bitcode_file, symbol
+from plab.sim.compiler import bitcode_function, ti
 from plab.sim.spectral import (
     product,
     product_nt,
@@ -14,11 +19,14 @@ from plab.sim.spectral import (
     spectral_return_map,
     spectral_return_map_adjoint,
 )
-from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, STATE, STATE_MASK, Storage
+from plab.sim.storage import AT_C, AT_F, BLOCK, BLOCK_BITS, GROUND, STATE, STATE_MASK, Storage
 from plab.sim.tensors import Array
 
 SIZES = {ti.f32: 4, ti.f64: 8}
 """Bytes of a number."""
+
+ENDINGS = {ti.f32: "f32", ti.f64: "f64", ti.i32: "i32", ti.i64: "i64"}
+"""Endings of the names of functions of bitcode."""
 
 
 @ti.func
@@ -66,7 +74,24 @@ def as_matrix(a: ti.template()):
 
 
 class ParticlePhases(Storage):
-    """Material update, particle-to-grid and grid-to-particle transfers and their adjoints."""
+    """Material update, particle-to-grid and grid-to-particle transfers and their adjoints.
+
+    Attributes:
+        code_device: Device whose bitcode the phases call.
+    """
+
+    code_device: str
+
+    def function(self, unit: Law | str, name: str, real: Any = None) -> Callable[..., None]:
+        """Return a function of a law, or of ``transfers`` or ``atomics``, in the simulator's precision or
+        another; it takes local variables."""
+        precision = "f32" if self.real == ti.f32 else "f64"
+        path = bitcode_file(self.code_device, precision, unit, len(self.laws) > 1)
+        return bitcode_function(path, symbol(unit, name, ENDINGS[real] if real else precision))
+
+    def scheduled(self, law: Law) -> bool:
+        """Whether a law has a schedule of its own, with singular values beyond the range of its series."""
+        return law is LAWS["von_mises"]
 
     # -- access to the particle state ---------------------------------------------------------------
 
@@ -155,20 +180,22 @@ class ParticlePhases(Storage):
 
     @ti.func
     def parameters_of_tile(self, e: ti.template(), entry9: ti.template()):
-        """mu, lambda and yield strain of a tile's particles, which are numbers, or lanes where bodies differ;
-        ``entry9`` is the tile's in ``affine``."""
+        """Coefficients of a tile's particles, which are numbers, or lanes where bodies differ, and there of
+        several laws the number of each; ``entry9`` is the tile's in ``affine``."""
         if ti.static(self.mixed):
-            return [self.place_material[entry9 // 3 + i] for i in range(3)]
+            first = entry9 // 9 * ti.static(self.place_rows)
+            return [self.place_material[first + i] for i in range(self.place_rows)]
         else:
-            return self.material[e]
+            return [self.material[e][GROUND + i] for i in range(self.coefficients)]
 
     @ti.func
     def parameters_of_particle(self, e: ti.template(), entry: ti.template(), lane: ti.template()):
-        """mu, lambda and yield strain of one particle; ``entry`` is its tile's, of any time slot."""
+        """The same of one particle; ``entry`` is its tile's, of any time slot."""
         if ti.static(self.mixed):
-            return [self.place_material[self.place_of(entry) * 3 + i][lane] for i in range(3)]
+            first = self.place_of(entry) * ti.static(self.place_rows)
+            return [self.place_material[first + i][lane] for i in range(self.place_rows)]
         else:
-            return self.material[e]
+            return [self.material[e][GROUND + i] for i in range(self.coefficients)]
 
     @ti.func
     def place_of(self, entry):
@@ -177,14 +204,14 @@ class ParticlePhases(Storage):
         return entry // STATE % (self.batch * self.tiles)
 
     @ti.func
-    def accumulate_particle(self, grid_index, entry, lane, mu_bar, lam_bar, yield_bar):
+    def accumulate_particle(self, grid_index, entry, lane, bars: ti.template()):
         """Add one particle's share to the adjoint of its body's material."""
         body = self.place_body[self.place_of(entry)][lane]
-        self.accumulate_material(grid_index * self.materials + body, mu_bar, lam_bar, yield_bar)
+        self.accumulate_material(grid_index * self.materials + body, bars)
 
     @ti.func
     def spectral_material(self, state: ti.template(), source, target, lane, e, update: ti.template()):
-        """:meth:`material_tile` for one particle, by singular values; returns A, row by row."""
+        """Update of one particle under von Mises plasticity by singular values; returns A, row by row."""
         p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + AT_C, lane, 9))
         f = as_matrix(self.load(state, source + AT_F, lane, 9))
@@ -208,7 +235,7 @@ class ParticlePhases(Storage):
         e,
         grid_index,
     ):
-        """:meth:`material_tile_adjoint` for one particle, by singular values, given the adjoint of A."""
+        """Adjoint of :meth:`spectral_material`, given that of A."""
         p = self.parameters_of_particle(e, source, lane)
         c = as_matrix(self.load(state, source + AT_C, lane, 9))
         f = as_matrix(self.load(state, source + AT_F, lane, 9))
@@ -221,9 +248,9 @@ class ParticlePhases(Storage):
         if ti.static(self.full_gradient):
             mu_bar, lam_bar, yield_bar = spectral_parameter_adjoint(g, f_new_bar, tau_bar, p[0], p[1], p[2])
             if ti.static(self.mixed):
-                self.accumulate_particle(grid_index, target, lane, mu_bar, lam_bar, yield_bar)
+                self.accumulate_particle(grid_index, target, lane, [mu_bar, lam_bar, yield_bar])
             else:
-                self.accumulate_material(grid_index, mu_bar, lam_bar, yield_bar)
+                self.accumulate_material(grid_index, [mu_bar, lam_bar, yield_bar])
         c_bar = self.dt * product_nt(g_bar, f) + self.mass * a_bar
         f_bar = g_bar + self.dt * product_tn(c, g_bar)
         for i in ti.static(range(9)):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from plab.errors import ArgumentError
 from plab.scenes import CONTACTS, Scene, SceneError, sample_particles
-from plab.sim.batch import initial_poses, parameter_gradient, require_alike, with_material
+from plab.sim.batch import initial_poses, material_keys, parameter_gradient, require_alike, with_material
 from plab.sim.compiler import ti
 from plab.sim.cpu_engine import CpuEngine
 from plab.sim.memory import held_bytes, require_memory
@@ -196,27 +196,28 @@ class Simulator:
         self._start_from(particles)
         self.reset()
 
-    def set_material(
-        self,
-        youngs_modulus: ArrayLike | None = None,
-        poisson_ratio: ArrayLike | None = None,
-        yield_stress: ArrayLike | None = None,
-    ) -> None:
+    @property
+    def material_keys(self) -> tuple[str, ...]:
+        """Names of the material's parameters, in the order in which :meth:`material_gradient` has them."""
+        return material_keys(self.scenes[0])
+
+    def set_material(self, *values: ArrayLike | None, **named: ArrayLike | None) -> None:
         """Change the material; nothing is compiled anew.
 
         Args:
-            youngs_modulus: Young's modulus, one for all environments or shape [batch]; as it is if None. It
-                is that of all bodies; with shape [batch, body], where bodies have materials of their own, of
+            *values: Values of the parameters, in the order of :attr:`material_keys`; as they are if None.
+                Each is one for all environments, or has the shape [batch]. It is that of all bodies whose law
+                has such a parameter; with shape [batch, body], where bodies have materials of their own, of
                 each.
-            poisson_ratio: Poisson ratio, likewise.
-            yield_stress: von Mises yield stress, likewise.
+            **named: The same by the parameters' names.
 
         Raises:
             SceneError: If a scene could not be simulated with it, or a simulator of one material is given
                 one for each body; nothing is changed then.
         """
         self._require_runtime()
-        scenes = with_material(self.scenes, youngs_modulus, poisson_ratio, yield_stress)
+        given = {**dict(zip(self.material_keys, values, strict=False)), **named}
+        scenes = with_material(self.scenes, {key: value for key, value in given.items() if value is not None})
         for scene in scenes:
             scene.validate()
         self.scenes = scenes
@@ -555,20 +556,25 @@ class Simulator:
         """Gradient of the last :meth:`rollout`'s loss with respect to the material.
 
         Returns:
-            Derivatives with respect to Young's modulus, Poisson ratio and yield stress, shape [batch, 3];
-            where bodies have materials of their own, with respect to those of each body, shape [batch, body,
-            3].
+            Derivatives with respect to the parameters in :attr:`material_keys` (Young's modulus, Poisson
+            ratio and yield stress under von Mises plasticity), shape [batch, parameter]; where bodies have
+            materials of their own, with respect to those of each body, shape [batch, body, parameter], 0
+            where its law has no such parameter.
 
         Raises:
             RuntimeError: If the simulator was built without ``full_gradient=True``, or there was no
                 rollout with a gradient.
         """
         self._require_gradient()
-        materials = self._engine.materials
-        bars = self._engine.material_bar.to_numpy().reshape(self.batch, -1, materials, 3).sum(axis=1)
+        materials, keys = self._engine.materials, self.material_keys
+        bars = self._engine.material_bar.to_numpy()
+        bars = bars.reshape(self.batch, -1, materials, bars.shape[1]).sum(axis=1)
         gradient = np.array(
             [
-                [parameter_gradient(m, bar) for m, bar in zip(scene.materials[:materials], rows, strict=True)]
+                [
+                    parameter_gradient(m, bar, keys)
+                    for m, bar in zip(scene.materials[:materials], rows, strict=True)
+                ]
                 for scene, rows in zip(self.scenes, bars, strict=True)
             ]
         )

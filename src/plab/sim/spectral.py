@@ -1,5 +1,5 @@
 """The material update by singular values, for strains outside the range of the series in
-:mod:`plab.sim.material`.
+:mod:`plab.laws.von_mises`.
 
 Reached by few particles (strong compression, inverted or nearly singular F, stiff materials that do not
 yield), so it is written for robustness: a one-sided Jacobi SVD with proper rotations (det U = det V = 1; the
@@ -7,15 +7,15 @@ smallest singular value carries the sign of det F) and a derivative in divided d
 Material parameters are called as there, matrices are 3x3.
 """
 
+from plab.laws.von_mises import NORM_SHIFT
 from plab.sim.compiler import ti
-from plab.sim.material import NORM_SHIFT
 
 SINGULAR_VALUE_MIN = 0.05
 """Singular values are clamped from below before the logarithm, as in the PlasticineLab release."""
 
 
-# Taichi's own products of matrices take it several times as long to compile; those of plab.sim.linalg are no
-# functions of Taichi's.
+# Taichi's own products of matrices take it several times as long to compile; those of plab.laws.algebra are
+# no functions of Taichi's.
 
 
 @ti.func

@@ -20,10 +20,10 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plab.laws import Law
+from plab.laws.algebra import Series
 from plab.scenes import MANIPULATOR_SHAPES, Scene
-from plab.sim.batch import material_parameters
 from plab.sim.compiler import ti
-from plab.sim.linalg import Series
 from plab.sim.runtime import Runtime
 from plab.sim.shapes import SURFACES, require_surfaces
 from plab.sim.tensors import Array
@@ -74,8 +74,16 @@ STRAINS = 56
 
 STRAIN_D, STRAIN_W, STRAIN_Z, STRAIN_SCALARS = 9, 15, 21, 27
 STRAIN_D_BAR, STRAIN_BARS, STRAIN_G_BAR, STRAIN_PARAMETERS, STRAIN_PARAMETER_BARS = 31, 37, 39, 48, 51
-"""Entries of a tile among these, named as in :mod:`plab.sim.material`: G is first; scalars are J, c2, a1,
-a2; bars those of J, c2; parameters mu, lambda and the yield strain, with adjoints of their own."""
+"""Entries of a tile among these under von Mises plasticity, named as in :mod:`plab.laws.von_mises`: G is
+first; scalars are J, c2, a1, a2; bars those of J, c2; parameters mu, lambda and the yield strain, with
+adjoints of their own."""
+
+LAW_PARAMETERS, LAW_PARAMETER_BARS, STRAIN_LAW = 0, 24, 54
+"""Entries of a tile among these under other laws: coefficients, their adjoints; and under any, the number of
+each lane's law where there are several."""
+
+GROUND = 4
+"""Entries of an environment's material before the law's coefficients: floor friction, gravity (3)."""
 
 LANES = {"cpu": 8, "cuda": 32}
 """Particles per tile."""
@@ -98,7 +106,7 @@ class Storage:
         """Allocate what forward simulation needs of scenes that are alike in all but the per-environment
         data, for :meth:`fill_parameters`; gradients include those by initial state and material if
         ``full_gradient``. The CPU is ``deterministic`` in any case. With ``singular_values`` the series of
-        :mod:`plab.sim.material` serve no particle."""
+        :mod:`plab.laws.von_mises` serve no particle."""
         # Fields that the host reads or writes: number, field, components.
         self.shared: list[tuple[int, ti.Field, int]] = []
         # Adjoints that are sums over a gradient's steps, and the length of their vectors.
@@ -121,6 +129,8 @@ class Storage:
         # Materials of an environment: 1, or one per body.
         self.materials = first.material_count
         self.mixed = self.materials > 1
+        self.laws: tuple[Law, ...] = tuple(dict.fromkeys(m.kind for m in first.materials[: self.materials]))
+        self.coefficients = max(law.size for law in self.laws)
         self.series = Series.for_precision(runtime.precision)
         if singular_values:
             self.series = replace(self.series, z_squared_max=-1.0)
@@ -177,14 +187,15 @@ class Storage:
         # Stress and momentum gradient A (9) of each particle within one substep.
         self.affine = ti.Vector.field(self.lanes, real, shape=b * self.tiles * 9)
         if self.mixed:
-            # Each particle's mu, lambda and yield strain, and the number of its body.
-            self.place_material = self.share(ti.Vector.field(self.lanes, real, shape=b * self.tiles * 3))
+            # Each particle's coefficients and, of several laws, the number of its own; and that of its body.
+            shape = b * self.tiles * self.place_rows
+            self.place_material = self.share(ti.Vector.field(self.lanes, real, shape=shape))
             self.place_body = self.share(ti.Vector.field(self.lanes, ti.i32, shape=b * self.tiles))
             self._bodies = np.zeros((b, self.tiles, 1, self.lanes), int)
         self.momentum = self.scattered_grid(b * self.chunks * self.nodes)
         self.velocity = self.gathered_grid(b * self.nodes)
-        # Material per environment: mu, lambda, yield strain (of its first body), floor friction, gravity (3).
-        self.material = self.share(ti.Vector.field(7, real, shape=b))
+        # Floor friction and gravity (3) of each environment, and the coefficients of its first body.
+        self.material = self.share(ti.Vector.field(GROUND + self.coefficients, real, shape=b))
         self.size = self.share(ti.Vector.field(3, real, shape=(b, m)))
         self.friction = self.share(ti.field(real, shape=(b, m)))
         self.scale = self.share(ti.Vector.field(7, ti.f64, shape=(b, m)))
@@ -229,9 +240,9 @@ class Storage:
         self.velocity_bar = self.scattered_grid(b * self.chunks * self.nodes)
         self.momentum_bar = self.gathered_grid(b * self.nodes)
         self.pose_bar = ti.Vector.field(8, ti.f64, shape=(b, max(1, self.manipulators)))
-        # Adjoints of mu, lambda and yield strain, material by material.
+        # Adjoints of the coefficients, material by material.
         rows = b * self.chunks * self.materials if self.full_gradient else 1
-        self.material_bar = ti.field(ti.f64, shape=(rows, 3))
+        self.material_bar = ti.field(ti.f64, shape=(rows, self.coefficients))
         self.adjoint_sums += [(self.pose_bar, 8), (self.material_bar, 0)]
 
     @ti.kernel
@@ -248,14 +259,30 @@ class Storage:
                     field[i][c] = 0.0
 
     def fill_material(self, scenes: Sequence[Scene]) -> None:
-        """Write material, floor friction and gravity of all environments."""
-        rows = [[*material_parameters(s.materials[0]), s.floor_friction, *s.gravity] for s in scenes]
+        """Write floor friction, gravity and material of all environments."""
+        tables = [self._coefficients(s) for s in scenes]
+        rows = [
+            [s.floor_friction, *s.gravity, *t[0][: self.coefficients]]
+            for s, t in zip(scenes, tables, strict=True)
+        ]
         self.write(self.material, rows)
         if self.mixed:
-            by_body = np.array([[material_parameters(m) for m in s.materials] for s in scenes])
-            columns = np.arange(3).reshape(1, 1, 3, 1)
+            columns = np.arange(self.place_rows).reshape(1, 1, -1, 1)
             environments = np.arange(self.batch).reshape(-1, 1, 1, 1)
-            self.write(self.place_material, by_body[environments, self._bodies, columns])
+            self.write(self.place_material, np.array(tables)[environments, self._bodies, columns])
+
+    def _coefficients(self, scene: Scene) -> list[list[float]]:
+        """Return each material's coefficients, padded, and the number of its law."""
+        rows = []
+        for material in scene.materials[: self.materials]:
+            row = material.kind.coefficients_of(material.values)
+            rows.append([*row, *[0.0] * (self.coefficients - len(row)), self.laws.index(material.kind)])
+        return [row[: self.place_rows] for row in rows]
+
+    @property
+    def place_rows(self) -> int:
+        """Lane vectors of a tile in ``place_material``."""
+        return self.coefficients + (len(self.laws) > 1)
 
     def fill_bodies(self, scenes: Sequence[Scene], order: np.ndarray) -> None:
         """Write whose particles are where, by their numbers at each place, shape [batch, particle], and what
@@ -265,7 +292,11 @@ class Storage:
         places = self._bodies.reshape(self.batch, -1)[:, : self.particles]
         places[:] = [s.particle_bodies[row] for s, row in zip(scenes, order, strict=True)]
         self.write(self.place_body, self._bodies)
+        self.fill_laws(scenes)
         self.fill_material(scenes)
+
+    def fill_laws(self, scenes: Sequence[Scene]) -> None:
+        """Write which laws each tile has; the CPU's tiles are asked for it."""
 
     def fill_parameters(self, scenes: Sequence[Scene]) -> None:
         """Write everything in which environments may differ, terms of the loss excepted."""

@@ -2,7 +2,8 @@
 
 A function that is called with the numbers of a :class:`Trace` records a node per operation.
 :func:`derivatives` walks the record backwards and adds the nodes of the adjoints; :func:`evaluated` computes
-nodes with numbers of any kind: NumPy's arrays, or :class:`material.Lanes`, which write LLVM's instructions.
+nodes with numbers of any kind: NumPy's arrays, or :class:`plab.sim.codegen.llvm.Number`, which writes LLVM's
+instructions.
 Equal nodes are recorded once, and what no output needs is not computed.
 """
 
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated"]
+__all__ = ["Node", "Primitive", "Trace", "derivatives", "evaluated", "frozen"]
 
 Number = Any
 """A node, or a constant that needs none."""
@@ -70,14 +71,41 @@ class Node:
     def __lt__(self, other: Number) -> Node:
         return self.trace.node("less", self, other)
 
+    def __gt__(self, other: Number) -> Node:
+        return self.trace.node("less", other, self)
+
     def __array_ufunc__(self, function: np.ufunc, _method: str, *given: Number) -> Node:
-        """Record :func:`numpy.sqrt` and :func:`numpy.minimum`."""
-        return self.trace.node({np.sqrt: "sqrt", np.minimum: "minimum"}[function], *given)
+        """Record a NumPy function of numbers, or an operator whose left side is a NumPy number."""
+        if function in _OPERATORS:
+            left, right = given
+            return _OPERATORS[function](float(left) if isinstance(left, np.generic) else left, right)
+        return self.trace.node(_FUNCTIONS[function], *given)
 
     def __array_function__(self, function: Any, _types: Any, given: Any, _keywords: Any) -> Number:
         """Record :func:`numpy.where`."""
         assert function is np.where
         return self.trace.node("where", *given)
+
+
+_FUNCTIONS = {
+    np.sqrt: "sqrt",
+    np.minimum: "minimum",
+    np.maximum: "maximum",
+    np.exp: "exp",
+    np.log: "log",
+}
+
+_OPERATORS: dict[np.ufunc, Callable[..., Any]] = {
+    np.add: operator.add,
+    np.subtract: operator.sub,
+    np.multiply: operator.mul,
+    np.divide: operator.truediv,
+}
+
+
+def frozen(number: Number) -> Number:
+    """Return a number whose derivative counts as zero."""
+    return number.trace.node("frozen", number) if isinstance(number, Node) else number
 
 
 class Trace:
@@ -160,6 +188,13 @@ def _shares(node: Node, bar: Number) -> Sequence[Number]:
         case "minimum":
             least = where("less", a, rest[0])
             return where("where", least, bar, 0.0), where("where", least, 0.0, bar)
+        case "maximum":
+            most = where("less", rest[0], a)
+            return where("where", most, bar, 0.0), where("where", most, 0.0, bar)
+        case "exp":
+            return (bar * node,)
+        case "log":
+            return (bar / a,)
         case "where":
             return 0.0, where("where", a, bar, 0.0), where("where", a, 0.0, bar)
     raise ValueError(f"no derivative of {node.operation}")
@@ -176,18 +211,20 @@ def derivatives(outputs: Sequence[Number], bars: Sequence[Number], inputs: Seque
     trace = inputs[0].trace
     varied = {one.place for one in inputs}
     for node in trace.nodes[min(varied) :]:
-        if any(isinstance(one, Node) and one.place in varied for one in node.arguments):
+        if node.operation not in ("frozen", "less") and any(
+            isinstance(one, Node) and one.place in varied for one in node.arguments
+        ):
             varied.add(node.place)
     sums: dict[int, Number] = {}
 
     def share(to: Number, bar: Number) -> None:
-        if isinstance(to, Node) and to.place in varied:
+        if isinstance(to, Node) and to.place in varied and not _is(bar, 0.0):
             sums[to.place] = sums[to.place] + bar if to.place in sums else bar
 
     for output, bar in zip(outputs, bars, strict=True):
         share(output, bar)
     ends = {one.place for one in inputs}
-    for node in reversed(trace.nodes[: max(sums) + 1]):
+    for node in reversed(trace.nodes[: max(sums, default=-1) + 1]):
         if node.place in sums and node.place not in ends:
             for argument, bar in zip(node.arguments, _shares(node, sums[node.place]), strict=True):
                 share(argument, bar)
@@ -203,6 +240,10 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "less": operator.lt,
     "sqrt": np.sqrt,
     "minimum": np.minimum,
+    "maximum": np.maximum,
+    "exp": np.exp,
+    "log": np.log,
+    "frozen": lambda number: number,
     "where": np.where,
 }
 

@@ -7,39 +7,38 @@ the fixed-corotated model is ``tau = 2 mu (V^2 - V) + lambda J (J - 1) I`` with 
 That is what an SVD of G would give.
 
 Yielding keeps ``|d|`` small (0.012 to 0.05 in the suite), so log and exp are short series, exact to
-rounding: :mod:`plab.sim.linalg` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
+rounding: :mod:`plab.laws.algebra` has the coefficients of the polynomials in ``Z = I - 2 (b + I)^-1``, with
 ``d = atanh(Z)``, and in d. Where ``|Z|`` or J leave the range in which the series are exact to rounding,
 :mod:`plab.sim.spectral` takes over with an SVD.
 
 Everywhere d has 6 components, C, F and G have 9; ``j`` is J, ``c2`` J^(-2/3), ``mu`` and ``lam`` are Lame's
-parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.sim.linalg.Series`.
+parameters, ``yield_strain`` is the yield stress / (2 mu), and ``series`` a :class:`plab.laws.algebra.Series`.
 
-The update comes in parts, so that what a scene or a tile does not need is not computed. Components are
-numbers of any kind: NumPy's arrays, say. The simulator runs bitcode: ``make bitcode`` calls these functions
-with numbers that write an instruction at each operation, and derives the adjoint from them by tracing.
+The update comes in parts, so that what a scene or a tile does not need is not computed;
+:mod:`plab.sim.codegen.materials` has their schedule, and :mod:`plab.sim.spectral` what is beyond the series.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
-from plab.sim.linalg import (
+from plab.laws.algebra import (
+    Series,
+    det,
     det_sym,
     exp_coefficients,
     inverse_sym,
     log_coefficients,
-    mul,
     mul_sym_mat,
     outer_sym,
     square_sym,
+    trial_gradient,
 )
+from plab.laws.elastic import ELASTIC, lame
+from plab.laws.law import Parameter
 
 NORM_SHIFT = 1e-8
 """Added to |d|^2 under the square root, as in the PlasticineLab release."""
-
-
-def trial_gradient(c, f, dt):
-    """(I + dt C) F."""
-    cf = mul(c, f)
-    return [f[i] + dt * cf[i] for i in range(9)]
 
 
 def hencky_strain(g, j, series):
@@ -79,11 +78,6 @@ def stress(d, j, c2, mu, lam, yield_strain, series):
     return polynomial_sym(t0, t1 * k, t2 * k * k, d, square_sym(d))
 
 
-def scattered_matrix(tau, c, stress_scale, mass):
-    """A = stress_scale tau + mass C, which a particle scatters, from a symmetric tau (6) and a full C (9)."""
-    return [stress_scale * tau[(0, 3, 4, 3, 1, 5, 4, 5, 2)[i]] + mass * c[i] for i in range(9)]
-
-
 def flow(d, g, yield_strain, series):
     """F' = exp((k - 1) d) G (9 components); the identity where nothing yields."""
     q, det_d, _norm, k = yield_factor(d, yield_strain)
@@ -98,3 +92,36 @@ def yield_factor(d, yield_strain):
     q = 0.5 * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + d[3] * d[3] + d[4] * d[4] + d[5] * d[5]
     norm = np.sqrt(2.0 * q + NORM_SHIFT)
     return q, det_sym(d), norm, np.minimum(yield_strain / norm, 1.0)
+
+
+def update(c, f, dt, mu, lam, yield_strain):
+    """Kirchhoff stress and new F within the range of the series."""
+    series = Series.for_precision("float64")
+    g = trial_gradient(c, f, dt)
+    j = det(g)
+    c2, *_rest, d = hencky_strain(g, j, series)
+    return stress(d, j, c2, mu, lam, yield_strain, series), flow(d, g, yield_strain, series)
+
+
+YIELD_STRAIN_MAX = 1e30
+"""Stands for infinity, which would turn the unused branch into infinity times zero."""
+
+
+def coefficients(youngs_modulus, poisson_ratio, yield_stress):
+    """Lame's parameters and the yield strain."""
+    mu, lam = lame(youngs_modulus, poisson_ratio)
+    limit = np.minimum(yield_stress, YIELD_STRAIN_MAX) / (2.0 * mu)
+    return mu, lam, np.minimum(limit, YIELD_STRAIN_MAX)
+
+
+VON_MISES = replace(
+    ELASTIC,
+    name="von_mises",
+    parameters=(
+        *ELASTIC.parameters,
+        Parameter("yield_stress", 50.0, "[0, inf]", "Pa", "von Mises yield stress; inf never yields"),
+    ),
+    update=update,
+    coefficients=coefficients,
+    stiffness=lambda mu, lam, _limit: 3.0 * lam + 2.0 * mu,
+)

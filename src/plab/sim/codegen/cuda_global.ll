@@ -3,7 +3,7 @@
 
 target triple = "nvptx64-nvidia-cuda"
 
-define void @add_f32(i64* %where, float* %what) alwaysinline {
+define void @atomics_add_f32(i64* %where, float* %what) alwaysinline {
   %place = load i64, i64* %where
   %number = load float, float* %what
   %address = inttoptr i64 %place to float addrspace(1)*
@@ -11,7 +11,7 @@ define void @add_f32(i64* %where, float* %what) alwaysinline {
   ret void
 }
 
-define void @add_f64(i64* %where, double* %what) alwaysinline {
+define void @atomics_add_f64(i64* %where, double* %what) alwaysinline {
   %place = load i64, i64* %where
   %number = load double, double* %what
   %address = inttoptr i64 %place to double addrspace(1)*
@@ -19,7 +19,7 @@ define void @add_f64(i64* %where, double* %what) alwaysinline {
   ret void
 }
 
-define void @look_i32(i64* %where, i32* %what) alwaysinline {
+define void @atomics_look_i32(i64* %where, i32* %what) alwaysinline {
   %place = load i64, i64* %where
   %address = inttoptr i64 %place to i32 addrspace(1)*
   %number = load volatile i32, i32 addrspace(1)* %address
@@ -27,7 +27,7 @@ define void @look_i32(i64* %where, i32* %what) alwaysinline {
   ret void
 }
 
-define void @add_i64(i64* %where, i64* %what) alwaysinline {
+define void @atomics_add_i64(i64* %where, i64* %what) alwaysinline {
   %place = load i64, i64* %where
   %number = load i64, i64* %what
   %address = inttoptr i64 %place to i64 addrspace(1)*

@@ -1,7 +1,7 @@
 """3x3 algebra, and series for the logarithm and exponential of symmetric 3x3 matrices.
 
-Components may be of any kind: numbers, arrays, or what ``make bitcode`` calls these functions with. A matrix
-is a tuple of 9 components in row-major order, a symmetric one a tuple of 6: (00, 11, 22, 01, 02, 12).
+Components may be of any kind, see :class:`plab.laws.Law`. A matrix is a tuple of 9 components in row-major
+order, a symmetric one a tuple of 6: (00, 11, 22, 01, 02, 12).
 
 By Cayley-Hamilton, log and exp are polynomials of degree two in the matrix, with scalar recurrences for their
 coefficients:
@@ -10,7 +10,7 @@ coefficients:
   factor of Z^2 maps the coefficients of (I, Z, Z^2) linearly; Horner's rule runs over these maps.
 * ``exp``: d is traceless, so ``d^3 = q d + D I`` with ``q = tr(d^2) / 2`` and ``D = det d``.
 
-:mod:`plab.sim.material` defines b, Z and d.
+:mod:`plab.laws.von_mises` defines b, Z and d.
 """
 
 import math
@@ -99,6 +99,12 @@ def square_sym(s):
 def mat_from_sym(s):
     """The 9 components of a symmetric matrix."""
     return (s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2])
+
+
+def trial_gradient(c, f, dt):
+    """(I + dt C) F."""
+    cf = mul(c, f)
+    return [f[i] + dt * cf[i] for i in range(9)]
 
 
 def mul_sym_mat(s, b):

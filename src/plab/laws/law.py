@@ -1,0 +1,105 @@
+"""Constitutive laws: parameters, stress, and limit of the time step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from plab.laws.tracing import Trace, derivatives, evaluated
+
+__all__ = ["Law", "Parameter"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a law.
+
+    Attributes:
+        name: Key in a task's YAML.
+        default: Value where none is given.
+        interval: Admissible values, such as ``(0, inf)`` or ``[0, 0.5)``.
+        unit: Unit; empty for a number.
+        meaning: What it is, in a few words.
+    """
+
+    name: str
+    default: float
+    interval: str
+    unit: str = ""
+    meaning: str = ""
+
+    def admits(self, value: float) -> bool:
+        """Whether a value is in the interval."""
+        low, high = (float(end) for end in self.interval[1:-1].split(","))
+        above = value >= low if self.interval[0] == "[" else value > low
+        return above and (value <= high if self.interval[-1] == "]" else value < high)
+
+
+@dataclass(frozen=True)
+class Law:
+    """A constitutive law of isotropic bodies of density 1.
+
+    Its functions are plain Python on components of any kind: numbers, NumPy's arrays, or what writes the
+    instructions of the simulator and records them for the adjoint. They may use ``+ - * /``, comparisons by
+    ``<`` and ``>``, and NumPy's ``sqrt, exp, log, minimum, maximum, where``. Full matrices have 9 components
+    in row-major order, symmetric ones 6: (00, 11, 22, 01, 02, 12).
+
+    Attributes:
+        name: Name in a task's YAML.
+        parameters: Its parameters, in the order in which functions and gradients have them.
+        update: From C (9), F (9), the time step and the coefficients to the Kirchhoff stress (6) and F after
+            the substep (9).
+        stiffness: From the coefficients to 3 lambda + 2 mu at rest [pressure].
+        coefficients: From the parameters to what ``update`` takes of them; the parameters by default.
+        viscosity: From the coefficients to the largest dynamic viscosity [pressure x s].
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    update: Callable[..., tuple[Sequence[Any], Sequence[Any]]]
+    stiffness: Callable[..., float]
+    coefficients: Callable[..., Sequence[Any]] = lambda *values: values
+    viscosity: Callable[..., float] = lambda *_: 0.0
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Default values of the parameters."""
+        return {parameter.name: parameter.default for parameter in self.parameters}
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return len(self.coefficients_of(self.defaults))
+
+    def coefficients_of(self, values: Mapping[str, float]) -> list[float]:
+        """Return the coefficients that belong to values of the parameters."""
+        return [float(number) for number in self.coefficients(*(values[key] for key in self.keys))]
+
+    def largest_step(self, values: Mapping[str, float], dx: float) -> float:
+        """Return the largest stable time step [s] on a grid of spacing dx.
+
+        A lone particle's kernel has the second moment dx^2 / 4 wherever the particle is. Symplectic Euler is
+        stable while K dt^2 + 4 eta dt < dx^2, with the stiffness K and the viscosity eta, at density 1. No
+        mode of a body is faster, because the grid's mass is that of the particles, summed (Irons and
+        Treharne, 1971).
+        """
+        found = self.coefficients_of(values)
+        stiffness, viscosity = float(self.stiffness(*found)), float(self.viscosity(*found))
+        if viscosity == 0.0:
+            return dx / math.sqrt(stiffness)
+        return dx * dx / (2.0 * viscosity + math.sqrt(4.0 * viscosity**2 + stiffness * dx * dx))
+
+    def parameter_gradient(self, values: Mapping[str, float], bars: Sequence[float]) -> list[float]:
+        """Return derivatives by the parameters from those by the coefficients."""
+        trace = Trace()
+        inputs = trace.inputs("values", len(self.parameters))
+        own = derivatives(self.coefficients(*inputs), list(bars), inputs)
+        given = {node: values[key] for node, key in zip(inputs, self.keys, strict=True)}
+        return [float(number) for number in evaluated(own, given)]

@@ -1,0 +1,149 @@
+"""Files of LLVM bitcode that Taichi links into its kernels, written when first needed.
+
+A file has the functions of the transfers or of one law, for one device and one precision. It lies in plab's
+cache folder under a digest of its sources, since Taichi knows compiled kernels by the names of these files:
+an edited formula is another file, and compiles anew.
+
+Taichi 1.7 has LLVM 15, which reads what llvmlite 0.42 to 0.44 write; Quadrants has LLVM 22, as llvmlite 0.50.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import inspect
+import os
+import platform
+import re
+import sys
+import tempfile
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from plab import laws
+from plab.files import cache_dir
+from plab.laws import Law
+
+if TYPE_CHECKING:
+    from plab.sim.codegen.materials import Maker
+
+X86 = "p270:32:32-p271:32:32-p272:64:64-i64:64-f80:128-n8:16:32:64-S128"
+LAYOUTS = {
+    "linux-x86_64": f"e-m:e-{X86}",
+    "win32-amd64": f"e-m:w-{X86}",
+    "darwin-x86_64": f"e-m:o-{X86}",
+    "darwin-arm64": "e-m:o-i64:64-i128:128-n32:64-S128",
+}
+"""Data layouts of the platforms that Taichi has wheels for."""
+
+PLATFORM = f"{sys.platform}-{platform.machine().lower()}"
+
+
+@functools.cache
+def bitcode_file(device: str, precision: str, unit: Law | str, mixed: bool = False) -> str:
+    """Return the path of a file of bitcode, written if it is not there.
+
+    Args:
+        device: ``cpu`` or ``cuda``.
+        precision: ``f32`` or ``f64``.
+        unit: A law, ``transfers`` or ``atomics``.
+        mixed: Whether lanes of a tile may have different laws.
+
+    Raises:
+        plab.sim.DeviceError: If it has to be written, and llvmlite does not load; one line.
+    """
+    code = None
+    digest = hashlib.sha256(repr((_sources(), PLATFORM, device, precision, mixed)).encode())
+    if isinstance(unit, Law):
+        try:
+            digest.update(
+                Path(inspect.getfile(unit.update)).read_bytes() + repr((unit.name, unit.size)).encode()
+            )
+        except (OSError, TypeError):
+            # Typed into an interpreter: there is no file.
+            code = _code(device, precision, unit, mixed)
+            digest.update(code)
+    name = f"{device}-{unit if isinstance(unit, str) else unit.name}-{precision}-{digest.hexdigest()[:12]}.bc"
+    # RuntimeError: there is no home.
+    for folder in (_cache, _temporary):
+        with contextlib.suppress(OSError, RuntimeError):
+            if (folder() / name).exists():
+                return str(folder() / name)
+    code = code or _code(device, precision, unit, mixed)
+    for folder in (_cache, _temporary):
+        with contextlib.suppress(OSError, RuntimeError):
+            path = folder() / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            own = path.with_name(f"{name}.{os.getpid()}")
+            own.write_bytes(code)
+            own.replace(path)
+            return str(path)
+    raise _unsupported("plab found no folder to write its compiled laws to: set PLAB_CACHE_DIR")
+
+
+def _cache() -> Path:
+    return cache_dir() / "laws"
+
+
+@functools.cache
+def _temporary() -> Path:
+    return Path(tempfile.mkdtemp(prefix="plab-laws-"))
+
+
+@functools.cache
+def _sources() -> bytes:
+    """Return a digest of what writes bitcode: plab's own files, and llvmlite."""
+    folders = Path(__file__).parent, Path(laws.__file__).parent
+    files = [path for folder in folders for path in sorted(folder.iterdir()) if path.suffix in (".py", ".ll")]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in files))
+    with contextlib.suppress(PackageNotFoundError):
+        digest.update(version("llvmlite").encode())
+    return digest.digest()
+
+
+def _code(device: str, precision: str, unit: Law | str, mixed: bool) -> bytes:
+    """Return the bitcode of a file."""
+    if device == "cpu" and PLATFORM not in LAYOUTS:
+        raise _unsupported(
+            f"plab's simulator has no data layout for {PLATFORM}: it runs on {', '.join(LAYOUTS)}"
+        )
+    try:
+        import llvmlite.binding as llvm
+        from llvmlite import ir
+    except ImportError as error:
+        raise _unsupported(f"plab compiles its laws with llvmlite, which does not load: {error}") from None
+    from plab.sim.codegen import materials, stencils
+
+    if unit == "atomics":
+        text = Path(__file__).with_name("cuda_global.ll").read_text(encoding="utf-8")
+        if llvm.llvm_version_info[0] > 16:
+            text = re.sub(r"(?:i32|i64|float|double)( addrspace\(1\))?\*", r"ptr\1", text)
+        return bytes(llvm.parse_assembly(text).as_bitcode())
+    makers: Mapping[str, Maker]
+    if isinstance(unit, Law):
+        makers = materials.tile_makers(unit, mixed) if device == "cpu" else materials.particle_makers(unit)
+    else:
+        makers = stencils.TILE_TRANSFERS if device == "cpu" else stencils.PARTICLE_TRANSFERS
+    module = ir.Module("plab")
+    module.data_layout = LAYOUTS[PLATFORM] if device == "cpu" else ""
+    module.triple = "" if device == "cpu" else "nvptx64-nvidia-cuda"
+    for name, make in makers.items():
+        make(module, symbol(unit, name, precision), ir.FloatType() if precision == "f32" else ir.DoubleType())
+    parsed = llvm.parse_assembly(str(module).replace('target triple = ""\n', ""))
+    parsed.verify()
+    return bytes(parsed.as_bitcode())
+
+
+def symbol(unit: Law | str, name: str, precision: str) -> str:
+    """Return the name of a function in a file of bitcode."""
+    return f"{unit if isinstance(unit, str) else unit.name}_{name}_{precision}"
+
+
+def _unsupported(message: str) -> Exception:
+    # The simulator's runtime imports Taichi, which what writes bitcode does not need.
+    from plab.sim.runtime import DeviceError
+
+    return DeviceError(message)

@@ -1,0 +1,354 @@
+"""Constitutive laws: formulas, closed forms, adjoints, compiled functions and their cache."""
+
+import ctypes
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plab.config import build_scene, load_config
+from plab.laws import LAWS, Law, find_law
+from plab.scenes import Material
+from plab.sim import DeviceError
+from plab.sim.codegen import bitcode
+from plab.sim.compiler import ti
+from plab.sim.cuda_sums import add
+from plab.sim.runtime import start_runtime
+
+sys.path.append(str(Path(__file__).parents[1] / "examples" / "own_law"))
+SNOW = find_law("snow:SNOW")
+"""The law of docs/own_law.md."""
+
+ALL = {**LAWS, SNOW.name: SNOW}
+
+DT = 1e-4
+CONSTANTS = (DT, 0.5, 0.3)
+"""Time step, scale of the stress in A, and mass."""
+
+OWN = {"von_mises": {"yield_stress": 20.0}, "viscoplastic": {"yield_stress": 20.0, "exponent": 0.6}}
+"""Values that differ from the defaults, so that some particles yield."""
+
+COUNT = 600
+
+
+def coefficients(law: Law) -> list[float]:
+    return law.coefficients_of({**law.defaults, **OWN.get(law.name, {})})
+
+
+def deformed(strain: float) -> tuple[np.ndarray, np.ndarray]:
+    """C and F of particles, [9, particle], compressed a little."""
+    rng = np.random.default_rng(0)
+    f = 0.99 * np.eye(3).reshape(9, 1) + strain * rng.normal(size=(9, COUNT))
+    return 30.0 * rng.normal(size=(9, COUNT)), f
+
+
+def table(values: object) -> np.ndarray:
+    """Components, some of which are one number for all particles, as [component, particle]."""
+    return np.array(np.broadcast_arrays(*values, np.zeros(COUNT))[: len(values)])
+
+
+def matrices(a: np.ndarray) -> np.ndarray:
+    return a.reshape(3, 3, -1).transpose(2, 0, 1)
+
+
+def updated(law: Law, c: np.ndarray, f: np.ndarray, *own: object) -> tuple[np.ndarray, np.ndarray]:
+    """A (9) and the new F (9)."""
+    materials = pytest.importorskip("plab.sim.codegen.materials")
+    tau, new = law.update(c, f, DT, *own)
+    return table(materials.scattered_matrix(tau, c, *CONSTANTS[1:])), table(new)
+
+
+# ----------------------------------------------------------------------------------------------- formulas
+
+
+def in_principal_stretches(law: Law, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stretches after return mapping and principal Kirchhoff stresses of solids, shape [particle, 3]."""
+    mu, lam, *rest = coefficients(law)
+    j = s.prod(axis=1, keepdims=True)
+    if law.name == "elastic":
+        return s, mu * (s * s - 1.0) + lam * j * (j - 1.0)
+    e = np.log(s)
+    trace = e.sum(axis=1, keepdims=True)
+    d = e - trace / 3.0
+    norm = np.sqrt((d * d).sum(axis=1, keepdims=True) + (1e-8 if law.name == "von_mises" else 0.0))
+    if law.name == "von_mises":
+        limit = rest[0]
+    elif law.name == "drucker_prager":
+        limit = np.maximum(-rest[0] * (3.0 * lam + 2.0 * mu) / (2.0 * mu) * trace, 0.0)
+        trace = np.minimum(trace, 0.0)
+    else:
+        # Bisection for the rate of plastic flow.
+        stress, consistency, exponent = rest
+        low, high = np.zeros_like(norm), 2.0 * mu * norm
+        for _ in range(100):
+            x = 0.5 * (low + high)
+            rate = (x / (math.sqrt(2.0) * consistency)) ** (1.0 / exponent) / math.sqrt(2.0)
+            above = x + 2.0 * mu * DT * rate > 2.0 * mu * norm - stress
+            low, high = np.where(above, low, x), np.where(above, x, high)
+        limit = (stress + low) / (2.0 * mu)
+    k = np.minimum(1.0, limit / norm)
+    new = s * np.exp((k - 1.0) * d)
+    if law.name == "von_mises":
+        return new, 2.0 * mu * (new - 1.0) * new + lam * j * (j - 1.0)
+    return new, 2.0 * mu * k * d + (lam + 2.0 * mu / 3.0) * trace
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if name != "fluid"])
+@pytest.mark.parametrize("strain", [0.0, 0.01])
+def test_solids_are_as_in_principal_stretches(name: str, strain: float) -> None:
+    law, (c, f) = LAWS[name], deformed(strain)
+    u, s, vt = np.linalg.svd(matrices(f) + DT * matrices(c) @ matrices(f))
+    new, stress = in_principal_stretches(law, s)
+    a, f_new = updated(law, c, f, *coefficients(law))
+    tau = (u * stress[:, None]) @ u.transpose(0, 2, 1)
+    wanted = CONSTANTS[1] * tau + CONSTANTS[2] * matrices(c)
+    np.testing.assert_allclose(matrices(a), wanted, atol=1e-9)
+    np.testing.assert_allclose(matrices(f_new), (u * new[:, None]) @ vt, atol=1e-13)
+    assert name == "elastic" or strain == 0.0 or 0.2 < (np.abs(new - s).max(axis=1) > 1e-12).mean()
+
+
+def test_a_fluid_has_pressure_and_newtonian_shear() -> None:
+    c, f = deformed(0.01)
+    bulk, eta = coefficients(LAWS["fluid"])
+    a, new = updated(LAWS["fluid"], c, f, bulk, eta)
+    j = np.linalg.det(matrices(f) + DT * matrices(c) @ matrices(f))[:, None, None]
+    rate = 0.5 * (matrices(c) + matrices(c).transpose(0, 2, 1))
+    rate = rate - np.trace(rate, axis1=1, axis2=2)[:, None, None] * np.eye(3) / 3.0
+    tau = bulk * (j - 1.0) * j * np.eye(3) + 2.0 * eta * j * rate
+    np.testing.assert_allclose(matrices(a), 0.5 * tau + 0.3 * matrices(c), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(matrices(new)), j[:, 0, 0], rtol=1e-14)
+
+
+def sheared(law: Law, own: list[float], rate: float, steps: int, squeeze: float = 1.0) -> np.ndarray:
+    """Kirchhoff stress (6) after steps of simple shear in the plane of x and y."""
+    c, f = np.zeros(9), squeeze * np.eye(3).reshape(9)
+    c[1] = rate
+    for _ in range(steps):
+        tau, f = law.update(c, np.array(f, float), DT, *own)
+    return np.array(tau, float)
+
+
+def test_shear_follows_closed_forms() -> None:
+    """Elastic: mu gamma, and a normal stress mu gamma^2. Fluid: eta times the rate. Herschel-Bulkley: yield
+    stress and consistency times a power of the rate. Sand: what its friction allows of the pressure."""
+    mu, lam = coefficients(LAWS["elastic"])
+    tau = sheared(LAWS["elastic"], [mu, lam], 10.0, 100)
+    np.testing.assert_allclose(tau[[0, 1, 3]], [mu * 0.01, 0.0, mu * 0.1], atol=1e-9)
+    assert sheared(LAWS["fluid"], [5000.0, 2.0], 10.0, 5)[3] == pytest.approx(20.0)
+    for exponent in (1.0, 0.5):
+        tau = sheared(LAWS["viscoplastic"], [mu, lam, 20.0, 3.0, exponent], 10.0, 3000)
+        assert tau[3] == pytest.approx(20.0 / math.sqrt(2.0) + 3.0 * 10.0**exponent, rel=2e-3)
+    sand = LAWS["drucker_prager"]
+    own = sand.coefficients_of(sand.defaults)
+    tau = sheared(sand, own, 10.0, 3000, squeeze=0.999)
+    pressure = -tau[:3].sum() / 3.0
+    assert pressure == pytest.approx((own[1] + 2.0 * own[0] / 3.0) * -3.0 * math.log(0.999), rel=1e-6)
+    deviator = np.sqrt(((tau[:3] + pressure) ** 2).sum() + 2.0 * (tau[3:] ** 2).sum())
+    assert deviator == pytest.approx(3.0 * own[2] * pressure, rel=1e-6)
+
+
+def test_triaxial_compression_of_sand_fails_by_mohr_and_coulomb() -> None:
+    """The smaller principal stress is (1 - sin phi) / (1 + sin phi) of the larger."""
+    sand = LAWS["drucker_prager"]
+    for angle in (20.0, 35.0):
+        f = np.diag([0.98, 1.004, 1.004]).reshape(9)
+        tau, _new = sand.update(
+            np.zeros(9), f, DT, *sand.coefficients_of({**sand.defaults, "friction_angle": angle})
+        )
+        sine = math.sin(math.radians(angle))
+        assert tau[1] / tau[0] == pytest.approx((1.0 - sine) / (1.0 + sine), rel=1e-9)
+
+
+def test_separated_sand_carries_nothing_until_it_is_back_at_its_volume() -> None:
+    sand = LAWS["drucker_prager"]
+    f, seen = np.eye(3).reshape(9), []
+    for rate in (200.0, 200.0, -200.0, -150.0, -60.0):
+        tau, f = sand.update(rate * np.eye(3).reshape(9), np.array(f), DT, *coefficients(sand))
+        seen.append(tau[0])
+    assert np.abs(seen[:4]).max() == 0.0 and seen[4] < -1.0
+
+
+# ----------------------------------------------------------------------------------------------- adjoints
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if name != "von_mises"])
+@pytest.mark.parametrize("strain", [0.0, 1e-4, 0.01, 0.1])
+def test_adjoints_of_laws_are_central_differences(name: str, strain: float) -> None:
+    """By C, F and each coefficient, also where all stretches are equal."""
+    from plab.sim.codegen.materials import law_adjoint
+
+    law, (c, f) = ALL[name], deformed(strain)
+    rng = np.random.default_rng(1)
+    a_bar, f_bar = rng.normal(size=(2, 9, COUNT))
+    own = [np.full(COUNT, value) for value in coefficients(law)]
+    bars = law_adjoint(law, c, f, own, CONSTANTS, a_bar, f_bar)
+    ways = [30.0 * rng.normal(size=c.shape), 0.01 * rng.normal(size=f.shape)]
+    ways.append([value * rng.normal(size=COUNT) for value in own])
+
+    def loss(step: float) -> np.ndarray:
+        given = [x + step * way for x, way in zip(own, ways[2], strict=True)]
+        a, new = updated(law, c + step * ways[0], f + step * ways[1], *given)
+        return (a_bar * a).sum(axis=0) + (f_bar * new).sum(axis=0)
+
+    h = 1e-4
+    slope = (8.0 * (loss(h) - loss(-h)) - (loss(2.0 * h) - loss(-2.0 * h))) / (12.0 * h)
+    wanted = sum((table(bar) * way).sum(axis=0) for bar, way in zip(bars, ways, strict=True))
+    error = np.abs(slope - wanted) / (np.abs(wanted) + 0.1 * np.abs(wanted).mean())
+    # At kinks, such as the onset of yield, the slopes of both sides differ.
+    assert np.quantile(error, 0.99) < 1e-6
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_parameters_are_differentiated_and_limit_the_time_step(name: str) -> None:
+    law = ALL[name]
+    values = {**law.defaults, **OWN.get(name, {})}
+    bars = np.random.default_rng(2).normal(size=law.size) / coefficients(law)
+    for key, slope in zip(law.keys, law.parameter_gradient(values, bars), strict=True):
+        up, down = ({**values, key: values[key] * (1.0 + sign * 1e-6)} for sign in (1, -1))
+        rise = bars @ np.subtract(law.coefficients_of(up), law.coefficients_of(down))
+        assert slope == pytest.approx(rise / (2e-6 * values[key]), rel=1e-6, abs=1e-9), key
+    assert 0.0 < law.largest_step(values, 0.01) < 0.01
+    for parameter in law.parameters:
+        assert parameter.admits(parameter.default) and not parameter.admits(-1.0)
+
+
+# ----------------------------------------------------------------------------------------------- compiled
+
+
+def compiled(device: str, precision: str, law: Law, mixed: bool = False):
+    """A function that calls functions of a law's bitcode by name, with arrays whose addresses they take."""
+    llvm = pytest.importorskip("llvmlite.binding")
+    llvm.initialize()
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    host = llvm.Target.from_default_triple().create_target_machine(opt=0)
+    module = llvm.parse_bitcode(bitcode._code(device, precision, law, mixed))
+    module.triple, module.data_layout = llvm.get_default_triple(), str(host.target_data)
+    engine = llvm.create_mcjit_compiler(module, host)
+    engine.finalize_object()
+
+    def call(name: str, *arrays: np.ndarray) -> None:
+        address = engine.get_function_address(bitcode.symbol(law, name, precision))
+        ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(arrays))(address)(*[a.ctypes.data for a in arrays])
+
+    call.engine = engine
+    return call
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("name", [name for name in ALL if name != "von_mises"])
+def test_compiled_laws_compute_their_formulas(name: str, precision: str) -> None:
+    """A tile on the CPU, one with lanes of another law, and a particle on CUDA; forward and adjoint."""
+    from plab.sim.codegen.materials import law_adjoint
+    from plab.sim.storage import AT_C, AT_F, LAW_PARAMETER_BARS, STATE, STRAIN_LAW, STRAINS
+
+    law, lanes = ALL[name], 8
+    kind, tolerance = (np.float32, 2e-5) if precision == "f32" else (np.float64, 1e-13)
+    rng = np.random.default_rng(3)
+    state, bar = rng.normal(size=(2, STATE, lanes)).astype(kind)
+    state[AT_C:AT_F], state[AT_F:] = (x[:, :lanes] for x in deformed(0.01))
+    affine, own = rng.normal(size=(9, lanes)).astype(kind), coefficients(law)
+    c, f = (x.astype(float) for x in (state[AT_C:AT_F], state[AT_F:]))
+    a, f_new = (x[:, :lanes] for x in updated(law, *deformed(0.01), *own))
+    spread = [np.full(lanes, value) for value in own]
+    c_bar, f_bar, own_bar = (
+        np.array(np.broadcast_arrays(*x, c[0])[: len(x)])
+        for x in law_adjoint(law, c, f, spread, CONSTANTS, affine.astype(float), bar[AT_F:].astype(float))
+    )
+
+    def close(got: np.ndarray, want: np.ndarray) -> None:
+        np.testing.assert_allclose(got, want, rtol=0, atol=tolerance * np.abs(want).max())
+
+    numbers = [np.array([value], kind) for value in (1.0, *CONSTANTS)]
+    for mixed in (False, True):
+        strains, out, new = np.zeros((STRAINS, lanes), kind), np.zeros((9, lanes), kind), state.copy()
+        strains[: law.size] = np.array(own)[:, None]
+        mine = np.arange(lanes) % 3 > 0 if mixed else np.full(lanes, True)
+        strains[STRAIN_LAW] = mine
+        call = compiled("cpu", precision, law, mixed)
+        at = [np.array([x.ctypes.data], np.uint64) for x in (strains, state, out, new)]
+        call("update", *at, *numbers)
+        close(out[:, mine], a[:, mine])
+        close(new[AT_F:, mine], f_new[:, mine])
+        assert (out[:, ~mine] == 0.0).all() and (new[:, ~mine] == state[:, ~mine]).all()
+        given = bar.copy()
+        at = [np.array([x.ctypes.data], np.uint64) for x in (strains, state, affine, given)]
+        call("adjoint", *at, *numbers)
+        close(given[AT_C:AT_F, mine], c_bar[:, mine])
+        close(given[AT_F:, mine], f_bar[:, mine])
+        assert (given[:, ~mine] == bar[:, ~mine]).all()
+        bars = strains[LAW_PARAMETER_BARS : LAW_PARAMETER_BARS + law.size]
+        close(bars[:, mine] * np.array(own)[:, None], own_bar[:, mine] * np.array(own)[:, None])
+    call = compiled("cuda", precision, law)
+    held = [np.array([x], kind) for x in (*state[AT_C:, 0], *own)]
+    call("particle", *held, *numbers[1:])
+    close(np.ravel(held[:9]), a[:, 0])
+    close(np.ravel(held[9:18]), f_new[:, 0])
+    held = [np.array([x], kind) for x in (*state[AT_C:, 0], *affine[:, 0], *bar[AT_F:, 0], *own)]
+    call("particle_adjoint", *held, *numbers[1:])
+    close(np.ravel(held[:9]), c_bar[:, 0])
+    close(np.ravel(held[9:18]), f_bar[:, 0])
+
+
+def test_compiled_laws_are_kept_in_the_cache(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "cache"))
+    given = ("cpu", "f32", LAWS["elastic"])
+    path = Path(bitcode.bitcode_file.__wrapped__(*given))
+    assert path.parent == tmp_path / "cache" / "laws" and [p.name for p in path.parent.iterdir()] == [
+        path.name
+    ]
+    time = path.stat().st_mtime_ns
+    assert bitcode.bitcode_file.__wrapped__(*given) == str(path) and path.stat().st_mtime_ns == time
+    # Without a cache, a folder of the process serves; without llvmlite, one line says so.
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path / "file"))
+    other = Path(bitcode.bitcode_file.__wrapped__(*given))
+    assert other != path and other.name == path.name and other.exists()
+    other.unlink()
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    with pytest.raises(DeviceError, match="llvmlite"):
+        bitcode.bitcode_file.__wrapped__(*given)
+
+
+def test_many_threads_add_to_numbers_of_a_field() -> None:
+    start_runtime("cpu", "float32")
+    values = np.arange(1, 1001)
+    for kind, size in ((ti.f32, 4), (ti.f64, 8), (ti.i64, 8)):
+        sums = ti.Vector.field(4, kind, shape=3)
+
+        @ti.kernel
+        def add_all(given: ti.types.ndarray()):
+            for i in range(given.shape[0]):
+                add(kind, ti.get_addr(sums, 0) + ti.cast(size * (4 * (i % 3) + 2), ti.u64), given[i])  # noqa: B023
+
+        add_all(values)
+        expected = np.zeros((3, 4))
+        expected[:, 2] = [values[k::3].sum() for k in range(3)]
+        np.testing.assert_array_equal(sums.to_numpy(), expected)
+
+
+def test_laws_are_found_by_name() -> None:
+    assert Material(5000.0, 0.2, 50.0).kind is LAWS["von_mises"]
+    with pytest.raises(ValueError, match="law 'drucker' does not exist; choose from: von_mises"):
+        find_law("drucker")
+    with pytest.raises(ValueError, match=r"friction is no parameter of law elastic"):
+        Material(5000.0, 0.2, 50.0, "elastic", (("friction", 1.0),)).validate()
+    with pytest.raises(ValueError, match=r"friction_angle 95 is outside \[0, 90\)"):
+        Material(5000.0, 0.2, 50.0, "drucker_prager", (("friction_angle", 95.0),)).validate()
+
+
+def test_the_page_on_laws_shows_its_example_and_what_it_prints(capsys) -> None:
+    root = Path(__file__).parents[1]
+    page = (root / "docs" / "own_law.md").read_text(encoding="utf-8")
+    law, trial = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert law == (root / "examples/own_law/snow.py").read_text(encoding="utf-8")
+    task = (root / "examples/own_law/conf/task/Snow.yaml").read_text(encoding="utf-8")
+    assert all(excerpt in task for excerpt in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL))
+    exec(law + trial, {})
+    assert capsys.readouterr().out == re.findall(r"```text\n(.*?)```", page, re.DOTALL)[0]
+    cfg = load_config(["task=Snow", "variant=2"], root / "examples/own_law/conf")
+    (material,) = build_scene(cfg).materials
+    assert material.kind is SNOW and material.values["compression"] == 0.01
