@@ -298,13 +298,14 @@ def test_a_run_improves_on_its_start_and_tells_what_it_cost(finished, method: st
 
 
 def stop_before(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
-    """Let runs end before an iteration, as if their process did."""
+    """Let runs end before the row of an iteration, as if their process did."""
     intact = planner.PlannerRunner.iterate
 
     def iterate(self, tracks):
+        steps = list(intact(self, tracks))
         if tracks[0].iteration == iteration:
             raise OSError("gone")
-        yield from intact(self, tracks)
+        yield from steps
 
     monkeypatch.setattr(planner.PlannerRunner, "iterate", iterate)
 

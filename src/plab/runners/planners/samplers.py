@@ -246,7 +246,8 @@ class Cmaes(Sampler):
 
     def state(self) -> dict[str, Any]:
         held = self._search.__getstate__()
-        return super().state() | {"search": {name: v for name, v in held.items() if v is not None}}
+        # Copies: the library changes some of its arrays in place.
+        return super().state() | {"search": {name: np.array(v) for name, v in held.items() if v is not None}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
