@@ -65,9 +65,10 @@ TABLES = {
 """Tables of a method, and the key of ``protocol`` whose value chooses a row."""
 
 
-def _by_task(table: str, default: Any = None, *, _root_: DictConfig) -> Any:
+def _by_task(table: str, default: Any = None, *, _parent_: DictConfig, _root_: DictConfig) -> Any:
     """Return the entry of a method's table for the protocol and the task, or for ``other`` tasks."""
-    row = _root_.method[table].get(_root_.protocol[TABLES[table]], default)
+    method = _parent_ if table in _parent_ else _root_.method
+    row = method[table].get(_root_.protocol[TABLES[table]], default)
     return row.get(_root_.task.name, row.get("other", default)) if isinstance(row, DictConfig) else row
 
 
@@ -251,8 +252,9 @@ def finish(composed: DictConfig, words: Sequence[str] = (), *, alone: bool = Tru
         overrides = parse(words)
         _require_effect(composed, overrides, alone)
         _choose_profile(composed.method)
-        if "lr_by_task" in composed.method:
-            _resolve(composed.method, TABLES)
+        for section in (composed.method, composed.method.get("planner", {})):
+            if "lr_by_task" in section:
+                _resolve(section, TABLES)
         _choose_numbers(composed, overrides)
         _choose_variant(composed, overrides)
         parts = vars(OmegaConf.to_object(composed))
@@ -379,6 +381,8 @@ def _typed_method(method: DictConfig, path: str) -> DictConfig:
     if isinstance(stages := method.get("stages"), DictConfig):
         for name in stages:
             stages[name] = _typed_method(stages[name], f"{path}.stages.{name!s}")
+    if isinstance(planner := method.get("planner"), DictConfig):
+        method.planner = _typed_method(planner, f"{path}.planner")
     kind = family(str(method.family)).config_type(method.get("algorithm"))
     # Below a root, so that what is wrong is named by its whole key.
     root = OmegaConf.create({})

@@ -120,6 +120,7 @@ FAMILIES: Mapping[str, Family] = _Registry(
     pods="plab.runners.pods:FAMILY",
     shac="plab.runners.shac:FAMILY",
     bc="plab.runners.bc:FAMILY",
+    mpc="plab.runners.mpc:FAMILY",
 )
 """plab's own families by name, the ``family`` of a method's YAML."""
 

@@ -162,5 +162,5 @@ FAMILY = Family(
     ranking="score",
     rules={"bc": Rule(Cloning, BcConfig)},
     contact="hard",
-    methods={"bc": Appearance("BC", "#882255", "-.")},
+    methods={"bc": Appearance("BC", "#661100", "-.")},
 )

@@ -97,7 +97,7 @@ class Track:
         self.iteration, self.best_loss = rows, result.best_loss
         self.best_actions = result.best_actions
         self._by_score = family(cfg.method.family).ranking == "score"
-        known = self._by_score and rows > 0
+        known = self._by_score and result.best_iteration >= 0
         self._best_score = float(columns["score"][result.best_iteration]) if known else -np.inf
         self._budget = {name: int(columns[name][-1]) if rows and name in columns else 0 for name in BUDGETS}
 

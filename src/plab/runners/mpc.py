@@ -1,0 +1,243 @@
+"""Model-predictive control: ``mpc`` plans some steps ahead, takes the first of them, and plans again.
+
+Any planner or gradient method plans, from the state that has been reached; the section ``method.planner`` has
+its keys. The next plan starts from the rest of the last. To reproduce a result:
+
+    plab run task=Move variant=1 method=mpc seed=0
+    plab run task=Move variant=1 method=mpc method@method.planner=adam seed=0
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plab.config import ConfigError, MethodConfig, ranges
+from plab.config.families import Appearance, Family, family
+from plab.runners.libraries import torch
+from plab.runners.planners.planner import (
+    Asking,
+    CandidateStart,
+    Planner,
+    PlannerConfig,
+    PlannerRunner,
+    Request,
+    make_planner,
+)
+from plab.runners.runner import Step, Track
+from plab.runners.trajectory import TrajectoryConfig
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from plab.sim import State
+
+
+@dataclass
+class MpcConfig(MethodConfig):
+    """Model-predictive control.
+
+    Attributes:
+        window: Steps that a plan looks ahead; less at the end of the episode.
+        execute: Steps taken of each plan.
+        planner: Section ``method`` of a planner or gradient method; its iterations are those of each plan.
+    """
+
+    window: int = field(metadata=ranges.COUNT)
+    execute: int = field(metadata=ranges.COUNT)
+    planner: Any
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        if not isinstance(self.planner, PlannerConfig | TrajectoryConfig):
+            raise ConfigError(f"{path}.planner cannot plan: choose cem, mppi, cmaes, multistart, adam or gd")
+        if self.execute > self.window:
+            raise ConfigError(
+                f"{path}.execute must be at most {path}.window={self.window} (got {self.execute})"
+            )
+        self.planner.check(f"{path}.planner")
+
+    @property
+    def population(self) -> int:
+        """Candidates that are tried together."""
+        return getattr(self.planner, "population", 1)
+
+
+class Descent(Planner):
+    """A gradient method as a planner of one candidate."""
+
+    method: Any
+
+    def begin(self, random: torch.Generator, found: Tensor) -> None:
+        """Start from the best that has been found, or from random actions."""
+        seed = int(torch.randint(2**31, (1,), generator=random, device=self.start.device))
+        kind = family(self.method.family).rules[self.method.optimizer].what
+        self._rule = kind(self.method, self.start.shape, seed)
+        if len(found):
+            self._rule.actions = found[0].cpu().numpy()
+
+    def iterate(self, random: torch.Generator) -> Asking:
+        """Update the actions by their gradient."""
+        tried = self.candidates()
+        softness = self.method.softness if self.method.contact == "soft" else None
+        answer = yield Request(tried, softness, gradient=True)
+        if answer.gradient is not None:
+            self._rule.step(answer.gradient[0].cpu().numpy())
+        if softness is not None:
+            answer = yield Request(tried)
+        return self.show(tried, answer)
+
+    def candidates(self) -> Tensor:
+        """Return the actions, shape [1, T, A]."""
+        return torch.as_tensor(self._rule.actions, device=self.start.device)[None]
+
+
+class Replanning(CandidateStart):
+    """Random starts in the middle of an episode: those that go to the body are for its beginning."""
+
+    def draw(self, method: PlannerConfig, count: int, random: torch.Generator) -> Tensor:
+        """Draw candidates, shape [count, T, A]."""
+        return super().draw(replace(method, contact_starts=0.0), count, random)
+
+
+class MpcRunner(PlannerRunner):
+    """Plans and executes; each iteration is a plan of the steps ahead and the execution of some of them.
+
+    A row measures the steps taken so far; only the last, of a whole episode, can have the best actions.
+    """
+
+    def build(self) -> None:
+        """Make the problem, with an environment per candidate."""
+        super().build()
+        self._beginning = self._here()
+        (self._track,) = self.tracks
+        self._method = self._track.cfg.method_as(MpcConfig)
+
+    def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
+        """Begin the episode, or take the steps of the file again."""
+        self._executed = np.zeros((0, self.problem.scenes[0].action_dim))
+        self._found: Tensor | None = None
+        self._terms: list[np.ndarray] = []
+        self._first_loss = float(self.problem.loss_of(self.problem.simulator.measure().terms)[0])
+        self._go_to(self._beginning)
+        if state is not None:
+            self._execute(np.array(state["executed"]))
+            if "found" in state:
+                self._found = torch.as_tensor(np.array(state["found"]), device=self._device)
+
+    def iterations(self, track: Track) -> int:
+        """Return how many plans an episode takes."""
+        return math.ceil(track.cfg.sim.horizon / self._method.execute)
+
+    def has_more(self, track: Track) -> bool:
+        """Return whether steps are left."""
+        return track.iteration < self.iterations(track)
+
+    def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
+        """Plan from here, and take the first steps of the plan."""
+        begin, track, method = time.perf_counter(), self._track, self._method
+        scene, taken = self.problem.scenes[0], len(self._executed)
+        ahead = min(method.window, scene.horizon - taken)
+        kind = Replanning if taken else CandidateStart
+        start = kind(replace(scene, horizon=ahead), self.problem.target_mass[0], self._device)
+        gradient = isinstance(method.planner, TrajectoryConfig)
+        planner = Descent(method.planner, start) if gradient else make_planner(method.planner, start)
+        found = None if self._found is None else self._found[:, :ahead]
+        spent = {True: 0, False: 0}
+        for number in range(method.planner.iterations):
+            asking, answer = planner.plan(self._numbers(number), found if number == 0 else None), None
+            try:
+                while True:
+                    request = next(asking) if answer is None else asking.send(answer)
+                    spent[request.gradient] += request.actions.shape[0] * ahead
+                    answer = self._try({track: request})[track]
+                    if not track.open:
+                        return
+            except StopIteration:
+                pass
+        plans = planner.found()
+        share = plans[0, : method.execute].cpu().numpy()
+        self._execute(share)
+        # The rest of each plan, and its last action on and on.
+        left = plans[:, len(share) :] if plans.shape[1] > len(share) else plans[:, -1:]
+        last = left[:, -1:].expand(-1, method.window - left.shape[1], -1)
+        self._found = torch.cat([left, last], dim=1)
+        actions = np.zeros((scene.horizon, scene.action_dim))
+        actions[: len(self._executed)] = self._executed
+        state = {"executed": self._executed, "found": self._found.cpu().numpy()}
+        yield (
+            track,
+            Step(
+                self._measures(),
+                actions,
+                state,
+                steps_forward=spent[False] + len(share),
+                steps_gradient=spent[True],
+                seconds=time.perf_counter() - begin,
+                whole=len(self._executed) == scene.horizon,
+            ),
+        )
+
+    def close(self) -> None:
+        """Return to the beginning, from which the episode is judged."""
+        if hasattr(self, "_beginning"):
+            self._go_to(self._beginning)
+
+    def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
+        """Report how the episode goes."""
+        text = f"step {len(self._executed)} hard score {rows[0]['score']:.3f}"
+        self.report(self._track.iteration, text)
+
+    def _numbers(self, number: int) -> torch.Generator:
+        """Return the random numbers of an iteration of the plan, which a resumed run draws again."""
+        key = [self._track.cfg.seed, self._track.iteration, number]
+        seed = np.random.SeedSequence(key).generate_state(1, np.uint64)[0]
+        return torch.Generator(self._device).manual_seed(int(seed) >> 1)
+
+    def _execute(self, actions: np.ndarray) -> None:
+        """Take steps in the hard contact model, actions of shape [k, A], and plan from where they lead."""
+        simulator = self.problem.simulator
+        simulator.set_contact("hard")
+        done = simulator.rollout(np.stack([actions] * simulator.batch), gradient=False)
+        self._terms += list(done.step_terms[0])
+        self._executed = np.concatenate([self._executed, actions])
+        self._go_to(self._here())
+
+    def _here(self) -> State:
+        """Return the state of the first environment, for all of them."""
+        state = self.problem.simulator.state()
+        shared = {name: np.repeat(own[:1], len(own), axis=0) for name, own in vars(state).items()}
+        return replace(state, **shared)
+
+    def _go_to(self, state: State) -> None:
+        self.problem.simulator.set_initial_state(state)
+
+    def _measures(self) -> dict[str, float]:
+        """Return the measures of the steps taken so far."""
+        problem, terms = self.problem, np.array(self._terms)
+        loss = problem.loss_of(terms)
+        iou = problem.simulator.measure().iou
+        sums = zip(problem.term_names, terms.sum(axis=0).tolist(), strict=True)
+        return {
+            "loss": float(loss.sum()),
+            **{f"loss_{name}": total for name, total in sums},
+            "reward": float((self._first_loss - loss).sum()),
+            "iou": float(iou[0]),
+            "score": float(problem.scores_of(iou)[0][0]),
+        }
+
+
+FAMILY = Family(
+    label="actions of plans that are made anew every few steps",
+    config=MpcConfig,
+    runner=MpcRunner,
+    ranking="score",
+    contact="hard",
+    methods={"mpc": Appearance("MPC", "#999999", "--")},
+)
