@@ -64,10 +64,10 @@ class UncheckedScene(Scene):
 
 @dataclass(frozen=True)
 class Resolution:
-    """How something is simulated.
+    """Discretisation and arithmetic of a simulation.
 
     Attributes:
-        axis: What is varied: ``substeps`` or ``grid``.
+        axis: Varied quantity: ``substeps`` or ``grid``.
         grid: Grid nodes per axis.
         substeps: Substeps per environment step.
         precision: ``float32`` or ``float64``.
@@ -83,7 +83,7 @@ class Resolution:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run.
+    """Settings and references of a comparison.
 
     Attributes:
         grid: Grid of the settings that differ in substeps.
@@ -173,10 +173,6 @@ def lattice(bodies: Sequence[Body], spacing: float) -> list[np.ndarray]:
     return out
 
 
-def _volume(body: Body) -> float:
-    return float(np.prod(body.size)) if body.shape == "box" else 4.0 / 3.0 * np.pi * body.size[0] ** 3
-
-
 class Attempt:
     """A task with the actions that are tried and the states that they half reach."""
 
@@ -197,7 +193,7 @@ class Attempt:
         """
         plan, scene = self._plan, self.scene
         if setting.axis == "grid":
-            volume = sum(_volume(body) for body in scene.bodies)
+            volume = sum(body.volume for body in scene.bodies)
             parts = lattice(scene.bodies, np.cbrt(volume / plan.particles) * plan.grid / setting.grid)
             counted = zip(scene.bodies, parts, strict=True)
             scene = replace(scene, bodies=tuple(replace(b, particles=len(x)) for b, x in counted))

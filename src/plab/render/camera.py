@@ -85,7 +85,7 @@ def fit_camera(points: np.ndarray, view: View, aspect: float) -> Camera:
     """Return the camera whose pictures hold all points.
 
     Args:
-        points: What is to be seen [domain units], shape [point, 3].
+        points: Points in the picture [domain units], shape [point, 3].
         view: Direction to look from.
         aspect: Width of the picture over its height.
     """

@@ -30,7 +30,7 @@ def require_packages(who_needs: str, packages: Mapping[str, str], extra: str) ->
     """Raise :class:`RenderError` if a package is missing.
 
     Args:
-        who_needs: What begins the message: ``pictures need``.
+        who_needs: Start of the message: ``pictures need``.
         packages: Names for readers by those that are imported.
         extra: The extra that installs them.
     """

@@ -66,7 +66,7 @@ def save(recording: RecordedRollout, path: Path, size: tuple[int, int], every: i
     """Write a recording: a strip as PNG, a film as GIF or MP4.
 
     Args:
-        recording: What to show.
+        recording: The rollout.
         path: File to write; see :func:`check_output`.
         size: Width and height of a frame [pixels]; even numbers for MP4.
         every: Environment steps from one frame of a film to the next.

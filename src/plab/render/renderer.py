@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pyvista as pv
@@ -55,7 +56,7 @@ class Renderer:
 
     Attributes:
         size: Width and height of the pictures [pixels].
-        camera: Where the pictures are taken from.
+        camera: Camera of the pictures.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Renderer:
                 or surfaces are rough.
             target_mass: Mass tensor of the target, shape [n, n, n]; None draws no target.
             size: Width and height of the pictures [pixels].
-            camera: Where the pictures are taken from; :func:`plab.render.camera.scene_camera` if None.
+            camera: Camera of the pictures; :func:`plab.render.camera.scene_camera` if None.
         """
         if len(size) != 2 or min(size) < 1:
             raise ArgumentError(f"size must be width and height in pixels (got {size})")
@@ -168,9 +169,8 @@ class Renderer:
     def _draw(self, shown: Sequence[pv.Actor], clouds: Sequence[Cloud]) -> np.ndarray:
         """Draw some of the actors, and the shadows of clouds."""
         plotter = self._window()
-        for thing in self._things:
-            for actor in thing.actors:
-                actor.visibility = any(actor is other for other in shown)
+        for actor in (actor for thing in self._things for actor in thing.actors):
+            actor.visibility = any(actor is other for other in shown)
         self._floor.shade(floor_light(clouds, self._light))
         plotter.renderer.ResetCameraClippingRange()
         plotter.render()
@@ -224,7 +224,7 @@ class Clay:
     """A surface of plasticine, darker in its corners.
 
     Attributes:
-        actors: What stands for it in the window: one actor.
+        actors: Its actor.
     """
 
     def __init__(self, plotter: pv.Plotter, mesh: pv.PolyData, color: str) -> None:
@@ -247,9 +247,9 @@ class Rigid:
     """A manipulator.
 
     Attributes:
-        actors: What stands for its parts in the window.
-        cloud: What stands for it in shadows, at the last pose.
-        moves: Whether actions move it.
+        actors: Actors of its parts.
+        cloud: Points that throw its shadow, at the last pose.
+        moves: True if actions move it.
     """
 
     def __init__(self, plotter: pv.Plotter, manipulator: Manipulator) -> None:
@@ -257,11 +257,8 @@ class Rigid:
         self.moves = manipulator.action_dim > 0
         self._parts = manipulator_parts(manipulator)
         self._samples = [part.scatter(_SAMPLE_AREA) for part in self._parts]
-        self.actors: list[pv.Actor] = []
-        for part in self._parts:
-            self.actors.append(
-                plotter.add_mesh(part_mesh(part), color=MANIPULATOR_COLOR, culling="back", **_METAL)
-            )
+        look: dict[str, Any] = {"color": MANIPULATOR_COLOR, "culling": "back", **_METAL}
+        self.actors = [plotter.add_mesh(part_mesh(part), **look) for part in self._parts]
 
     def place(self, pose: np.ndarray) -> None:
         """Put it at a pose, shape [8]; it is opaque there."""
@@ -285,10 +282,10 @@ class Target:
     """The target, as a ghost and as a solid.
 
     Attributes:
-        actors: What stands for both in the window.
+        actors: Actors of both.
         mesh: Its surface.
-        cloud: What stands for the solid in shadows.
-        ghost: What stands for the ghost: where it is outside plasticine, and inside.
+        cloud: Points that throw the solid's shadow.
+        ghost: Actors of the ghost: outside plasticine, and inside.
         solid: The solid.
     """
 

@@ -93,11 +93,10 @@ def stored(path: Path) -> tuple[Config, np.ndarray]:
         reason = str(error).splitlines()[0]
         raise RenderError(f"{path} has a configuration that cannot be replayed: {reason}") from error
     actions = run.best_actions
-    if actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
-        shape = list(actions.shape)
-        raise RenderError(f"{path} has actions of shape {shape}, but its task takes [steps, {components}]")
-    if actions.dtype.kind not in "iuf" or not np.isfinite(actions).all():
-        raise RenderError(f"{path} has actions that are not finite numbers")
+    numbers = actions.dtype.kind in "iuf" and np.isfinite(actions).all()
+    if not numbers or actions.ndim != 2 or not len(actions) or actions.shape[1] != components:
+        has = f"actions of shape {list(actions.shape)}"
+        raise RenderError(f"{path} has {has}, its task takes finite ones of shape [steps, {components}]")
     return cfg, actions
 
 

@@ -54,7 +54,7 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
     """Return how much light reaches the floor.
 
     Args:
-        clouds: What is above it.
+        clouds: Bodies and manipulators above it.
         light: Direction towards the light, shape [3].
 
     Returns:
@@ -81,15 +81,12 @@ def floor_light(clouds: Sequence[Cloud], light: np.ndarray) -> np.ndarray:
 
 
 def hidden_share(front: np.ndarray, clay: np.ndarray, camera: Camera) -> float:
-    """Return how much of what is seen of a thing hides plasticine that it touches, or nearly so.
+    """Return the share of an object's area in the picture behind which there is plasticine that it touches.
 
     Args:
-        front: Points of the thing [domain units], shape [point, 3].
+        front: Points of the object [domain units], shape [point, 3].
         clay: Points of the plasticine, likewise.
-        camera: Where the picture is taken from.
-
-    Returns:
-        Share of the area that the thing takes of the picture.
+        camera: Camera of the picture.
     """
     low, high = front.min(axis=0) - _CONTACT, front.max(axis=0) + _CONTACT
     near = clay[np.all((clay > low) & (clay < high), axis=1)]

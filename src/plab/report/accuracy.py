@@ -37,7 +37,7 @@ def work_precision(table: pd.DataFrame) -> Drawing | None:
     Without run times, which a busy machine cannot measure, errors are drawn against substeps.
 
     Args:
-        table: What ``python -m plab.bench.accuracy`` wrote, see :func:`plab.report.reference.measured`.
+        table: Table of ``plab bench accuracy``, see :func:`plab.report.reference.measured`.
     """
     table = table[(table["axis"] == "substeps") & (table["material"] == "series")]
     if table.empty:
@@ -109,11 +109,8 @@ def _errors(panel: Axes, own: pd.DataFrame, cost: str, column: str, varied: str)
 
 
 def precision_summary(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the worst and the median difference of float32 from float64, per task and kind of actions.
-
-    Args:
-        table: What ``python benchmarks/precision.py`` wrote, see :func:`plab.report.reference.measured`.
-    """
+    """Return the worst and the median difference of float32 from float64, per task and kind of actions, from
+    the table of ``benchmarks/precision.py``."""
     rows = []
     for (task, kind), own in table.groupby(["task", "actions"], sort=False):
         score, turn = own["difference"].astype(float).abs(), own["angle_deg"].astype(float)

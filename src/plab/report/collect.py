@@ -152,8 +152,8 @@ def collect(source: str | Path | Sequence[str | Path], chosen: Selection, split:
 
     Args:
         source: Folder of results, archive, or several of them.
-        chosen: Which runs; what it leaves open is the suite's tasks and variants, the paper's methods and
-            seeds, and further methods and seeds that the results have.
+        chosen: Choice of runs; where it leaves something open: the suite's tasks and variants, the paper's
+            methods and seeds, and further methods and seeds that the results have.
         split: Setting whose values are treated as methods of their own: a dotted key, ``folder`` or ``seed``;
             none if empty.
 
@@ -217,7 +217,7 @@ def collect_ablation(
 
     Args:
         source: Folder of results, archive, or several of them.
-        chosen: Which runs.
+        chosen: Choice of runs.
         key: Dotted key of the setting.
 
     Returns:
@@ -249,26 +249,20 @@ def collect_ablation(
 def _split(found: Sequence[Row], key: str, places: Sequence[Path]) -> tuple[list[Row], dict[str, list[str]]]:
     """Return runs renamed where their method has several values of a setting, and the new names by method."""
     texts = [_split_value(row, key, places) for row in found]
-    seen: dict[str, set[str]] = defaultdict(set)
-    for row, text in zip(found, texts, strict=True):
-        seen[row.values["method"]].add(text)
-    several = [
-        (name, text) for name, own in seen.items() if len(own) > 1 for text in sorted(own, key=_by_number)
-    ]
-    if not several:
+    methods = [row.values["method"] for row in found]
+    new: dict[tuple[str, str], str] = {}
+    for name in dict.fromkeys(methods):
+        own = {text for of, text in zip(methods, texts, strict=True) if of == name}
+        for text in sorted(own, key=_by_number) if len(own) > 1 else ():
+            new[name, text] = part(name, key.rpartition(".")[2], text, len(new))
+    if not new:
         raise ArgumentError(
             f"no method has runs that differ in {key}: split by a key in which they do, such as method.lr, "
             "or by folder or seed"
         )
-    new = {
-        (name, text): part(name, key.rpartition(".")[2], text, place)
-        for place, (name, text) in enumerate(several)
-    }
     renamed = [
-        replace(
-            row, values=row.values | {"method": new.get((row.values["method"], text), row.values["method"])}
-        )
-        for row, text in zip(found, texts, strict=True)
+        replace(row, values=row.values | {"method": new.get((name, text), name)})
+        for row, name, text in zip(found, methods, texts, strict=True)
     ]
     names: dict[str, list[str]] = defaultdict(list)
     for (name, _), own_name in new.items():
@@ -282,9 +276,7 @@ def _split_value(row: Row, key: str, places: Sequence[Path]) -> str:
     if key == "folder":
         return next(str(place) for place in places if row.path.is_relative_to(place))
     if "." not in key:
-        raise ArgumentError(
-            f"cannot split by '{key}': give a dotted key such as method.lr, or folder or seed"
-        )
+        raise ArgumentError(f"cannot split by '{key}': give a dotted key such as method.lr, folder or seed")
     value = lookup(row.config, key)
     if value is None or value != value:
         return "none"
@@ -404,11 +396,7 @@ def _described(own: Sequence[Row], every: Sequence[Row]) -> str:
 
 
 def changed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a run's settings that are not those of plab's own files, by dotted key.
-
-    Args:
-        config: The run's configuration.
-    """
+    """Return the settings of a run's configuration that are not those of plab's own files, by dotted key."""
     variants = config["task"].get("variants") or {}
     by_variant = {f"task.{key}" for key in variants.get(str(config["variant"]), {})}
     expected = _expected(config["method"]["name"], config["task"]["name"], config["protocol"]["name"])

@@ -53,7 +53,7 @@ class Drawing:
         name: Name of its files.
         figure: The figure.
         notes: Sentences on what it shows.
-        numbers: What it shows, where that is a few numbers.
+        numbers: Numbers that it shows, if they are few.
     """
 
     name: str
@@ -94,8 +94,8 @@ def draw_band(
     """Draw a mean with its spread.
 
     Args:
-        axes: Where.
-        drawn: What.
+        axes: Axes to draw on.
+        drawn: Mean and spread.
         name: Name of the method, which has a colour and a line style of its own.
         ceiling: The spread is drawn from zero to this.
         colour: Another colour.
@@ -165,8 +165,8 @@ def save(drawings: Sequence[Drawing], folder: Path, origin: Mapping[str, Any]) -
     Args:
         drawings: The figures.
         folder: Folder to write to.
-        origin: What is to be said about where they come from; ``footer`` is a list of lines for the files'
-            own metadata.
+        origin: Origin of the figures, see :func:`plab.report.writing.origin`; ``footer`` is a list of lines
+            for the files' own metadata.
     """
     folder.mkdir(parents=True, exist_ok=True)
     made = " | ".join(origin["footer"])

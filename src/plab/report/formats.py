@@ -30,11 +30,11 @@ class Table:
         name: Name of its files.
         form: ``ours``, ``paper`` or ``comparison``: its folder.
         title: Heading.
-        cells: What readers see, text.
+        cells: Text of the table.
         data: The same as numbers with all digits, a row per number or group of numbers: the CSV file.
-        bold: Which cells are bold, of the shape of ``cells``; None if none is.
+        bold: Mask of bold cells, of the shape of ``cells``; None if none is.
         notes: Sentences on what the table says and how it was made.
-        long: Whether it may be longer than a page.
+        long: True if it may be longer than a page.
     """
 
     name: str
@@ -85,8 +85,8 @@ def write_table(table: Table, folder: Path, origin: Mapping[str, Any]) -> None:
     Args:
         table: The table.
         folder: Folder of tables.
-        origin: What is to be said about where the table comes from; ``footer`` is a list of lines for the
-            files themselves.
+        origin: Origin of the table, see :func:`plab.report.writing.origin`; ``footer`` is a list of lines
+            for the files themselves.
     """
     path = folder / table.file
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -59,8 +59,8 @@ def best_runs(runs: Runs, *, every_run: bool = False) -> list[Shown]:
 
     Args:
         runs: Our runs.
-        every_run: Whether each of them has a picture and a film, not only the best of each configuration a
-            picture, and the best of each task a film.
+        every_run: Give each of them a picture and a film, not only the best of each configuration a picture,
+            and the best of each task a film.
     """
     found: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = defaultdict(dict)
     # Ties are broken by the hash, whatever order the files were found in.

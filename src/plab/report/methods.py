@@ -63,7 +63,7 @@ def part(name: str, key: str, value: str, place: int) -> str:
         name: Name of the method.
         key: Name of the setting.
         value: Its value.
-        place: Which of all such methods it is, from 0: its colour and line style.
+        place: Number of the method among all such ones, from 0: its colour and line style.
 
     Returns:
         Name of the new one.

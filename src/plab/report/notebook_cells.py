@@ -32,7 +32,7 @@ def gather(results: Sequence[str], words: Sequence[str] = ()) -> Runs:
 
     Args:
         results: Folders or archives; ``example`` is the archive that comes with plab.
-        words: Which runs, as for ``python -m plab.report``.
+        words: Choice of runs, as for ``plab report``.
     """
     runs = collect([resolve(source) for source in results], select(words, NAMES))
     if runs.table.empty:

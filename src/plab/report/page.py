@@ -127,7 +127,7 @@ class Page:
         """Write ``index.html`` with the pictures that there are.
 
         Args:
-            drawing: Whether more pictures are being drawn. Then, or while runs are under way, the page loads
+            drawing: True while pictures are being drawn. Then, or while runs are under way, the page loads
                 itself again when it has been written anew.
         """
         pictures = {one.name: present(one, self._out) for one in self.shown}

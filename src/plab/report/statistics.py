@@ -28,7 +28,7 @@ class Summary:
     Attributes:
         mean: Their mean; NaN of none.
         std: Their standard deviation as a population, as in the paper's tables; NaN of none.
-        count: How many there are.
+        count: Their number.
     """
 
     mean: float

@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -370,7 +369,7 @@ _BENCHMARK = (
     ("forward_ms", "forward", "forward_ms"),
     ("gradient_ms", "forward + backward", "forward_backward_ms"),
 )
-"""Column of the benchmark's file, what it measures, and the paper's column."""
+"""Column of the benchmark's file, measured calls, and the paper's column."""
 
 _TIMES = (
     "Milliseconds per environment step of one environment, mean ± standard deviation, measured by "
@@ -386,13 +385,10 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
 
     Args:
         runs: Our runs.
-        benchmark: What ``python -m plab.bench.speed --paper --csv`` measured, or None.
+        benchmark: Table of ``plab bench speed --paper --csv``, or None.
     """
-    tasks, steps, paper = (
-        ordered_tasks(runs.tasks),
-        _step_times(runs),
-        paper_table("timing").set_index("task"),
-    )
+    tasks, steps = ordered_tasks(runs.tasks), _step_times(runs)
+    paper = paper_table("timing").set_index("task")
     cells, data, compared = [], [], []
     for task in tasks:
         own = steps[steps["task"] == task]
@@ -401,22 +397,19 @@ def timing(runs: Runs, benchmark: pd.DataFrame | None = None) -> list[Table]:
             for kind, title in (("gradient", "gradient methods [ms]"), ("training", "RL [ms]")):
                 chosen = own[(own["device"] == device) & (own["kind"] == kind)]
                 # Runs of one batch have equal shares of the same time: one measurement.
-                ms = np.unique(chosen["ms"].to_numpy(float).round(9))
-                mine = summarise(ms)
+                mine = summarise(np.unique(chosen["ms"].to_numpy(float).round(9)))
                 shown[title] = _measured(mine)
                 numbers = {"ms": mine.mean, "std": mine.std, "measurements": mine.count}
                 data.append({"task": task, "device": device, "kind": kind} | numbers)
-                if kind == "gradient" and task in paper.index and len(ms):
+                if kind == "gradient" and task in paper.index and mine.count:
                     printed = float(paper.loc[task, "forward_backward_ms"])
-                    compared.append(_time_row(task, f"runs, {device}", "forward + backward", ms, printed))
+                    compared.append((task, "forward + backward", f"runs, {device}", mine, printed))
             cells.append(shown)
         for row in () if benchmark is None else benchmark[benchmark["task"] == task].to_dict("records"):
             where = [row["device"], *([row["precision"]] if "precision" in row else [])]
             where = f"benchmark, {', '.join(where)}, batch {row['batch']}"
             for column, kind, name in _BENCHMARK:
-                compared.append(
-                    _time_row(task, where, kind, np.array([row[column]]), float(paper.loc[task, name]))
-                )
+                compared.append((task, kind, where, summarise([row[column]]), float(paper.loc[task, name])))
     theirs = paper.loc[[task for task in tasks if task in paper.index]].reset_index()
     printed_cells = {"task": theirs["task"], "forward [ms]": theirs["forward_ms"].map(number)}
     printed_cells["forward + backward [ms]"] = theirs["forward_backward_ms"].map(number)
@@ -448,41 +441,29 @@ def _step_times(runs: Runs) -> pd.DataFrame:
     return pd.DataFrame({"task": table["task"], "device": device, "kind": kind, "ms": ms}).dropna()
 
 
-def _time_row(task: str, where: str, kind: str, ms: np.ndarray, theirs: float) -> dict[str, Any]:
-    # The paper gives no spread: all of the interval is ours.
-    gap = stratified_difference([summarise(ms)], [Summary(theirs, 0.0, 2)])
-    mean = float(ms.mean())
-    return {
-        **{"task": task, "measured": where, "what": kind, "measurements": len(ms)},
-        **{"ms": mean, "std": float(ms.std()), "paper_ms": theirs},
-        **{"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": theirs / mean},
-    }
-
-
 def _measured(ms: Summary) -> str:
     return f"{mean_and_std(ms)} ({ms.count})" if ms.count else NOTHING
 
 
-def _compared_times(rows: Sequence[dict[str, Any]], more: list[str]) -> Table:
-    columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
-    cells = [
-        (
-            *(row[name] for name in ("task", "what", "measured")),
-            _measured(Summary(row["ms"], row["std"], row["measurements"])),
-            number(row["paper_ms"]),
-            number(row["difference"], sign=True),
-            ends(Interval(row["difference"], row["low"], row["high"])),
-            number(row["ratio"], 1),
-        )
-        for row in rows
-    ]
+def _compared_times(times: Sequence[tuple[str, str, str, Summary, float]], more: list[str]) -> Table:
+    """Return the table of task, measured calls, place of the measurement, our times and the paper's."""
+    data, cells = [], []
+    for task, kind, where, mine, theirs in times:
+        # The paper gives no spread: all of the interval is ours.
+        gap, ratio = stratified_difference([mine], [Summary(theirs, 0.0, 2)]), theirs / mine.mean
+        which = {"task": task, "measured": where, "what": kind, "measurements": mine.count}
+        which |= {"ms": mine.mean, "std": mine.std, "paper_ms": theirs}
+        data.append(which | {"difference": gap.value, "low": gap.low, "high": gap.high, "ratio": ratio})
+        shown = _measured(mine), number(theirs), number(gap.value, sign=True), ends(gap), number(ratio, 1)
+        cells.append((task, kind, where, *shown))
     notes = [
         _TIMES,
         "The paper's: a GTX 1080 Ti, other hardware than ours. The interval is Student's t over our "
         "measurements, for the paper gives no spread.",
         *more,
     ]
-    data = pd.DataFrame(rows, columns=None if rows else ["task", "measured", "what", "measurements", "ms"])
-    shown = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
+    columns = ["task", "what", "measured by", "plab [ms]", "paper [ms]", "difference", INTERVAL]
+    table = pd.DataFrame(cells, columns=[*columns, "paper / plab"])
+    numbers = pd.DataFrame(data, columns=None if data else ["task", "measured", "what", "measurements", "ms"])
     title = "Time per environment step, compared"
-    return Table("timing", "comparison", title, shown, data, None, notes, True)
+    return Table("timing", "comparison", title, table, numbers, None, notes, True)

@@ -33,7 +33,7 @@ def write_tables(runs: Runs, out: Path, command: str, benchmark: pd.DataFrame | 
         runs: Our runs.
         out: Folder to write to.
         command: Command that makes them, for their footers.
-        benchmark: What ``python -m plab.bench.speed --paper --csv`` measured, or None.
+        benchmark: Table of ``plab bench speed --paper --csv``, or None.
 
     Returns:
         The tables.
@@ -67,7 +67,7 @@ def write_curves(
         ablation: Runs that differ in the yield stress, or None.
         out: Folder to write to.
         command: Command that makes them, for their metadata.
-        errors: What ``python -m plab.bench.accuracy`` measured, or None.
+        errors: Table of ``plab bench accuracy``, or None.
 
     Returns:
         The figures.

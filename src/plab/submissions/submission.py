@@ -66,7 +66,7 @@ class Card:
         link: Paper, code or page, http or https.
         budget: Environment steps simulated for all that is submitted, those of tuning included.
         hardware: Hardware that it was computed on.
-        gradient: Whether the simulator's gradient was used.
+        gradient: True if the simulator's gradient was used.
         description: The method in a sentence or two; may be left out.
     """
 
