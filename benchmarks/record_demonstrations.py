@@ -23,7 +23,7 @@ from plab.demonstrations import SCORES, known_actions
 from plab.errors import ConfigError
 from plab.render.rollouts import stored
 from plab.results.table import Row, readable_rows
-from plab.scenes import MANIPULATOR_SHAPES, Scene
+from plab.scenes import Scene
 from plab.targets.scripted import DECIMALS
 
 __all__ = ["action_names", "best_actions", "best_known", "main", "save_actions"]
@@ -57,11 +57,7 @@ def best_known(cfgs: Sequence[Config], runs: Sequence[Row]) -> list[ReplayedDemo
 
 def action_names(scene: Scene) -> list[str]:
     """Name the components of a scene's action vector: number of the manipulator and motion."""
-    return [
-        f"{number}_{name}"
-        for number, manipulator in enumerate(scene.manipulators)
-        for name in MANIPULATOR_SHAPES[manipulator.shape].action_names
-    ]
+    return list(scene.action_names)
 
 
 def save_actions(task: str, variant: str, actions: np.ndarray, names: list[str], score: float) -> None:

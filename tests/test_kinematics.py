@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import closing
 from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+import torch
 
+import plab
+from plab.cli.main import main
+from plab.config import ConfigError, build_scene, load_config
+from plab.config.run import config_dict, config_hash
+from plab.demonstrations import known_actions
+from plab.kinematics import Chain, read_model
+from plab.kinematics.actions import JointActions
 from plab.losses import make_terms
+from plab.problem import Problem
+from plab.runners.planners.starts import ContactStarts
 from plab.scenes import Body, Manipulator, Scene, SceneError
 from plab.sim import Simulator
 
@@ -46,3 +61,150 @@ def test_a_scene_has_31_manipulators_at_most() -> None:
     small(*[ball] * 31).validate()
     with pytest.raises(SceneError, match="32 manipulators are more than 31"):
         small(*[ball] * 32).validate()
+
+
+# ---------------------------------------------------------------------------------------- articulated models
+
+ARM = "plab:kinematics/assets/arm.xml"
+HAND = "gymnasium_robotics:envs/assets/hand/reach.xml"
+UPRIGHT = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
+
+
+def placed(free: bool = False, position=(0.28, 0.0, 0.5), **options) -> Chain:
+    model, _digest = read_model(ARM)
+    given = {
+        "scale": {".*": 0.05, "left|right": 0.01, "base_.*": 0.02},
+        "start": {},
+        "limits": {},
+        "together": {},
+    }
+    if not free:
+        del given["scale"]["base_.*"]
+    return model.placed(position, UPRIGHT, free, **given | options)
+
+
+@pytest.mark.parametrize(("model", "root"), [(ARM, "world"), (HAND, "robot0:hand mount")])
+def test_forward_kinematics_is_mujocos(model: str, root: str) -> None:
+    """Frames of all links, by NumPy and by PyTorch, at random joint positions."""
+    package, _, inside = model.partition(":")
+    compiled = mujoco.MjModel.from_xml_path(f"{find_spec(package).submodule_search_locations[0]}/{inside}")
+    data = mujoco.MjData(compiled)
+    omit = ["robot0:C_forearm"] if model == HAND else []
+    tree, digest = read_model(model, root, omit=omit)
+    assert digest != read_model(model, root, 2.0, omit)[1]
+    chain = tree.placed((0, 0, 0), (1, 0, 0, 0), False, scale={".*": 0.1}, start={}, limits={}, together={})
+    joints = np.random.default_rng(0).uniform([j.low for j in chain.joints], [j.high for j in chain.joints])
+    data.qpos[:] = joints
+    mujoco.mj_kinematics(compiled, data)
+    body = compiled.body(root).id
+    mount = np.eye(4)
+    mount[:3, :3], mount[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+    frames = mount @ chain.frames(joints)
+    own = [g for g in range(compiled.ngeom) if compiled.geom_type[g] in (3, 6) and compiled.geom_contype[g]]
+    expected = np.array([data.geom_xpos[g] for g in own])
+    gaps = np.linalg.norm(frames[:, None, :3, 3] - expected, axis=-1)
+    assert len(chain.links) == len(own) and max(gaps.min(axis=0).max(), gaps.min(axis=1).max()) < 1e-12
+    # A capsule's axis, the second of its frame here, is the third of MuJoCo's.
+    for link, frame, g in zip(chain.links, frames, gaps.argmin(axis=1), strict=True):
+        axes = data.geom_xmat[own[g]].reshape(3, 3)
+        if link.shape == "CapsuleLink":
+            np.testing.assert_allclose(frame[:3, 1], axes[:, 2], atol=1e-10)
+    scene = small(*chain.manipulators(1.0), kinematics=chain)
+    found = JointActions([scene]).frames(torch.tensor(joints)[None, None])[0, 0]
+    np.testing.assert_allclose(mount @ found.numpy(), frames, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def arm(device: str) -> Simulator:
+    """Two environments with a ball of their own and an arm on a free base that reaches into the body."""
+    start = {"shoulder": 0.35, "elbow": 1.75, "wrist": 0.4}
+    ball = Manipulator("Sphere", (0.05,), (0.5, 0.33, 0.58), scale=(0.02,) * 3)
+    scenes = []
+    for place in ((0.28, 0.0, 0.5), (0.27, 0.01, 0.49)):
+        chain = placed(True, place, start=start, together={"grip": "left|right"})
+        scenes.append(small(ball, *chain.manipulators(0.8), kinematics=chain))
+    terms = make_terms({"sdf": 10.0, "contact": 1.0})
+    simulator = Simulator(scenes, terms=terms, precision="float64", device=device)
+    sdf = np.random.default_rng(1).random((2, 16, 16, 16))
+    simulator.set_target(np.ones_like(sdf), sdf)
+    return simulator
+
+
+def test_the_gradient_by_joint_actions(arm: Simulator) -> None:
+    """Against central differences, component by component, and that of a closed loop which replays them."""
+    names = arm.scenes[0].action_names
+    assert names[2:4] == ("0_z", "base_x") and names[-1] == "grip" and len(names) == arm.action_dim == 15
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (2, STEPS, 15))
+    result = arm.rollout(actions)
+    end = arm.state()
+    assert np.abs(end.v).max() > 0.1
+    largest = np.abs(result.gradient).max()
+    for component in range(15):
+        direction = np.zeros_like(actions)
+        direction[..., component] = np.random.default_rng(component).normal(size=(2, STEPS))
+        ends = [arm.rollout(actions + h * direction, gradient=False).step_terms for h in (1e-6, -1e-6)]
+        difference = ((ends[0] - ends[1]) @ [10.0, 1.0]).sum() / 2e-6
+        slope = (result.gradient * direction).sum()
+        assert abs(slope - difference) < 1e-6 * largest, names[component]
+        assert abs(slope) > 1e-6 * largest, names[component]
+    # The links are where the joints say, and steps lead where a rollout does.
+    for scene, poses, joints in zip(arm.scenes, end.poses, end.joints, strict=True):
+        np.testing.assert_allclose(poses[1:, :3], scene.kinematics.frames(joints)[:, :3, 3], atol=1e-12)
+    arm.reset()
+    arm.step(actions[:, 0])
+    kept = arm.state()
+    arm.reset()
+    arm.set_state(kept)
+    for t in range(1, STEPS):
+        arm.step(actions[:, t])
+    np.testing.assert_array_equal(arm.state().x, end.x)
+    bars = {}
+    arm.reset()
+    arm.closed_loop(
+        STEPS, lambda t, x, poses: actions[:, min(t, STEPS - 1)], lambda t, bar: bars.update({t: bar})
+    )
+    looped = np.stack([bars[t] for t in range(STEPS)], axis=1)
+    np.testing.assert_allclose(looped, result.gradient, rtol=1e-9, atol=1e-12)
+    # Alone an environment has the same bits.
+    alone, both, given = JointActions(arm.scenes[1:]), JointActions(arm.scenes), actions.swapaxes(0, 1)
+    twists = both.drive(both.start, given).twists[:, 1:]
+    np.testing.assert_array_equal(alone.drive(alone.start, given[:, 1:]).twists, twists)
+
+
+COARSE = ("sim.grid_size=16", "sim.substeps=5", "sim.dt=4e-4", "sim.particles_scale=0.05")
+
+
+def test_an_arm_is_one_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a task with an articulated model: a run, its demonstration, environments, and what is refused."""
+    monkeypatch.setenv("PLAB_CACHE_DIR", str(tmp_path))
+    words = ["task=Gripper", *COARSE]
+    cfg = load_config(words)
+    assert (cfg.task.kinematics.model, len(cfg.task.kinematics.sha256)) == (ARM, 64)
+    assert config_hash(cfg) != config_hash(load_config([*words, "task.kinematics.friction=1"]))
+    assert "kinematics" not in config_dict(load_config(["task=Move"]))["task"]
+    assert main(["run", *words, "method=adam", "method.iterations=2", f"results_dir={tmp_path}"]) == 0
+    assert len(list(tmp_path.rglob("seed0-*.h5"))) == 1
+    assert build_scene(cfg).action_names[-2:] == ("left", "right")
+    problem = Problem([cfg])
+    problem.simulator.set_contact("hard")
+    best = problem.rollout(known_actions(cfg)[None], gradient=False)
+    assert best.scores[0].score > 0.99
+    (start,) = ContactStarts(problem.scenes[0], problem.target_mass[0]).draw(1, seed=0)
+    assert start.shape == (50, 7) and np.isfinite(start).all()
+    with closing(plab.make("Gripper", overrides=COARSE)) as env:
+        seen, _info = env.reset(seed=0)
+        assert env.action_space.shape == (7,) and env.observation_space.contains(seen)
+        for action in known_actions(cfg):
+            seen, *_, info = env.step(action)
+            assert env.observation_space.contains(seen)
+    assert info["score"] == pytest.approx(best.scores[0].score, abs=1e-6)
+    for wrong, named in (
+        ("+task.kinematics.scale.finger=0.1", "task.kinematics: scale: 'finger' matches none of turn"),
+        ("task.kinematics.start={elbow: 3}", "joint elbow at 3 is outside its limits 0 .. 2.6"),
+        ("task.kinematics.model=plab:none.xml", "there is no model"),
+        ("task.kinematics.root=foot", "has no body 'foot'; choose from: base, upper"),
+        ("task.kinematics.sha256=abc", "another model than this configuration's"),
+        ("task.kinematics.size=4", "more than a cell per substep"),
+    ):
+        with pytest.raises((ConfigError, SceneError), match=re.escape(named)):
+            build_scene(load_config([*words, wrong]))

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from plab.config.suite import suite_tasks
+from plab.config.suite import EXTENSION_TASKS, suite_tasks
 from plab.errors import TRACEBACK, ArgumentError, PlabError, out_of_memory, pick, tell, traceback_wanted
 
 EXIT_BUG, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 70, 130, 141
@@ -165,7 +165,7 @@ def task_list(text: str) -> list[str]:
     """Read names of tasks with commas between them."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in suite_tasks():
+        if name not in (*suite_tasks(), *EXTENSION_TASKS):
             raise ArgumentTypeError(f"there is no task '{name}'; choose from: {', '.join(suite_tasks())}")
     return names
 

@@ -318,7 +318,7 @@ def build_scene(cfg: Config) -> Scene:
     scene = Scene(
         name=task.name,
         bodies=task.build_bodies(sim.particles_scale),
-        manipulators=tuple(manipulator.build() for manipulator in task.manipulators.values()),
+        **task.build_tools(),
         youngs_modulus=task.youngs_modulus,
         poisson_ratio=task.poisson_ratio,
         yield_stress=task.yield_stress,
@@ -510,5 +510,7 @@ def _reject_unknown(node: Any, path: str) -> None:
     for key, below in ((str(key), below) for key, below in node.items_ex(resolve=False)):
         if known is not None and key not in known:
             raise ConfigError(f"unknown key '{path}{key}'; {pick(key, known)}")
-        if isinstance(below, DictConfig) and not (below._is_missing() or below._is_interpolation()):
+        if isinstance(below, DictConfig) and not (
+            below._is_missing() or below._is_none() or below._is_interpolation()
+        ):
             _reject_unknown(below, f"{path}{key}.")

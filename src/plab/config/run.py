@@ -229,9 +229,11 @@ _NO_EFFECT = {
 def config_dict(cfg: Config | Mapping[str, Any]) -> dict[str, Any]:
     """Return a :class:`Config`, or a mapping, as plain dictionaries and lists.
 
-    Optional keys of bodies that have no value, such as ``file``, are left out.
+    Optional keys of bodies that have no value, such as ``file``, are left out, and so is ``kinematics``.
     """
     plain = json.loads(json.dumps(dict(cfg) if isinstance(cfg, Mapping) else dataclasses.asdict(cfg)))
+    if lookup(plain, "task.kinematics") is None:
+        del plain["task"]["kinematics"]
     bodies = lookup(plain, "task.bodies")
     for body in bodies.values() if isinstance(bodies, dict) else ():
         for key in ("file", "sha256", *MATERIAL_KEYS, "law", "parameters"):
@@ -258,7 +260,7 @@ def config_hash(cfg: Config | Mapping[str, Any]) -> str:
 def _drop_places(node: Any) -> None:
     """Remove the paths of files from a part of a configuration: their SHA-256 is what counts."""
     for key, value in list(node.items()) if isinstance(node, dict) else ():
-        if key == "file" and not isinstance(value, dict):
+        if key in ("file", "model") and not isinstance(value, dict):
             del node[key]
         _drop_places(value)
 

@@ -14,6 +14,9 @@ from plab.errors import ConfigError
 SUITE_VARIANTS = ("1", "2", "3", "4", "5")
 """Variants of every task of the suite."""
 
+EXTENSION_TASKS = ("Gripper", "HandLift")
+"""Tasks beside the suite, with articulated models: in no table or default of the suite."""
+
 PAPER_METHODS = ("sac", "td3", "ppo", "adam", "gd", "adam_h")
 """Methods that the paper compares, in its order."""
 
@@ -65,5 +68,5 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 
 def suite_tasks() -> list[str]:
-    """Return the names of plab's own tasks, those of the files in ``conf/task``."""
-    return group_names("task")
+    """Return the names of the suite's tasks, those of the files in ``conf/task`` beside the extension."""
+    return [name for name in group_names("task") if name not in EXTENSION_TASKS]

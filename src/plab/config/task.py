@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from plab.config import ranges
 from plab.errors import ConfigError
 from plab.files import ShapeError, pinned
+from plab.kinematics import Chain, ModelError, locate_model, read_model
 from plab.laws import find_law
 from plab.scenes import MATERIAL_KEYS, Body, Manipulator, SceneError, make_body
 from plab.targets import TargetError, make_recipe
@@ -108,6 +110,91 @@ class ManipulatorConfig(ranges.Section):
 
 
 @dataclass
+class KinematicsConfig(ranges.Section):
+    """An articulated model: links that move by joint-space actions. Patterns are regular expressions of whole
+    names, of which the last that matches counts.
+
+    Attributes:
+        model: MJCF or URDF file, or ``package:path`` of one inside an installed package.
+        root: Body of the model whose frame is placed; the model's world if not given.
+        size: Domain units per unit of length of the model.
+        position: Place (x, y, z) of that frame's origin [domain units].
+        rotation: Unit quaternion (w, x, y, z) from that frame's axes to the domain's; turns z up into y up if
+            not given.
+        free: Whether the base moves, by the joints ``base_x``, ``base_y``, ``base_z``, ``base_yaw``,
+            ``base_pitch`` and ``base_roll``.
+        scale: Motion per environment step at action 1, by patterns of joints [rad or domain units]; joints
+            without one stay where they start.
+        start: Positions at the start, by patterns of joints; 0, or the limit next to it, if not given.
+        limits: Lowest and highest positions, by patterns of joints; the model's if not given.
+        together: Patterns of joints that one component of the action moves, by its name.
+        omit: Patterns of collision geometry that is left out.
+        friction: Coulomb friction of all links with the plasticine.
+        sha256: SHA-256 of the tree. Found out where it is not given; refused if it is another one.
+    """
+
+    model: str
+    scale: dict[str, float]
+    root: str | None = None
+    size: float = field(default=1.0, metadata=ranges.POSITIVE)
+    position: list[float] = field(default_factory=lambda: [0.5, 0.0, 0.5], metadata=ranges.POINT)
+    rotation: list[float] = field(
+        default_factory=lambda: [0.5**0.5, -(0.5**0.5), 0.0, 0.0], metadata=ranges.within(ranges.vector, 4)
+    )
+    free: bool = False
+    start: dict[str, float] = field(default_factory=dict)
+    limits: dict[str, list[float]] = field(default_factory=dict)
+    together: dict[str, str] = field(default_factory=dict)
+    omit: list[str] = field(default_factory=list)
+    friction: float = field(default=5.0, metadata=ranges.NOT_NEGATIVE)
+    sha256: str | None = None
+
+    def check(self, path: str) -> None:
+        """Raise :class:`ConfigError` for a value out of range."""
+        super().check(path)
+        for pattern, bounds in self.limits.items():
+            ranges.vector(f"{path}.limits.{pattern}", bounds, 2)
+            if bounds[0] > bounds[1]:
+                raise ConfigError(f"{path}.limits.{pattern}: low {bounds[0]:g} is above high {bounds[1]:g}")
+        for pattern, value in self.scale.items():
+            if not 0 <= value <= 1:
+                raise ConfigError(f"{path}.scale.{pattern} must be in [0, 1], not {value:g}")
+        if not math.isclose(math.hypot(*self.rotation), 1.0, abs_tol=1e-3):
+            raise ConfigError(f"{path}.rotation must be a unit quaternion, not {self.rotation}")
+
+    def build(self) -> Chain:
+        """Return the scene's articulated model.
+
+        Raises:
+            ConfigError: If the model cannot be read, is another one, or a pattern matches nothing.
+        """
+        try:
+            patterns = {key: getattr(self, key) for key in ("scale", "start", "limits", "together")}
+            return self._read().placed(self.position, self.rotation, self.free, **patterns)
+        except (ModelError, SceneError) as error:
+            raise ConfigError(f"task.kinematics: {error}") from None
+
+    def pin(self) -> None:
+        """Replace the model's name by where it is, unless it is in a package, and note its SHA-256; errors as
+        of :meth:`build`."""
+        try:
+            self.model = locate_model(self.model)
+            self._read()
+        except (ModelError, ShapeError, SceneError) as error:
+            raise ConfigError(f"task.kinematics: {error}") from None
+
+    def _read(self) -> Chain:
+        chain, digest = read_model(self.model, self.root, self.size, self.omit)
+        if self.sha256 not in (None, digest):
+            raise ModelError(
+                f"{self.model} is another model than this configuration's: its SHA-256 begins with "
+                f"{digest[:8]}, not with {str(self.sha256)[:8]!r}"
+            )
+        self.sha256 = digest
+        return chain
+
+
+@dataclass
 class RangeConfig:
     """Numbers that are drawn uniformly and independently, each between its two bounds.
 
@@ -179,6 +266,7 @@ class TaskConfig(ranges.Section):
         gravity: Acceleration (x, y, z).
         bodies: Bodies of plasticine, by name.
         manipulators: Manipulators, by name, in the order of the action vector.
+        kinematics: An articulated model, whose links and actions come after the manipulators'; None without.
         target: ``recipe`` and the fields of that recipe in :data:`plab.targets.RECIPES`.
         variants: By name: what each variant changes: a part of this very structure, merged over it.
         random: Ranges of ``variant=random``: the fields of :class:`RandomConfig`. Empty in a run's
@@ -199,6 +287,7 @@ class TaskConfig(ranges.Section):
     variants: dict[str, Any]
     random: dict[str, Any] = field(default_factory=dict)
     release: dict[str, Any] = field(default_factory=dict)
+    kinematics: KinematicsConfig | None = None
 
     def check(self, path: str) -> None:
         """Raise :class:`ConfigError` for what :meth:`plab.scenes.Scene.validate` does not look at."""
@@ -208,6 +297,8 @@ class TaskConfig(ranges.Section):
         for group in ("bodies", "manipulators"):
             for name, item in getattr(self, group).items():
                 item.check(f"{path}.{group}.{name}")
+        if self.kinematics is not None:
+            self.kinematics.check(f"{path}.kinematics")
         try:
             make_recipe(self.target)
         except TargetError as error:
@@ -227,6 +318,13 @@ class TaskConfig(ranges.Section):
             except (ConfigError, SceneError, ShapeError) as error:
                 raise ConfigError(f"task.bodies.{name}: {error}") from None
         return tuple(bodies)
+
+    def build_tools(self) -> dict[str, Any]:
+        """Return the scene's ``manipulators`` and ``kinematics``; see :meth:`KinematicsConfig.build`."""
+        tools = tuple(manipulator.build() for manipulator in self.manipulators.values())
+        chain = self.kinematics.build() if self.kinematics else None
+        links = chain.manipulators(self.kinematics.friction) if chain and self.kinematics else ()
+        return {"manipulators": tools + links, "kinematics": chain}
 
     def pin_files(self) -> None:
         """Replace the name of each file by its path, and add the SHA-256 of its content.

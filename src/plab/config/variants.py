@@ -98,7 +98,8 @@ def _draw(base: DictConfig, random: RandomConfig, rng: np.random.Generator) -> D
         displacement = _uniform(random.shift, rng)
         moving = [name for name, item in base.manipulators.items() if item.scale]
         places = [f"bodies.{name}.center" for name in base.bodies]
-        for key in [*places, *(f"manipulators.{name}.position" for name in moving)]:
+        places += [f"manipulators.{name}.position" for name in moving]
+        for key in [*places, *(["kinematics.position"] if base.kinematics else [])]:
             if OmegaConf.select(changes, key) is None:
                 start = OmegaConf.select(base, key, throw_on_missing=True)
                 # Rounding takes off the digits that adding decimals leaves, nothing else.
@@ -134,9 +135,8 @@ def _require_list(base: DictConfig, key: str, path: str) -> None:
 def _check(task: TaskConfig, random: RandomConfig) -> None:
     """Raise what is wrong with a drawn task, short of simulating it."""
     task.check("task")
-    manipulators = tuple(manipulator.build() for manipulator in task.manipulators.values())
     # The suite's grid and material, not the run's: they must not decide what is drawn.
-    scene = Scene(task.name, task.build_bodies(), manipulators)
+    scene = Scene(task.name, task.build_bodies(), **task.build_tools())
     scene.validate()
     check_target(scene, task.target)
     recipe = make_recipe(task.target)

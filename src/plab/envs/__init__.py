@@ -11,7 +11,7 @@ from typing import Any
 
 import gymnasium
 
-from plab.config.suite import SUITE_VARIANTS, suite_tasks
+from plab.config.suite import EXTENSION_TASKS, SUITE_VARIANTS, suite_tasks
 
 __all__ = ["ENTRY_POINT", "make", "make_vec", "register_suite", "register_task"]
 
@@ -51,8 +51,8 @@ def make_vec(
 
 
 def register_suite() -> None:
-    """Register all tasks of the suite with Gymnasium."""
-    for task in suite_tasks():
+    """Register all tasks of the suite and of its extension with Gymnasium."""
+    for task in (*suite_tasks(), *EXTENSION_TASKS):
         register_task(task)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from plab.scenes.bodies import (
     make_body,
     vector3,
 )
+
+if TYPE_CHECKING:
+    from plab.kinematics import Chain
 
 __all__ = [
     "CONTACTS",
@@ -210,6 +213,7 @@ class Scene:
             normalises them, ``release`` leaves the poses at t = 0 as they are until something moves.
         floor_stencil: Stencil of particles within half a cell of a lower face, likewise: plab's reaches the
             layer of nodes below the domain, the release's begins at node 0, with weights from -0.25 to 1.125.
+        kinematics: Articulated model whose links are the last manipulators; None without one.
     """
 
     name: str
@@ -228,6 +232,7 @@ class Scene:
     sampling_convention: str = "plab"
     digits_convention: str = "plab"
     floor_stencil: str = "plab"
+    kinematics: Chain | None = None
 
     @property
     def dx(self) -> float:
@@ -277,8 +282,21 @@ class Scene:
 
     @property
     def action_dim(self) -> int:
-        """Length of the action vector: the moving manipulators' components, concatenated."""
-        return sum(m.action_dim for m in self.manipulators)
+        """Length of the action vector, see :attr:`action_names`."""
+        return len(self.action_names)
+
+    @property
+    def tools(self) -> tuple[Manipulator, ...]:
+        """Manipulators with actions of their own: all but the links of an articulated model."""
+        links = len(self.kinematics.links) if self.kinematics else 0
+        return self.manipulators[: len(self.manipulators) - links]
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the components of the action vector: of the tools one after the other, by number, then
+        those of the articulated model."""
+        own = [f"{k}_{name}" for k, tool in enumerate(self.tools) for name in tool.kind.action_names]
+        return (*own, *(self.kinematics.components if self.kinematics else ()))
 
     @property
     def particle_count(self) -> int:
@@ -299,6 +317,8 @@ class Scene:
     def facts(self) -> dict[str, Any]:
         """Return the scene as plain data, apart from meshes, without what a body shares with the scene."""
         facts = asdict(self)
+        if self.kinematics is None:
+            del facts["kinematics"]
         for body in facts["bodies"]:
             for key in MATERIAL_KEYS:
                 if body[key] is None:
@@ -344,6 +364,8 @@ class Scene:
             self._validate_body(number, body)
         count = len(self.manipulators)
         _require(count <= MANIPULATORS_MAX, f"{count} manipulators are more than {MANIPULATORS_MAX}")
+        if self.kinematics is not None:
+            self._require_slow("kinematics", self.kinematics.largest_step())
         for number, manipulator in enumerate(self.manipulators):
             self._validate_manipulator(number, manipulator)
 
@@ -413,14 +435,16 @@ class Scene:
             all(a <= b for a, b in zip(low, high, strict=True)),
             f"{label}: lower_bound {low} must not be above upper_bound {high}",
         )
-        # Contact acts on nodes: it is not felt by what passes more than one of them in a substep.
-        way = manipulator.largest_step()
+        self._require_slow(f"{label}: scale {manipulator.scale}", manipulator.largest_step())
+
+    def _require_slow(self, label: str, way: float) -> None:
+        """Refuse a motion per environment step that contact, which acts on nodes, would not feel: of more
+        than a cell per substep."""
         limit = self.substeps * self.dx
         if way > limit:
             raise SceneError(
-                f"{label}: scale {manipulator.scale} moves it by up to {way:.3g} per step, more than a cell "
-                f"per substep: scale it by {limit / way:.2g} or less, or use substeps >= "
-                f"{math.ceil(way / self.dx)}"
+                f"{label} moves it by up to {way:.3g} per step, more than a cell per substep: scale it by "
+                f"{limit / way:.2g} or less, or use substeps >= {math.ceil(way / self.dx)}"
             )
 
 

@@ -27,7 +27,12 @@ SHARED = (
 
 def scene_kind(scene: Scene) -> tuple[Any, ...]:
     """Return a key that is equal for scenes that one simulator can hold, in sequence or in a batch."""
-    return (*(getattr(scene, name) for name in SHARED), *(tool.shape for tool in scene.manipulators))
+    shared = (getattr(scene, name) for name in SHARED)
+    return (*shared, *(tool.shape for tool in scene.manipulators), _topology(scene))
+
+
+def _topology(scene: Scene) -> tuple[Any, ...]:
+    return scene.kinematics.topology if scene.kinematics else ()
 
 
 def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
@@ -48,7 +53,8 @@ def require_alike(scenes: Sequence[Scene], like: Scene | None = None) -> None:
                     f"scenes of one batch need the same {name}: {of} has {getattr(first, name)}, "
                     f"scene {number} has {getattr(scene, name)}"
                 )
-        if [m.shape for m in scene.manipulators] != [m.shape for m in first.manipulators]:
+        shapes = [[m.shape for m in one.manipulators] for one in (scene, first)]
+        if shapes[0] != shapes[1] or _topology(scene) != _topology(first):
             raise SceneError(
                 f"scenes of one batch need the same manipulators; scene {number} differs from {of}"
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -34,6 +35,8 @@ from plab.sim.term_phases import LossTerm
 
 if TYPE_CHECKING:
     import torch
+
+    from plab.kinematics.actions import Drive
 
 
 class Simulator:
@@ -122,6 +125,7 @@ class Simulator:
         self._particles = Particles(self._engine, self._numpy_real)
         self._tape = Tape(self._particles)
         self._initial = self._particles.array(1)
+        self._drive: Drive | None = None
         self._start_from(particles)
         # Changes with all that a rollout's gradient depends on.
         self._version = 0
@@ -256,6 +260,7 @@ class Simulator:
         self._version += 1
         self._engine.copy_slot(self._initial, 0, self._particles.current, 0)
         self._particles.order.reset()
+        self._joints: Any = self._initial_joints
         self._place(self._initial_poses)
         self._checked = True
 
@@ -272,7 +277,7 @@ class Simulator:
         """
         self._require_runtime()
         self._version += 1
-        array = step_actions(actions, self.batch, self.action_dim, self.device)
+        array = step_actions(actions, self.batch, self.action_dim, self.device, self._through)
         self._particles.step(self._pose, array)
         self._taken += 1
         self._checked = check
@@ -317,7 +322,9 @@ class Simulator:
     def state(self) -> State:
         """The current state, particles in the order in which they were given."""
         poses = cast(np.ndarray, self.poses())
-        return self._particles.unpack(self._particles.current.to_numpy(), poses)
+        state = self._particles.unpack(self._particles.current.to_numpy(), poses)
+        joints = self._joints.cpu().numpy() if on_device(self._joints) else self._joints
+        return state if joints is None else replace(state, joints=np.array(joints, np.float64))
 
     def observe(self, stride: int, like: torch.Tensor | None = None) -> np.ndarray | torch.Tensor:
         """Position and velocity of every ``stride``-th particle, in the order in which they were given.
@@ -375,9 +382,13 @@ class Simulator:
                 )
         if np.shape(state.poses) != self._initial_poses.shape:
             raise ArgumentError(f"poses have shape {np.shape(state.poses)}, not {self._initial_poses.shape}")
+        shapes = [() if one is None else one.shape for one in (state.joints, self._initial_joints)]
+        if shapes[0] != shapes[1]:
+            raise ArgumentError(f"joints have shape {shapes[0]}, not {shapes[1]}")
         self._version += 1
         self._particles.current.from_numpy(self._particles.pack(state))
         self._particles.order.reset()
+        self._joints = None if state.joints is None else np.array(state.joints, np.float64)
         self._place(np.asarray(state.poses, np.float64))
 
     def set_initial_state(self, state: State) -> None:
@@ -385,7 +396,7 @@ class Simulator:
         :class:`State`."""
         self.set_state(state)
         self.changes += 1
-        self._initial_poses = np.array(state.poses, np.float64)
+        self._initial_poses, self._initial_joints = np.array(state.poses, np.float64), self._joints
         self._engine.copy_slot(self._particles.current, 0, self._initial, 0)
 
     # -- rollouts and gradients -----------------------------------------------------------------------
@@ -424,7 +435,7 @@ class Simulator:
             require_none(failures)
         actions_bar = None
         if bars is not None:
-            actions_bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
+            actions_bar = self._by_actions(bars, steps, actions, self._drive)
             failures = broken_gradients(actions_bar) | failures
             if strict:
                 require_none(failures)
@@ -460,6 +471,7 @@ class Simulator:
             MemoryError: If even the sparsest checkpoints do not fit the budget.
         """
         array, steps, poses, plan = self._started(actions, gradient)
+        drive = self._drive
         recording = Recording(self._particles, actions, every_step, mass, steps)
         self._tape.forward(array, poses, None, steps, plan, after=recording.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
@@ -472,7 +484,7 @@ class Simulator:
             with self._kept_weights():
                 self._engine.write(self._engine.term_weights, np.zeros(self._engine.term_weights.shape))
                 bars = self._tape.backward(array, poses, terms, steps, before, add=recording.add)
-            bar = numbers_of(bars, (steps, self.batch, self.action_dim), actions).swapaxes(0, 1)
+            bar = self._by_actions(bars, steps, actions, drive)
             require_none(broken_gradients(bar))
             return bar
 
@@ -524,14 +536,27 @@ class Simulator:
         poses = self._pose_history(steps, cast(np.ndarray, self.poses()))
         terms = ti.ndarray(ti.f64, shape=(steps + 1) * self.batch * self._engine.measures)
         observe = functools.partial(self._observe, stride=stride, like=like)
-        loop = ClosedLoop(self._particles, poses, steps, choose, react, observe, stride, discount, like)
+        follow = self._follow if self._map else None
+        loop = ClosedLoop(
+            self._particles,
+            poses,
+            steps,
+            choose,
+            react,
+            observe,
+            stride,
+            discount,
+            like,
+            self.action_dim,
+            follow,
+        )
         loop.look(0, self._particles.current, 0)
         self._tape.forward(loop.actions, poses, None, steps, plan, after=loop.note)
         require_none(broken_states(self._engine.read(self._engine.fault), self.substeps))
         before = self.steps_before_contact(steps)
         with self._kept_weights() as loop.weights:
             self._tape.backward(loop.actions, poses, terms, steps, before, loop.add, loop.actions_bar)
-        bars = numbers_of(loop.actions_bar, (steps, self.batch, self.action_dim), like)
+        bars = numbers_of(loop.actions_bar, (steps, self.batch, self._engine.actions_per_step), like)
         require_none(broken_gradients(bars.swapaxes(0, 1)))
         loop.answer(0)
         self._engine.place(poses, steps, self._pose, 0)
@@ -610,9 +635,26 @@ class Simulator:
     ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
         """Reset; return actions, number of steps, pose history, and steps of a segment with a gradient."""
         self.reset()
-        array, steps = action_array(actions, self.batch, self.action_dim, self.device), np.shape(actions)[1]
+        array = action_array(actions, self.batch, self.action_dim, self.device, self._through)
+        steps = np.shape(actions)[1]
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         return array, steps, self._pose_history(steps, self._initial_poses), plan
+
+    def _follow(self, actions: Any) -> Drive:
+        """Move the joints of the articulated models by actions, shape [T, batch, A]."""
+        assert self._map is not None
+        self._drive = self._map.drive(self._joints, actions)
+        self._joints = self._drive.joints
+        return self._drive
+
+    def _by_actions(
+        self, bars: ti.Ndarray, steps: int, like: Any, drive: Drive | None
+    ) -> np.ndarray | torch.Tensor:
+        """Derivatives by the actions, shape [batch, T, A], from those by the manipulators' motions."""
+        bar = numbers_of(bars, (steps, self.batch, self._engine.actions_per_step), like)
+        if drive is not None:
+            bar = drive.pull_back(bar)[0]
+        return (bar.to(like.dtype) if on_device(bar) else bar).swapaxes(0, 1)
 
     def _judged(self, values: np.ndarray | torch.Tensor) -> Measures:
         """Loss terms and soft IoU from measures of shape [..., batch, measure]; see
@@ -633,6 +675,10 @@ class Simulator:
         self._particles.order.start_from(positions)
         self._engine.fill_bodies(self.scenes, self._particles.order.initial)
         self._initial_poses = initial_poses(self.scenes)
+        chain = self.scenes[0].kinematics
+        self._map = chain.action_map(self.scenes) if chain else None
+        self._through = (lambda actions: self._follow(actions).twists) if chain else None
+        self._initial_joints: np.ndarray | None = self._map.start if self._map else None
         start = rest_state(np.stack(positions), self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))
 

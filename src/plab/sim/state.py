@@ -25,6 +25,7 @@ class State:
         C: APIC velocity gradients, shape [batch, particle, 3, 3].
         F: Deformation gradients, shape [batch, particle, 3, 3].
         poses: Position (3), quaternion w, x, y, z (4) and gap (1), shape [batch, manipulator, 8].
+        joints: Joint positions of the articulated model, shape [batch, joint]; None without one.
     """
 
     x: np.ndarray
@@ -32,6 +33,7 @@ class State:
     C: np.ndarray
     F: np.ndarray
     poses: np.ndarray
+    joints: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

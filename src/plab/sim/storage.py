@@ -162,7 +162,7 @@ class Storage:
         self.motions = tuple(MANIPULATOR_SHAPES[m.shape].motion for m in manipulators)
         self.action_dims = tuple(m.action_dim for m in manipulators)
         self.action_offsets = tuple(sum(self.action_dims[:m]) for m in range(self.manipulators))
-        self.actions_per_step = scene.action_dim
+        self.actions_per_step = sum(self.action_dims)
         # Consecutive manipulators of one shape share one loop, hence one compiled body.
         groups = [list(group) for _, group in groupby(range(self.manipulators), key=self.shapes.__getitem__)]
         self.shape_ranges = tuple((self.shapes[group[0]], group[0], group[-1] + 1) for group in groups)

@@ -20,6 +20,8 @@ from plab.sim.tensors import copy_numbers, numbers_of, on_device, output_for, st
 if TYPE_CHECKING:
     import torch
 
+    from plab.kinematics.actions import Drive
+
 
 class Tape:
     """Runs environment steps forward and back.
@@ -373,13 +375,19 @@ class ClosedLoop:
         stride: int,
         discount: float,
         like: torch.Tensor | None,
+        components: int,
+        follow: Callable[[Any], Drive] | None,
     ) -> None:
-        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array, the rest is as
-        in :meth:`plab.sim.Simulator.closed_loop`."""
+        """Start before the first of T ``steps``; ``observe`` observes a time slot of an array, ``follow``
+        moves the joints of articulated models by actions of so many ``components``, the rest is as in
+        :meth:`plab.sim.Simulator.closed_loop`."""
         self._particles, self._engine = particles, particles.engine
         self._poses, self._steps, self._stride = poses, steps, stride
         self._choose, self._react, self._observe = choose, react, observe
         self._discount, self._like = discount, like
+        self._components, self._follow = components, follow
+        self._drives: list[Drive] = []
+        self._joints_bar: Any = None
         engine = self._engine
         self._row = engine.batch * engine.actions_per_step
         self.actions = ti.ndarray(ti.f64, shape=max(1, steps * self._row))
@@ -396,8 +404,14 @@ class ClosedLoop:
         chosen = self._choose(t, self._observe(state, slot), poses)
         if t < self._steps:
             device = "cuda" if engine.cuda else "cpu"
-            row = step_actions(chosen, engine.batch, engine.actions_per_step, device)
+            through = self._moved if self._follow else None
+            row = step_actions(chosen, engine.batch, self._components, device, through)
             copy_numbers(self.actions, t * self._row, row, self._row, 1)
+
+    def _moved(self, actions: Any) -> Any:
+        assert self._follow is not None
+        self._drives.append(self._follow(actions))
+        return self._drives[-1].twists
 
     def note(self, t: int, state: ti.Ndarray, slot: int) -> None:
         """Look at the state that step t has led to."""
@@ -430,7 +444,12 @@ class ClosedLoop:
         if t == self._steps:
             return self._react(t, None)
         shape = self._engine.batch, self._engine.actions_per_step
-        return self._react(t, numbers_of(self.actions_bar, shape, self._like, first=t * self._row))
+        bar = numbers_of(self.actions_bar, shape, self._like, first=t * self._row)
+        if self._drives:
+            # Steps are answered from the last to the first: later ones depend on the joints of earlier ones.
+            by_actions, self._joints_bar = self._drives[t].pull_back(bar[None], self._joints_bar)
+            bar = by_actions[0].to(bar.dtype) if on_device(bar) else by_actions[0]
+        return self._react(t, bar)
 
     def _zeros(self, like: Any) -> Any:
         shape = self._engine.batch, self._engine.particles, 3

@@ -85,15 +85,28 @@ def numbers_of(
 
 
 def step_actions(
-    actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
+    actions: "np.ndarray | torch.Tensor",
+    batch: int,
+    components: int,
+    device: str,
+    through: Callable[[Any], Any] | None = None,
 ) -> "np.ndarray | torch.Tensor | ti.Ndarray":
     """Actions of one environment step, shape [batch, component], for the kernels, which take them from where
     they are; float64.
+
+    Args:
+        actions: The actions.
+        batch: Number of environments.
+        components: Number of components.
+        device: ``cpu`` or ``cuda``.
+        through: Turns checked actions, shape [T, batch, component], into those of the manipulators, likewise.
 
     Raises:
         ValueError: If the shape is wrong or an action is not finite.
     """
     numbers = _numbers(actions, (batch, components))
+    if through is not None:
+        numbers = through(numbers.reshape(1, batch, components)).reshape(-1)
     if on_device(numbers) and device == "cuda" and numbers.shape[0]:
         # Another stream may use their memory again before the kernels have read it.
         return numbers if _in_default_stream() else _array_of(numbers, device)
@@ -104,14 +117,18 @@ def step_actions(
 
 
 def action_array(
-    actions: "np.ndarray | torch.Tensor", batch: int, components: int, device: str
+    actions: "np.ndarray | torch.Tensor",
+    batch: int,
+    components: int,
+    device: str,
+    through: Callable[[Any], Any] | None = None,
 ) -> ti.Ndarray:
-    """Actions of a rollout, shape [batch, T, component], for the kernels: step by step, float64.
-
-    Raises:
-        ValueError: If the shape is wrong or an action is not finite.
-    """
-    return _array_of(_numbers(actions, (batch, None, components)), device)
+    """Actions of a rollout, shape [batch, T, component], for the kernels: step by step, float64; arguments
+    and errors as those of :func:`step_actions`."""
+    numbers = _numbers(actions, (batch, None, components))
+    if through is not None:
+        numbers = through(numbers.reshape(-1, batch, components)).reshape(-1)
+    return _array_of(numbers, device)
 
 
 def _numbers(

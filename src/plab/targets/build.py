@@ -28,6 +28,7 @@ RECIPES: dict[str, type[Recipe]] = {
     "carry": scripted.CarryTarget,
     "dent": scripted.DentTarget,
     "draw": scripted.DrawTarget,
+    "gesture": scripted.GestureTarget,
     "lift": scripted.LiftTarget,
     "press": scripted.PressTarget,
     "push": scripted.PushTarget,

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene
+from plab.kinematics.chain import matched
+from plab.scenes import MATERIAL_KEYS, ROLL_RADIUS, Body, Manipulator, Scene, SceneError
 from plab.targets.recipes import EPISODE_STEPS, Recipe, TargetError
 
 DRAWS = 200
@@ -112,11 +113,11 @@ class Script(Recipe, ABC):
         """
         if self.seed < 0:
             raise TargetError(f"target.seed must be at least 0, not {self.seed}")
-        if not any(m.action_dim for m in scene.manipulators):
+        if not any(m.action_dim for m in scene.tools):
             raise TargetError(f"the recipe needs a manipulator that can move; task {scene.name} has none")
         rng = np.random.default_rng(self.seed)
         for _ in range(DRAWS):
-            tracks = [ActionTrack(m) for m in scene.manipulators if m.action_dim]
+            tracks = [ActionTrack(m) for m in scene.tools if m.action_dim]
             try:
                 self.plan(scene, tracks, rng)
                 return np.concatenate([track.actions() for track in tracks], axis=1)
@@ -299,7 +300,7 @@ class CarryTarget(Script):
 
     def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
         base, cargo = scene.bodies[0], scene.bodies[-1]
-        tools = [m for m in scene.manipulators if m.action_dim]
+        tools = [m for m in scene.tools if m.action_dim]
         squeeze, press = _draw(rng, "squeeze", self.squeeze), _draw(rng, "press", self.press)
         x, z = np.asarray(base.center)[[0, 2]] - np.asarray(cargo.center)[[0, 2]]
         rise = _top(base) - (cargo.center[1] - cargo.half_extent()[1]) + CLEARANCE
@@ -347,6 +348,72 @@ class PushTarget(Script):
         track.delay()
 
 
+@dataclass
+class Posture:
+    """Joint positions at the end of a part of a gesture.
+
+    Attributes:
+        joints: Ranges of positions by patterns of joints; joints of one pattern share one draw, of where
+            between the ends of its range. Others stay where they are.
+        steps: Environment steps to get there, at least.
+    """
+
+    joints: dict[str, list[float]]
+    steps: int = 1
+
+
+@dataclass
+class GestureTarget(Script):
+    """An articulated model goes through postures, one after the other, and stays in the last.
+
+    Attributes:
+        postures: The postures, in order.
+    """
+
+    postures: list[Posture]
+
+    def actions(self, scene: Scene) -> np.ndarray:
+        """See :meth:`Script.actions`."""
+        chain = scene.kinematics
+        if self.seed < 0 or chain is None:
+            reason = "the recipe needs a task with kinematics" if chain is None else "seed must be at least 0"
+            raise TargetError(f"target: {reason}")
+        rng = np.random.default_rng(self.seed)
+        joints = {joint.name: joint for joint in chain.joints}
+        at = {name: joint.start for name, joint in joints.items()}
+        rows: list[np.ndarray] = []
+        for number, posture in enumerate(self.postures):
+            goal: dict[str, float] = {}
+            for pattern, limits in posture.joints.items():
+                value = _draw(rng, f"postures[{number}].joints.{pattern}", limits)
+                try:
+                    goal |= matched(f"target.postures[{number}]", {pattern: value}, list(joints))
+                except SceneError as error:
+                    raise TargetError(str(error)) from None
+            shares = {name: (to - at[name]) / joints[name].scale for name, to in goal.items()}
+            most = max(map(abs, shares.values()), default=0.0)
+            steps = max(posture.steps, math.ceil(most - 1e-9))
+            row = np.zeros(scene.action_dim)
+            for name, share in shares.items():
+                row[joints[name].component - len(chain.components)] = share / steps
+            row = np.round(row, DECIMALS)
+            rows += [row] * steps
+            for name, joint in joints.items():
+                moved = at[name] + steps * joint.scale * row[joint.component - len(chain.components)]
+                at[name] = min(max(moved, joint.low), joint.high)
+        if len(rows) > EPISODE_STEPS:
+            raise TargetError(
+                f"the gesture takes {len(rows)} steps, not at most {EPISODE_STEPS}: shorten its ways"
+            )
+        actions = np.zeros((EPISODE_STEPS, scene.action_dim))
+        actions[: len(rows)] = np.reshape(rows, (len(rows), -1))
+        return actions
+
+    def plan(self, scene: Scene, tracks: list[ActionTrack], rng: np.random.Generator) -> None:
+        """Not used: a gesture moves joints."""
+        raise NotImplementedError
+
+
 def _draw(rng: np.random.Generator, name: str, limits: Sequence[float]) -> float:
     """Draw uniformly from a range [low, high]; all of a recipe's ranges are checked here."""
     if len(limits) != 2 or not -math.inf < limits[0] <= limits[1] < math.inf:
@@ -362,7 +429,7 @@ def _count(rng: np.random.Generator, name: str, limits: Sequence[int]) -> int:
 
 
 def _mover(scene: Scene) -> Manipulator:
-    return next(m for m in scene.manipulators if m.action_dim)
+    return next(m for m in scene.tools if m.action_dim)
 
 
 def _top(body: Body) -> float:

@@ -67,7 +67,7 @@ class ContactStarts:
     def __init__(self, scene: Scene, target: np.ndarray) -> None:
         """Take note of the scene, and of the target's mass tensor, shape [n, n, n]."""
         self._scene, self._target = scene, target
-        self._tools = [m for m in scene.manipulators if m.action_dim]
+        self._tools = [m for m in scene.tools if m.action_dim]
 
     def draw(self, count: int, seed: int) -> np.ndarray:
         """Draw starts, pushing and carrying in turn.
@@ -80,7 +80,26 @@ class ContactStarts:
             Actions in [-1, 1], shape [count, T, A].
         """
         rng = np.random.default_rng(seed)
-        return np.stack([(self._carry if k % 2 else self._push)(rng) for k in range(count)])
+        return np.stack(
+            [self._with_joints((self._carry if k % 2 else self._push)(rng), rng) for k in range(count)]
+        )
+
+    def _with_joints(self, own: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Add the actions of an articulated model, if there is one, to those of the other manipulators: two
+        even motions of all joints, in the second of which a base that moves goes the bodies' middle way."""
+        chain, steps = self._scene.kinematics, self._scene.horizon
+        if chain is None:
+            return own
+        first = max(1, int(steps * rng.uniform(0.3, 0.6)))
+        rows = rng.uniform(-1.0, 1.0, (2, len(chain.components)))
+        way = np.median(self._transport[1], axis=0)
+        for joint in chain.joints:
+            if joint.name in ("base_x", "base_y", "base_z"):
+                rows[1, joint.component] = (
+                    way["xyz".index(joint.name[-1])] / joint.scale / (steps - first or 1)
+                )
+        moved = np.repeat(rows, [first, steps - first], axis=0)
+        return np.concatenate([own, np.clip(moved, -1.0, 1.0)], axis=1)
 
     @cached_property
     def _transport(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,7 +115,7 @@ class ContactStarts:
         nodes = np.searchsorted(mass, (np.arange(len(points)) + 0.5) / len(points) * mass[-1])
         goals = np.stack(np.unravel_index(nodes, self._target.shape), axis=1) * scene.dx
         moved = np.zeros_like(points)
-        held = {self._owner(tool) for tool in self._tools}
+        held = {self._owner(tool) for tool in self._tools} or set(body.tolist())
         weight = np.where(np.isin(body, list(held)), 1.0, LEFT_ALONE)[:, None]
         for _ in range(ALIGNMENTS if len(scene.bodies) > 1 else 1):
             _, assigned = linear_sum_assignment(weight * cdist(points + moved, goals, "sqeuclidean"))
@@ -131,7 +150,7 @@ class ContactStarts:
                 direction = offset / np.linalg.norm(offset)
                 track.go(_action(tool, self._to_touch(tool, own, own.mean(0), direction) + press * direction))
             tracks.append(track)
-        together = max(map(len, tracks))
+        together = max(map(len, tracks), default=0)
         # Those that hold a body between them must keep pace.
         left = max(2, int((self._scene.horizon - together) * rng.uniform(0.5, 1.0)))
         # Over other bodies, every other time.
@@ -161,6 +180,8 @@ class ContactStarts:
         return place - np.asarray(tool.position)
 
     def _actions(self, tracks: Sequence[ActionTrack]) -> np.ndarray:
+        if not tracks:
+            return np.zeros((self._scene.horizon, 0))
         return np.concatenate([track.first(self._scene.horizon) for track in tracks], axis=1)
 
 

@@ -1,0 +1,177 @@
+"""Actions in joint space, turned into twists of a chain's links, and the adjoint back; in PyTorch.
+
+In an environment step every joint moves by its share of the action, within its limits. Forward kinematics
+gives the links' frames before and after; a link's twist is its displacement and the logarithm of its relative
+rotation, so that it arrives exactly where the joints say. Sums are written out: a product's bits must not
+depend on the number of environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from plab.kinematics.chain import Chain
+    from plab.scenes import Scene
+
+__all__ = ["Drive", "JointActions", "rotation_vector"]
+
+
+class Drive:
+    """Motion of the links in some environment steps, and the way back.
+
+    Attributes:
+        twists: Actions of the simulator, shape [T, batch, component]; like the actions an array or a tensor.
+        joints: Joint positions after the last step, shape [batch, joint], likewise.
+    """
+
+    def __init__(self, given: list[Tensor], made: list[Tensor], as_array: bool) -> None:
+        """Keep what was ``given``, actions and joint positions, and what was ``made``, twists and joint
+        positions."""
+        self._given, self._made, self._as_array = given, made, as_array
+        self.twists, self.joints = map(self._out, made)
+
+    def pull_back(self, bar: Any, joints_bar: Any = None) -> tuple[Any, Any]:
+        """Return the derivatives by the actions, shape [T, batch, A], and by the joint positions before, from
+        those by the twists and by the joint positions after."""
+        bars = [torch.as_tensor(bar).to(self._made[0])]
+        made = self._made[:1]
+        if joints_bar is not None:
+            made, bars = self._made, [*bars, torch.as_tensor(joints_bar).to(self._made[1])]
+        by_actions, by_joints = torch.autograd.grad(made, self._given, bars)
+        return self._out(by_actions), self._out(by_joints)
+
+    def _out(self, tensor: Tensor) -> Any:
+        return tensor.detach().numpy() if self._as_array else tensor.detach()
+
+
+class JointActions:
+    """Map from actions to twists, for a batch of scenes with chains of one topology.
+
+    Attributes:
+        start: Joint positions at t = 0, shape [batch, joint].
+    """
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        """Take the scenes' chains; the scenes' other manipulators keep their own components, which come
+        first."""
+        chains: list[Chain] = [scene.kinematics for scene in scenes]  # type: ignore[misc]
+        first = chains[0]
+        self._direct = scenes[0].action_dim - len(first.components)
+        # Joints by their depth in the tree: all of one depth are computed together.
+        depth: list[int] = []
+        for joint in first.joints:
+            depth.append(depth[joint.parent] + 1 if joint.parent >= 0 else 0)
+        levels = [[j for j, d in enumerate(depth) if d == k] for k in range(max(depth) + 1)]
+        order = [j for level in levels for j in level]
+        self._sizes = [len(level) for level in levels]
+        below = [[first.joints[j].parent for j in level] for level in levels[1:]]
+        self._indices = {
+            "component": [joint.component for joint in first.joints],
+            "order": order,
+            # Frame 0 is the world's.
+            "carriers": [order.index(k.parent) + 1 if k.parent >= 0 else 0 for k in first.links],
+            **{f"parents{k}": [levels[k].index(j) for j in parents] for k, parents in enumerate(below)},
+        }
+        self._arrays = {
+            name: np.array([[getattr(joint, name) for joint in chain.joints] for chain in chains], float)
+            for name in ("offset", "axis", "anchor", "low", "high", "scale", "start", "hinge")
+        }
+        self.start = self._arrays["start"]
+        for name in ("offset", "axis", "anchor", "hinge"):
+            self._arrays[name] = self._arrays[name][:, order]
+        self._arrays["links"] = np.array([[link.offset for link in chain.links] for chain in chains])
+        self._constants: dict[torch.device, dict[str, Tensor]] = {}
+
+    def drive(self, joints: Any, actions: Any) -> Drive:
+        """Move the joints.
+
+        Args:
+            joints: Joint positions before the first step, shape [batch, joint].
+            actions: Actions, shape [T, batch, A], float64; an array, or a tensor on any device.
+        """
+        given = torch.as_tensor(actions).requires_grad_()
+        before = torch.as_tensor(joints).detach().to(given).requires_grad_()
+        with torch.enable_grad():
+            c = self._on(given.device)
+            moves = given[..., self._direct :].clamp(-1.0, 1.0).index_select(-1, c["component"]) * c["scale"]
+            at = [before]
+            for move in moves:
+                at.append((at[-1] + move).clamp(c["low"], c["high"]))
+            frames = self.frames(torch.stack(at))
+            twists = torch.cat([_displacements(frames), _rotations(frames)], dim=-1)
+            raw = torch.cat([given[..., : self._direct], twists.flatten(2)], dim=-1)
+        return Drive([given, before], [raw, at[-1]], not isinstance(actions, Tensor))
+
+    def frames(self, joints: Tensor) -> Tensor:
+        """Transforms from the links' frames to the world by joint positions, shape [T, batch, joint]; shape
+        [T, batch, link, 4, 4]."""
+        c = self._on(joints.device)
+        moved = self._joint_frames(joints.index_select(-1, c["order"]), c)
+        own = _product(c["offset"], moved).split(self._sizes, dim=2)
+        world = [own[0]]
+        for k, frames in enumerate(own[1:]):
+            world.append(_product(world[-1].index_select(2, c[f"parents{k}"]), frames))
+        still = c["eye"].expand(*joints.shape[:2], 1, 4, 4)
+        return _product(torch.cat([still, *world], dim=2).index_select(2, c["carriers"]), c["links"])
+
+    @staticmethod
+    def _joint_frames(joints: Tensor, c: dict[str, Tensor]) -> Tensor:
+        """Transforms of the joints' own motions, shape [T, batch, joint, 4, 4], by Rodrigues' formula."""
+        angle = (joints * c["hinge"])[..., None, None]
+        # In homogeneous coordinates: the anchor stays where it is, a slide moves along its axis.
+        turn = angle.sin() * c["cross"] + (1.0 - angle.cos()) * c["cross2"]
+        return c["eye"] + _product(turn, c["to_anchor"]) + joints[..., None, None] * c["slide"]
+
+    def _on(self, device: torch.device) -> dict[str, Tensor]:
+        """Numbers of the chains on a device."""
+        if device not in self._constants:
+            c = {name: torch.tensor(array, device=device) for name, array in self._arrays.items()}
+            x, y, z = c["axis"].unbind(-1)
+            o = torch.zeros_like(x)
+            rows = (o, -z, y, o), (z, o, -x, o), (-y, x, o, o), (o, o, o, o)
+            c["cross"] = torch.stack([torch.stack(row, -1) for row in rows], -2)
+            c["cross2"] = c["cross"] @ c["cross"]
+            c["eye"] = torch.eye(4, dtype=x.dtype, device=device)
+            c["to_anchor"] = c["eye"].repeat(*x.shape, 1, 1)
+            c["to_anchor"][..., :3, 3] = -c["anchor"]
+            c["slide"] = torch.zeros_like(c["cross"])
+            c["slide"][..., :3, 3] = c["axis"] * (1.0 - c["hinge"])[..., None]
+            c |= {name: torch.tensor(index, device=device) for name, index in self._indices.items()}
+            self._constants[device] = c
+        return self._constants[device]
+
+
+def rotation_vector(turn: Tensor) -> Tensor:
+    """Logarithm of rotation matrices, shape [..., 3, 3], by less than half a turn; shape [..., 3]."""
+    skew = 0.5 * (turn - turn.transpose(-1, -2))
+    axis = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    square = axis[..., 0] ** 2 + axis[..., 1] ** 2 + axis[..., 2] ** 2
+    cosine = 0.5 * (turn[..., 0, 0] + turn[..., 1, 1] + turn[..., 2, 2] - 1.0)
+    small = (square < 1e-8) & (cosine > 0.0)
+    sine = torch.where(small, 1.0, square).sqrt()
+    # angle / sin(angle), as a series in sin(angle)^2 where both vanish.
+    ratio = torch.where(small, 1.0 + square / 6.0 + 3.0 * square**2 / 40.0, torch.atan2(sine, cosine) / sine)
+    return ratio[..., None] * axis
+
+
+def _displacements(frames: Tensor) -> Tensor:
+    return frames[1:, ..., :3, 3] - frames[:-1, ..., :3, 3]
+
+
+def _rotations(frames: Tensor) -> Tensor:
+    turns = frames[..., :3, :3]
+    return rotation_vector(_product(turns[1:], turns[:-1].transpose(-1, -2)))
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Matrix product, its sums in order."""
+    first, *others = (a.unsqueeze(-1) * b.unsqueeze(-3)).unbind(-2)
+    for term in others:
+        first = first + term
+    return first

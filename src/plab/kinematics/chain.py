@@ -1,0 +1,276 @@
+"""Kinematic trees: joints with limits, and links that they carry. Plain data and NumPy."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from plab.scenes import Manipulator, SceneError, vector3
+
+if TYPE_CHECKING:
+    from plab.kinematics.actions import JointActions
+    from plab.scenes import Scene
+
+__all__ = ["BASE_JOINTS", "Chain", "Joint", "Link", "matched", "pose_matrix"]
+
+Matrix = tuple[tuple[float, ...], ...]
+"""Homogeneous transform, 4 rows of 4 numbers."""
+
+LEVEL = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
+"""The transform that changes nothing."""
+
+BASE_JOINTS = {
+    "base_x": (1.0, 0.0, 0.0),
+    "base_y": (0.0, 1.0, 0.0),
+    "base_z": (0.0, 0.0, 1.0),
+    "base_yaw": (0.0, 1.0, 0.0),
+    "base_pitch": (1.0, 0.0, 0.0),
+    "base_roll": (0.0, 0.0, 1.0),
+}
+"""Axes of the joints of a free base: three slides along the world's axes, then three hinges."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint and what it adds to its parent's frame: first ``offset``, then its own motion.
+
+    Attributes:
+        name: Its name.
+        parent: Index of the joint that carries it, -1 for the world.
+        offset: Transform from its frame at position 0 to the parent's frame.
+        hinge: Whether it turns about the axis; it slides along it otherwise.
+        axis: Unit vector, in its own frame.
+        anchor: A point of the axis of a hinge, likewise [domain units].
+        low: Lowest position [rad or domain units].
+        high: Highest position.
+        scale: Motion per environment step at action 1.
+        start: Position at t = 0.
+        component: Index of the component of the chain's action that moves it.
+    """
+
+    name: str
+    parent: int
+    offset: Matrix
+    hinge: bool
+    axis: tuple[float, ...]
+    anchor: tuple[float, ...] = (0.0, 0.0, 0.0)
+    low: float = -math.inf
+    high: float = math.inf
+    scale: float = 0.0
+    start: float = 0.0
+    component: int = 0
+
+    def matrix(self, position: float) -> np.ndarray:
+        """Transform from its frame to the parent's, shape [4, 4]."""
+        own, axis, anchor = np.eye(4), np.array(self.axis), np.array(self.anchor)
+        if self.hinge:
+            own[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
+            own[:3, 3] = anchor - own[:3, :3] @ anchor
+        else:
+            own[:3, 3] = position * axis
+        return np.array(self.offset) @ own
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid link.
+
+    Attributes:
+        parent: Index of the joint that carries it, -1 for the world.
+        offset: Transform from the link's frame, in which its shape is, to that of the joint.
+        shape: Key of :data:`plab.scenes.MANIPULATOR_SHAPES`, with the motion ``twist``.
+        size: Lengths of the shape [domain units].
+    """
+
+    parent: int
+    offset: Matrix
+    shape: str
+    size: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A kinematic tree in a scene.
+
+    Attributes:
+        joints: Joints; a parent comes before its children.
+        links: Links, in the order of the scene's last manipulators.
+        components: Names of the components of its action; each is clipped to [-1, 1].
+    """
+
+    joints: tuple[Joint, ...]
+    links: tuple[Link, ...]
+    components: tuple[str, ...] = ()
+
+    @property
+    def topology(self) -> tuple[object, ...]:
+        """What is the same for the chains of all scenes of one simulator."""
+        joints = tuple((joint.parent, joint.hinge, joint.component) for joint in self.joints)
+        return joints, tuple((link.parent, link.shape) for link in self.links)
+
+    def frames(self, positions: Sequence[float]) -> np.ndarray:
+        """Transforms from the links' frames to the world by joint positions [joint], shape [link, 4, 4]."""
+        world: list[np.ndarray] = []
+        for joint, position in zip(self.joints, positions, strict=True):
+            above = world[joint.parent] if joint.parent >= 0 else np.eye(4)
+            world.append(above @ joint.matrix(position))
+        return np.array(
+            [(world[k.parent] if k.parent >= 0 else np.eye(4)) @ np.array(k.offset) for k in self.links]
+        )
+
+    def manipulators(self, friction: float) -> tuple[Manipulator, ...]:
+        """Links as manipulators of a scene, where they are at t = 0."""
+        frames = self.frames([joint.start for joint in self.joints])
+        turns = Rotation.from_matrix(frames[:, :3, :3]).as_quat(scalar_first=True)
+        wide: dict[str, Any] = {"lower_bound": (-1.0,) * 3, "upper_bound": (2.0,) * 3}
+        return tuple(
+            Manipulator(k.shape, k.size, vector3(at.tolist()), tuple(q.tolist()), friction=friction, **wide)
+            for k, at, q in zip(self.links, frames[:, :3, 3], turns, strict=True)
+        )
+
+    @staticmethod
+    def action_map(scenes: Sequence[Scene]) -> JointActions:
+        """Map from actions to twists, for a batch of scenes with chains of one topology."""
+        # Imported here: PyTorch is for those who simulate, not for those who read configurations.
+        from plab.kinematics.actions import JointActions
+
+        return JointActions(scenes)
+
+    def largest_step(self) -> float:
+        """Bound on how far any point of a link moves in an environment step [domain units]."""
+        most = 0.0
+        for link in self.links:
+            reach = float(np.linalg.norm(np.array(link.offset)[:3, 3])) + sum(link.size)
+            way, number = 0.0, link.parent
+            while number >= 0:
+                joint = self.joints[number]
+                way += joint.scale * ((reach + float(np.linalg.norm(joint.anchor))) if joint.hinge else 1.0)
+                slide = 0.0 if joint.hinge else max(abs(joint.low), abs(joint.high))
+                reach += float(np.linalg.norm(np.array(joint.offset)[:3, 3])) + min(slide, 1.0)
+                number = joint.parent
+            most = max(most, way)
+        return most
+
+    def placed(
+        self,
+        position: Sequence[float],
+        rotation: Sequence[float],
+        free: bool,
+        *,
+        scale: Mapping[str, float],
+        start: Mapping[str, float],
+        limits: Mapping[str, Sequence[float]],
+        together: Mapping[str, str],
+    ) -> Chain:
+        """Place a model in a scene, with the joints that are to move.
+
+        Args:
+            position: Origin of the model [domain units].
+            rotation: Quaternion w, x, y, z from the model's axes to the world's.
+            free: Whether the base moves, by :data:`BASE_JOINTS`; it is fixed otherwise.
+            scale: Motion per environment step at action 1, by patterns of joint names; of several that match
+                the last counts. Joints without one stay at their start.
+            start: Positions at t = 0, by patterns.
+            limits: Lowest and highest positions, likewise; the model's where nothing matches.
+            together: Patterns of joints that one component of the action moves, by its name.
+
+        Raises:
+            SceneError: If a pattern matches no joint, a joint starts outside its limits, or nothing moves.
+        """
+        turn = pose_matrix((0.0, 0.0, 0.0), rotation)
+        base = [
+            Joint(name, k - 1, LEVEL, k >= 3, axis, low=-math.pi if k >= 3 else -1.0)
+            for k, (name, axis) in enumerate(BASE_JOINTS.items() if free else ())
+        ]
+        base = [replace(joint, high=-joint.low) for joint in base]
+        place = pose_matrix(position, (1.0, 0.0, 0.0, 0.0))
+        if base:
+            base[0] = replace(base[0], offset=_tuples(place))
+        first = turn if base else place @ turn
+        shift = len(base)
+
+        def moved(node: Joint | Link) -> dict[str, Any]:
+            if node.parent >= 0:
+                return {"parent": node.parent + shift}
+            return {"parent": shift - 1, "offset": _tuples(first @ np.array(node.offset))}
+
+        joints = base + [replace(joint, **moved(joint)) for joint in self.joints]
+        links = [replace(link, **moved(link)) for link in self.links]
+        names = [joint.name for joint in joints]
+        scales, starts = matched("scale", scale, names), matched("start", start, names)
+        bounds = matched("limits", limits, names)
+        shared = {name: word for word in together for name in matched("together", {together[word]: 1}, names)}
+        for k, joint in enumerate(joints):
+            low, high = bounds.get(joint.name, (joint.low, joint.high))
+            at = starts.get(joint.name, float(np.clip(0.0, low, high)))
+            if not low <= at <= high:
+                raise SceneError(
+                    f"start: joint {joint.name} at {at:g} is outside its limits {low:g} .. {high:g}"
+                )
+            joints[k] = replace(joint, low=low, high=high, start=at, scale=scales.get(joint.name, 0.0))
+        components = list(dict.fromkeys(shared.get(one.name, one.name) for one in joints if one.scale))
+        if not components:
+            raise SceneError("scale: no joint moves: give one at least a scale")
+        numbered = [
+            replace(one, component=components.index(shared.get(one.name, one.name)) if one.scale else 0)
+            for one in joints
+        ]
+        return Chain(tuple(numbered), tuple(links), tuple(components)).moving()
+
+    def moving(self) -> Chain:
+        """The same chain without the joints that stay where they start."""
+        kept: list[Joint] = []
+        # Of each joint: index of the joint that carries its frame now, and transform to that frame.
+        frames: list[tuple[int, np.ndarray]] = []
+
+        def below(node: Joint | Link) -> tuple[int, np.ndarray]:
+            parent, matrix = frames[node.parent] if node.parent >= 0 else (-1, np.eye(4))
+            return parent, matrix @ np.array(node.offset)
+
+        for joint in self.joints:
+            parent, offset = below(joint)
+            moved = replace(joint, parent=parent, offset=_tuples(offset))
+            if joint.scale:
+                kept.append(moved)
+                frames.append((len(kept) - 1, np.eye(4)))
+            else:
+                frames.append((parent, moved.matrix(joint.start)))
+        links = [
+            replace(link, parent=parent, offset=_tuples(offset))
+            for link, (parent, offset) in ((link, below(link)) for link in self.links)
+        ]
+        return replace(self, joints=tuple(kept), links=tuple(links))
+
+
+def matched(key: str, table: Mapping[str, object], names: Sequence[str]) -> dict[str, Any]:
+    """Values of a table by names, given by patterns, regular expressions of whole names; SceneError, which
+    begins with ``key``, if one matches no name."""
+    found: dict[str, Any] = {}
+    for pattern, value in table.items():
+        try:
+            hits = [name for name in names if re.fullmatch(pattern, name)]
+        except re.error as error:
+            raise SceneError(f"{key}: '{pattern}' is not a pattern: {error}") from None
+        if not hits:
+            raise SceneError(f"{key}: '{pattern}' matches none of {', '.join(names)}")
+        found |= dict.fromkeys(hits, value)
+    return found
+
+
+def pose_matrix(position: ArrayLike, rotation: ArrayLike) -> np.ndarray:
+    """Homogeneous transform, shape [4, 4], of a position and a quaternion w, x, y, z."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _tuples(matrix: np.ndarray) -> Matrix:
+    return tuple(map(tuple, np.asarray(matrix).tolist()))
