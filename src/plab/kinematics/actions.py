@@ -88,16 +88,17 @@ class JointActions:
         self._arrays["links"] = np.array([[link.offset for link in chain.links] for chain in chains])
         self._constants: dict[torch.device, dict[str, Tensor]] = {}
 
-    def drive(self, joints: Any, actions: Any) -> Drive:
+    def drive(self, joints: Any, actions: Any, gradient: bool = True) -> Drive:
         """Move the joints.
 
         Args:
             joints: Joint positions before the first step, shape [batch, joint].
             actions: Actions, shape [T, batch, A], float64; an array, or a tensor on any device.
+            gradient: Whether :meth:`Drive.pull_back` is to be called.
         """
         given = torch.as_tensor(actions).requires_grad_()
         before = torch.as_tensor(joints).detach().to(given).requires_grad_()
-        with torch.enable_grad():
+        with torch.set_grad_enabled(gradient):
             c = self._on(given.device)
             moves = given[..., self._direct :].clamp(-1.0, 1.0).index_select(-1, c["component"]) * c["scale"]
             at = [before]

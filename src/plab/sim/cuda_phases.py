@@ -38,6 +38,9 @@ RESIDENT_BLOCK = WARP_BLOCK
 """Threads of a block of the step that is one launch: Taichi gives them no more registers than two blocks of a
 multiprocessor have."""
 
+FEW = 6
+"""Manipulators of which each node tests all; of more, a block's warps ask first which can reach the block."""
+
 POSE_SHARE = 8
 """Manipulators that a block moves."""
 
@@ -298,15 +301,33 @@ class CudaPhases(OrderPhases, PosePhases):
     # -- grid ---------------------------------------------------------------------------------------
 
     @ti.func
-    def touching(self, e, s, x):
-        """Bit mask of the manipulators whose contact is not zero at a point in substep s."""
+    def near_block(self, w, e, s, block):
+        """Bit mask of the manipulators that can reach a node of a block, of which a warp with all its lanes
+        has a part: each lane asks for one manipulator."""
+        mask, lane = 0, w % WARP
+        for shape, start, stop in ti.static(self.shape_ranges):
+            if lane >= start and lane < stop:
+                if self.is_near(shape, e, s, lane, block):
+                    mask = 1 << lane
+        for k in ti.static(range(5)):
+            mask = mask | ti.simt.warp.shfl_xor_i32(ti.u32(ALL_LANES), mask, 1 << k)
+        return mask
+
+    @ti.func
+    def touching(self, e, s, x, near):
+        """Bit mask of the manipulators whose contact is not zero at a point in substep s; of more than a few
+        only those of the mask ``near`` are asked."""
         mask = 0
         for shape, start, stop in ti.static(self.shape_ranges):
             for m in range(start, stop):
-                p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
-                d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-                if self.strength(e, d) > 0.0:
-                    mask = mask | (1 << m)
+                asked = 1
+                if ti.static(self.manipulators > FEW):
+                    asked = near & (1 << m)
+                if asked:
+                    p = self.into_frame(shape, e, s, m, x - self.frame_centre[e, s, m])
+                    d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+                    if self.strength(e, d) > 0.0:
+                        mask = mask | (1 << m)
         return mask
 
     @ti.func
@@ -511,8 +532,10 @@ class CudaPhases(OrderPhases, PosePhases):
         e, block, r = self.node_of(q)
         unit = self.momentum_scale(-1)
         total = self.take_nodes(self.momentum, shared, w, e, block, r, unit)
-        # A test of which manipulators are near would cost a thread as much as contact with them.
+        # A test of which of a few manipulators are near would cost a thread as much as contact with them.
         near = ti.static((1 << self.manipulators) - 1)
+        if ti.static(self.manipulators > FEW):
+            near = self.near_block(w, e, s, block)
         v = self.update_node(e, s, self.node_of_block(block, r), near, total)
         self.put_nodes(self.velocity, shared, w, e, block, r, widen(v, 0.0 * v[0]))
 
@@ -556,8 +579,10 @@ class CudaPhases(OrderPhases, PosePhases):
         unit = self.adjoint_scale(e, -1)
         bar4 = self.take_nodes(self.velocity_bar, shared, w, e, block, r, unit)
         near = 0
+        if ti.static(self.manipulators > FEW):
+            near = self.near_block(w, e, s, block)
         if total[3] > MASS_MIN:
-            near = self.touching(e, s, self.position(i))
+            near = self.touching(e, s, self.position(i), near)
         v, total_bar = self.update_node_adjoint(
             e * self.substeps + s, e, s, i, near, total, ti.Vector([bar4[0], bar4[1], bar4[2]])
         )

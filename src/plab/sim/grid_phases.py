@@ -90,18 +90,23 @@ class GridPhases(Storage):
         Distances are 1-Lipschitz, so one evaluation at the block's centre decides for all of its nodes.
         """
         mask = 0
+        for shape, start, stop in ti.static(self.shape_ranges):
+            for m in range(start, stop):
+                if self.is_near(shape, e, s, m, block):
+                    mask = mask | (1 << m)
+        return mask
+
+    @ti.func
+    def is_near(self, shape: ti.template(), e, s, m, block):
+        """Whether manipulator m can reach a node of a block in substep s."""
         centre = self.position(self.node_of_block(block, 0)) + 0.5 * (BLOCK - 1) * self.dx
         alpha = self.alpha[e]
         reach = ti.static(1.001 * math.sqrt(3.0) * 0.5 * (BLOCK - 1)) * self.dx
         if alpha > 0.0:
             reach += ti.static(-math.log(STRENGTH_MIN)) / alpha
-        for shape, start, stop in ti.static(self.shape_ranges):
-            for m in range(start, stop):
-                p = self.into_frame(shape, e, s, m, centre - self.frame_centre[e, s, m])
-                d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
-                if d <= reach:
-                    mask = mask | (1 << m)
-        return mask
+        p = self.into_frame(shape, e, s, m, centre - self.frame_centre[e, s, m])
+        d, _n = signed_distance(shape, p, self.size[e, m], self.frame_gap[e, s, m])
+        return d <= reach
 
     # -- contact ------------------------------------------------------------------------------------
 

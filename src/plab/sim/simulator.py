@@ -277,7 +277,8 @@ class Simulator:
         """
         self._require_runtime()
         self._version += 1
-        array = step_actions(actions, self.batch, self.action_dim, self.device, self._through)
+        through = (lambda given: self._follow(given, False).twists) if self._map else None
+        array = step_actions(actions, self.batch, self.action_dim, self.device, through)
         self._particles.step(self._pose, array)
         self._taken += 1
         self._checked = check
@@ -635,15 +636,16 @@ class Simulator:
     ) -> tuple[ti.Ndarray, int, ti.Ndarray, int | None]:
         """Reset; return actions, number of steps, pose history, and steps of a segment with a gradient."""
         self.reset()
-        array = action_array(actions, self.batch, self.action_dim, self.device, self._through)
+        through = (lambda given: self._follow(given, gradient).twists) if self._map else None
+        array = action_array(actions, self.batch, self.action_dim, self.device, through)
         steps = np.shape(actions)[1]
         plan = self._tape.plan(steps, self.memory_mb) if gradient else None
         return array, steps, self._pose_history(steps, self._initial_poses), plan
 
-    def _follow(self, actions: Any) -> Drive:
+    def _follow(self, actions: Any, gradient: bool = True) -> Drive:
         """Move the joints of the articulated models by actions, shape [T, batch, A]."""
         assert self._map is not None
-        self._drive = self._map.drive(self._joints, actions)
+        self._drive = self._map.drive(self._joints, actions, gradient)
         self._joints = self._drive.joints
         return self._drive
 
@@ -677,7 +679,6 @@ class Simulator:
         self._initial_poses = initial_poses(self.scenes)
         chain = self.scenes[0].kinematics
         self._map = chain.action_map(self.scenes) if chain else None
-        self._through = (lambda actions: self._follow(actions).twists) if chain else None
         self._initial_joints: np.ndarray | None = self._map.start if self._map else None
         start = rest_state(np.stack(positions), self._initial_poses)
         self._initial.from_numpy(self._particles.pack(start))
