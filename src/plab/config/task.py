@@ -332,6 +332,8 @@ class TaskConfig(ranges.Section):
         Raises:
             ConfigError: If a file is missing, cannot be read, or holds something else; names its key.
         """
+        if self.kinematics is not None:
+            self.kinematics.pin()
         # A variant's file has a hash of its own, whatever it is merged over.
         bodies = {name: vars(body) for name, body in self.bodies.items()}
         _pin({"bodies": bodies, "target": self.target, "variants": self.variants}, "task")
