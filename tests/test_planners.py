@@ -39,7 +39,9 @@ from same_runs import assert_same_numbers
 SHAPE = (5, 2)
 GOAL = torch.linspace(-0.9, 0.6, 10, dtype=torch.float64).reshape(SHAPE)
 START = CandidateStart(
-    SimpleNamespace(horizon=SHAPE[0], action_dim=SHAPE[1], manipulators=()), np.zeros(1), torch.device("cpu")
+    SimpleNamespace(horizon=SHAPE[0], action_dim=SHAPE[1], tools=(), kinematics=None),
+    np.zeros(1),
+    torch.device("cpu"),
 )
 
 
