@@ -11,7 +11,6 @@ from plab.bench import speed, workload
 from plab.bench.workload import FORWARD, GRADIENT, ROLLOUT
 
 TINY = ("sim.particles_scale=0.03", "sim.grid_size=32", "sim.dt=2e-4", "sim.substeps=5")
-STEPS = 6
 
 
 def read(path: Path) -> list[dict[str, str]]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pandas as pd
 import pytest
 
-from plab.bench.accuracy import QUICK, TASKS, Attempt, Plan, lattice, rows
+from plab.bench.accuracy import QUICK, TASKS, Attempt, Plan, lattice
 from plab.bench.stability import main
 from plab.scenes import Body
 
@@ -38,12 +35,3 @@ def test_lattices_fill_bodies_evenly_and_every_setting_has_a_scene() -> None:
 @pytest.mark.nightly
 def test_every_quick_case_survives() -> None:
     assert main(["--quick", "--precision", "float32"]) == 0
-
-
-@pytest.mark.nightly
-def test_finer_steps_come_closer_to_the_reference() -> None:
-    plan = replace(QUICK, substeps=(5, 20), reference=80, grids=(24, 32), steps=6, particles=200)
-    table = pd.DataFrame(rows(["Move"], plan)).query("contact == 'hard' and material == 'series'")
-    for name, some in table[table["axis"] == "substeps"].groupby("precision"):
-        errors = some.set_index("substeps")["positions"].astype(float)
-        assert errors[20] < errors[5], name

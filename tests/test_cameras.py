@@ -80,7 +80,13 @@ def test_pictures_are_the_same_in_a_batch_and_follow_steps():
         np.testing.assert_array_equal(one.capture("depth")["depth"][0], later["depth"][1])
 
 
-COARSE = ["sim.grid_size=32", "sim.particles_scale=0.05", f"sim.device={DEVICE}"]
+COARSE = [
+    "sim.grid_size=32",
+    "sim.particles_scale=0.03",
+    "sim.horizon=4",
+    "sim.substeps=5",
+    f"sim.device={DEVICE}",
+]
 EVERYTHING = {
     "observe": ["state", "particles", "depth", "rgb", "segmentation"],
     "cameras": {"top": {"position": (0.5, 2.0, 0.5), "target": (0.5, 0.0, 0.5), "size": (24, 16)}},
@@ -118,8 +124,7 @@ def test_stable_baselines_learns_from_pictures():
 
     from plab.envs.sb3 import make_sb3
 
-    overrides = [*COARSE, "sim.horizon=4"]
-    envs = make_sb3("plab/Move-v1", 2, overrides=overrides, observe=["state", "rgb"])
+    envs = make_sb3("plab/Move-v1", 2, overrides=COARSE, observe=["state", "rgb"])
     model = PPO("MultiInputPolicy", envs, n_steps=4, batch_size=8, n_epochs=1).learn(16)
     assert model.num_timesteps == 16 and set(envs.observation_space) == {"state", "front_rgb"}
 

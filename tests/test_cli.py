@@ -99,12 +99,6 @@ def test_an_experiment_is_a_sweep(seen):
     assert [(cfg.task.yield_stress, cfg.seed) for cfg in seen] == [(10, 0), (10, 1), (20, 0), (20, 1)]
 
 
-def test_a_sweep_goes_on_after_a_refused_job(seen, capsys):
-    assert main(["-m", "variant=1,9,2"]) == 2
-    assert [cfg.variant for cfg in seen] == ["1", "2"]
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def failing(error: BaseException) -> Callable[..., float]:
     def fail(cfg: Config) -> float:
         raise error

@@ -23,7 +23,6 @@ from plab.targets.store import TargetStore
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "examples" / "own_materials" / "conf"
 PAGE = (ROOT / "docs" / "own_materials.md").read_text(encoding="utf-8")
-QUICK = ("sim.grid_size=16", "sim.dt=4e-4", "sim.substeps=5", "sim.horizon=2", "sim.particles_scale=0.05")
 RUBBER = {"youngs_modulus": 2000.0, "poisson_ratio": 0.3, "yield_stress": math.inf}
 
 

@@ -7,37 +7,22 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import reference_mpm as ref
-from plab.scenes import Body, Manipulator, Scene
+from plab.scenes import Body, Scene
 
 torch.set_num_threads(1)
 
 IDENTITY = torch.eye(3, dtype=torch.float64)
-TILT = (0.8, 0.36, -0.48, 0.0)  # a unit quaternion about no particular axis
-MANIPULATORS = {
-    "Sphere": Manipulator("Sphere", (0.08,), (0.5, 0.62, 0.5), TILT, (0.05,) * 3),
-    "Capsule": Manipulator("Capsule", (0.2, 0.05), (0.5, 0.62, 0.5), TILT, (0.05,) * 3, friction=0.0),
-    "RollingPin": Manipulator(
-        "RollingPin", (0.3, 0.06), (0.5, 0.62, 0.5), (0.6, 0.8, 0.0, 0.0), (0.7, 0.1, 0.04)
-    ),
-    "Chopsticks": Manipulator(
-        "Chopsticks", (0.2, 0.05), (0.52, 0.66, 0.5), TILT, (0.05,) * 3 + (0.2,) * 3 + (0.05,), gap=0.16
-    ),
-    "Torus": Manipulator("Torus", (0.09, 0.05), (0.5, 0.62, 0.5), TILT, (0.05,) * 3),
-    "Cylinder": Manipulator("Cylinder", (0.08, 0.1), (0.5, 0.64, 0.5), TILT),
-    "Box": Manipulator("Box", (0.08, 0.05, 0.1), (0.5, 0.62, 0.5), TILT, (0.05,) * 3 + (0.2,) * 3),
-}
 
 
-def make_scene(*shapes: str, **changes: object) -> Scene:
-    """A block of 40 particles in mid-air on a coarse grid, with the named manipulators at its top."""
+def make_scene(**changes: object) -> Scene:
+    """A block of 40 particles in mid-air on a coarse grid."""
     scene = Scene(
         "test",
         bodies=(Body("box", (0.5, 0.5, 0.5), (0.25, 0.2, 0.25), 40),),
-        manipulators=tuple(MANIPULATORS[s] for s in shapes),
+        manipulators=(),
         grid_size=16,
         dt=4e-4,
         substeps=3,
@@ -91,35 +76,6 @@ def test_stress_is_the_derivative_of_the_fixed_corotated_energy() -> None:
     (P,) = torch.autograd.grad(strain_energy + volume_energy, F)
     U, _, Vt = ref.proper_svd(F)
     torch.testing.assert_close(ref.kirchhoff_stress(scene, F, U @ Vt), P @ F.mT, rtol=1e-10, atol=1e-9)
-
-
-H = math.sqrt(0.5)
-# A pin along z, turned by 90 degrees about x.
-PIN = Manipulator("RollingPin", (0.3, 0.03), (0.5, 0.2, 0.5), (H, H, 0.0, 0.0), (0.6, 0.09, 0.003))
-STICKS = replace(MANIPULATORS["Chopsticks"], rotation=(1.0, 0.0, 0.0, 0.0), minimal_gap=0.15)
-BOX = replace(MANIPULATORS["Box"], upper_bound=(0.51, 1.0, 1.0))
-# Manipulator and action, then by hand: position, rotation as a vector of the world's frame, gap.
-MOTIONS = (
-    # Rolls along x about its own axis, and moves up; yaws about the world's y.
-    (PIN, (0.5, 0.0, 2.0), (0.497, 0.201, 0.5), (0.0, 0.0, 0.1), 0.06),
-    (PIN, (0.0, 1.0, 0.0), (0.5, 0.2, 0.5), (0.0, -0.03, 0.0), 0.06),
-    # Close, to the minimal gap, and rotate in their own frame.
-    (STICKS, (0.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.3), (0.52, 0.66, 0.5), (0.0, 0.04, 0.0), 0.155),
-    (STICKS, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.52, 0.66, 0.5), (0.0, 0.0, 0.0), 0.15),
-    # Rotates in the world's frame, and stays within its bounds.
-    (BOX, (1.0, -0.6, 0.0, 0.0, 1.0, 0.0), (0.51, 0.61, 0.5), (0.0, 0.2 / 3, 0.0), 0.06),
-)
-
-
-@pytest.mark.parametrize(("manipulator", "action", "position", "turn", "gap"), MOTIONS)
-def test_motion_by_hand(manipulator: Manipulator, action, position, turn, gap: float) -> None:
-    scene = make_scene(manipulators=(manipulator,))
-    start = ref.initial_state(scene).poses[0]
-    moved = ref.move_manipulators(scene, start[None], torch.tensor(action, dtype=torch.float64))[0]
-    expected = torch.tensor([*position, gap], dtype=torch.float64)
-    torch.testing.assert_close(torch.cat([moved[:3], moved[7:]]), expected, rtol=0, atol=1e-14)
-    axes = ref.rotate(start[3:7], IDENTITY) @ torch.tensor(Rotation.from_rotvec(turn).as_matrix().T)
-    torch.testing.assert_close(ref.rotate(moved[3:7], IDENTITY), axes, rtol=0, atol=1e-14)
 
 
 def test_hard_and_soft_contact_by_hand() -> None:

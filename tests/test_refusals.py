@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -33,7 +30,6 @@ from plab.results import load
 from plab.sim import Simulator
 from suite import scene
 
-ROOT = Path(__file__).parents[1]
 MISSING = graphics.missing_graphics
 
 
@@ -266,24 +262,3 @@ def test_missing_extras(refused, monkeypatch, package, extra, entry, argv):
     monkeypatch.setattr(graphics, "missing_graphics", MISSING.__wrapped__)
     monkeypatch.setitem(sys.modules, package, None)
     assert f"plab[{extra}]" in refused(argv.split(), entry)
-
-
-def printing_to(output: object, folder: Path, *argv: str) -> tuple[int, str]:
-    """Exit code and standard error of a command line with a standard output of its own."""
-    command = [sys.executable, "-m", *argv]
-    done = subprocess.run(command, cwd=folder, stdout=output, stderr=subprocess.PIPE, text=True, check=False)
-    return done.returncode, done.stderr
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_outputs_that_close_or_are_full(tmp_path):
-    (tmp_path / "results").mkdir()
-    for argv in (("plab.status", "--json"), ("plab.run", "--help")):
-        reading, writing = os.pipe()
-        os.close(reading)
-        assert printing_to(writing, tmp_path, *argv) == (141, "")
-        os.close(writing)
-    with open("/dev/full", "w") as full:
-        code, line = printing_to(full, tmp_path, "plab.status", "--json")
-    assert code == 2 and line.count("\n") == 1 and "No space left" in line

@@ -291,11 +291,6 @@ def test_missing_packages_and_drivers_are_named(monkeypatch, told):
     monkeypatch.delenv("VTK_DEFAULT_OPENGL_WINDOW", raising=False)
     monkeypatch.setattr("plab.render.pictures.find_spec", lambda wanted: None)
     assert "imageio-ffmpeg" in told("task=Rope", "--output", "rope.mp4")
-    for package, name in (("pyvista", "PyVista"), ("PIL", "Pillow")):
-        graphics.missing_graphics.cache_clear()
-        monkeypatch.setattr(graphics, "find_spec", lambda wanted, gone=package: wanted != gone or None)
-        line = told("task=Rope")
-        assert name in line and "plab[render]" in line
 
     def no_library(name: str) -> None:
         raise OSError(name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import urllib.parse
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ from plab.cli.report import main
 from plab.config.selection import select
 from plab.render.graphics import missing_graphics
 from plab.report.collect import NAMES, collect
-from plab.report.media import best_runs, present
+from plab.report.media import best_runs
 from plab.report.methods import method
 from plab.report.statistics import interquartile_mean, shared_strata
 from plab.results import load
@@ -162,34 +161,3 @@ def test_page_in_a_browser(browser, results: Path, tmp_path: Path) -> None:
     sent = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [one["params"]["request"]["url"] for one in sent if one["method"] == "Network.requestWillBeSent"]
     assert asked and {urllib.parse.urlsplit(url).scheme for url in asked} == {"file"}
-
-
-@pytest.mark.nightly
-@drawing
-def test_pictures_are_drawn_once_and_replaced_by_better_ones(tmp_path: Path, monkeypatch) -> None:
-    results, out = tmp_path / "results", tmp_path / "page"
-    seen: list[bool] = []
-    replays = import_module("plab.render.pictures")
-    save = replays.save_set
-
-    def looking(*arguments):
-        # The page is there before its pictures.
-        seen.append(content(out / "index.html")["live"])
-        save(*arguments)
-
-    monkeypatch.setattr(replays, "save_set", looking)
-    coarse_run(results, "1", "adam", 0, 0.3)
-    for _ in range(2):
-        page = write(results, out)
-    (shown,) = best_runs(collect(results, select(["task=Rope"], NAMES)))
-    made = present(shown, out)
-    assert set(made) == {"start", "target", "adam", "adam film"}
-    assert all((out / path).is_file() for path in made.values())
-    assert seen == [True] and not content(page)["live"]
-    assert [one["name"] for one in content(page)["configurations"] if one["pictures"]] == ["Rope-v1"]
-    (before,) = (out / "media").iterdir()
-    coarse_run(results, "1", "adam", 1, 0.4)
-    monkeypatch.setattr(replays, "save_set", lambda found, folder, *_: (folder / "start.webp").touch())
-    write(results, out)
-    (after,) = (out / "media").iterdir()
-    assert after.name != before.name

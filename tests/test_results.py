@@ -84,6 +84,7 @@ def test_hash_and_path_depend_on_what_can_change_a_result(tmp_path: Path) -> Non
     same = (
         {"force": True},
         {"progress": True},
+        {"logger": "wandb"},
         {"sim": sim | {"memory_mb": 7.0}},
         {"task": task | {"release": {"horizon": 9}}},
         # The contact term acts by what the method says.

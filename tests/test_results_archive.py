@@ -124,6 +124,7 @@ def test_command_line(folder: Path, tmp_path: Path, told, capsys) -> None:
     assert "2 run(s)" in capsys.readouterr().out
     assert set(load(archive)["status"]) == {"finished", "stopped"}
     assert main(["unpack", archive, "--output", str(tmp_path / "out")]) == 0
+    # A finished run and one that has stopped.
     assert main(["check", str(tmp_path / "out"), archive]) == 0
     for word, named in (("task=Nothing", "Nothing"), ("tusk=Rope", "tusk")):
         assert named in told(["pack", str(folder), word, "--output", archive], main)
@@ -149,14 +150,6 @@ def problem(path: Path) -> str:
     """Return the problem found in a file; empty if there is none."""
     ((_, found),) = check(path)
     return "" if found is None else found.reason
-
-
-def test_good_files_pass(tmp_path: Path) -> None:
-    for method in ("adam", "sac"):
-        result = synthetic.run(tmp_path, method=method)
-        assert problem(synthetic.save(result)) == ""
-        begun = dataclasses.replace(result, status="stopped", evaluation={})
-        assert problem(synthetic.save(begun)) == ""
 
 
 def _table(run: RunResult, name: str, row: int, value: float) -> RunResult:

@@ -25,7 +25,7 @@ from plab.config import load_config
 from plab.config.suite import suite_tasks
 from plab.report.reference import paper_table
 from plab.submissions import submission
-from plab.submissions.board import board
+from plab.submissions.board import Board, board
 from plab.submissions.submission import (
     UNSEEN,
     Card,
@@ -126,33 +126,17 @@ def test_round_trip_of_policies(tmp_path: Path) -> None:
     assert "plans and policies" in why(read, made)
 
 
-def test_damaged_files(path: Path) -> None:
+def test_files_that_are_damaged_or_lead_elsewhere(path: Path) -> None:
     whole = path.read_bytes()
     for content in (whole[:-30], b"", b"not a zip file at all", whole[:200] + bytes(200) + whole[400:]):
         path.write_bytes(content)
         assert str(path) in why(read, path)
+    for name, named in (("../out", "'../out'"), ("secret", "no manifest.json")):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(name, b"/etc/passwd")
+        assert named in why(read, path)
     path.unlink()
     assert str(path) in why(read, path)
-
-
-def test_members_that_are_refused(path: Path) -> None:
-    def line(name: str, mode: str = "w") -> str:
-        info = zipfile.ZipInfo("x")
-        info.filename = name
-        with zipfile.ZipFile(path, mode) as archive:
-            archive.writestr(info, b"/etc/passwd")
-        return why(read, path)
-
-    with pytest.warns(UserWarning, match="Duplicate name"):
-        assert "two members 'card.yaml'" in line("card.yaml", mode="a")
-    for name in ("/etc/passwd", "../out", "a/../../b", "C:/x"):
-        assert repr(name) in line(name)
-    assert "no manifest.json" in line("secret")
-    content = bytearray(path.read_bytes())
-    place = content.index(b"PK\x01\x02") + 8
-    content[place : place + 2] = struct.pack("<H", 1)
-    path.write_bytes(content)
-    assert "encrypted" in why(read, path)
 
 
 def test_sizes_are_bounded_before_anything_is_unpacked(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -354,8 +338,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_scores_are_means_of_whole_tables_within_budgets(folder: Path) -> None:
-    sections = {section.title: section for section in board(folder).sections}
+@pytest.fixture(scope="module")
+def leaders(folder: Path) -> Board:
+    return board(folder)
+
+
+def test_scores_are_means_of_whole_tables_within_budgets(leaders: Board) -> None:
+    sections = {section.title: section for section in leaders.sections}
     lines = {line.card.name: line for line in sections["plab's suite"].lines}
     plans = lines["plans"]
     assert plans.status == "verified" and plans.covered == 2
@@ -370,10 +359,10 @@ def test_scores_are_means_of_whole_tables_within_budgets(folder: Path) -> None:
     assert unseen.score == pytest.approx(0.6 / 100) and sections["Unseen configurations"].expected == 100
 
 
-def test_what_does_not_belong_is_left_out_with_a_reason(folder: Path) -> None:
+def test_what_does_not_belong_is_left_out_with_a_reason(leaders: Board, folder: Path) -> None:
     reasons = {"believed": "verify", "deep": "JSON", "foreign": "scene of Move-v1", "liar": "1 claim"}
     reasons |= {"recording": "card", "rubbish": "zip"}
-    for line, (name, reason) in zip(sorted(board(folder).left_out), reasons.items(), strict=True):
+    for line, (name, reason) in zip(sorted(leaders.left_out), reasons.items(), strict=True):
         assert line.startswith(str(folder / f"{name}.")) and reason in line
 
 
@@ -393,8 +382,8 @@ def test_verification_is_kept_beside_the_file_and_is_of_its_bytes(folder: Path, 
     assert "plans.verified.json" in why(read_verification, read(path))
 
 
-def test_the_paper_and_own_runs_are_the_first_entries(tmp_path: Path) -> None:
-    sections = {section.title: section for section in board(tmp_path).sections}
+def test_the_paper_and_own_runs_are_the_first_entries(leaders: Board) -> None:
+    sections = {section.title: section for section in leaders.sections}
     paper = sections["The paper's table"]
     lines = {(line.card.name, line.status): line for line in paper.lines}
     assert len(lines) == len(paper.lines) == 9
@@ -405,10 +394,8 @@ def test_the_paper_and_own_runs_are_the_first_entries(tmp_path: Path) -> None:
     assert [value is None for value in lines["SAC", "printed"].budgets] == [True, True, True, False]
     assert [value is None for value in lines["Adam", "printed"].budgets] == [True, False, False, False]
     assert lines["Adam", "own runs"].covered == 50
-    own = sections["plab's suite"].lines
-    assert {(line.card.name, line.status, line.covered) for line in own} == {
-        (name, "own runs", 50) for name in ("Adam", "GD", "Adam-H")
-    }
+    own = [line for line in sections["plab's suite"].lines if line.status == "own runs"]
+    assert {(line.card.name, line.covered) for line in own} == {(n, 50) for n in ("Adam", "GD", "Adam-H")}
     assert all(value is not None for value in own[0].tasks)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from dataclasses import replace
@@ -313,27 +312,6 @@ def test_wandb_is_given_finite_numbers_by_their_steps(tmp_path: Path, monkeypatc
     quiet = RunLog(replace(cfg, logger="none"), run)
     quiet.write({"loss": 1.0}, 0)
     assert not quiet.wanted and len(began) == 2
-
-
-@pytest.mark.nightly
-def test_wandb_gets_the_rows(tmp_path: Path, monkeypatch) -> None:
-    wandb = pytest.importorskip("wandb")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    wandb.teardown()
-    result = run(make_config(tmp_path, "logger=wandb"))
-    # Its own process writes the files.
-    wandb.teardown()
-    name = f"Rope-v1-adam-{result.path.stem}"
-    written = next((tmp_path / "wandb").glob(f"offline-run-*/run-{name}.wandb")).read_bytes()
-    for value in (*result.iterations["loss"], *result.evaluation.values()):
-        assert json.dumps(value).encode() in written
-
-
-def test_the_logger_is_no_part_of_the_hash(tmp_path: Path) -> None:
-    cfgs = [make_config(tmp_path, f"logger={name}") for name in ("none", "tensorboard", "wandb")]
-    assert len({cfg.path for cfg in cfgs}) == 1
-    with pytest.raises(ConfigError, match="logger 'mlflow'"):
-        make_config(tmp_path, "logger=mlflow")
 
 
 # ---------------------------------------------------------------- policies: apg

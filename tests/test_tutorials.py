@@ -177,16 +177,6 @@ def test_a_method_of_ones_own(tmp_path):
     assert refused.stderr.count("\n") == 1
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_other_processes_find_the_module_of_a_method(tmp_path, launcher):
-    pytest.importorskip(launcher.partition("_")[0])
-    words = ("seed=0,1", f"hydra/launcher=batch_{launcher}")
-    done = python(tmp_path, "-m", "plab.run", "-m", *SEARCH, *words)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "2 runs: 2 finished, 0 finished before"
-
-
 def test_an_interrupted_search_goes_on(tmp_path):
     def result(folder: str) -> RunResult:
         words = [*SEARCH[2:], "progress=false", f"results_dir={tmp_path / folder}"]
