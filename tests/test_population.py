@@ -286,7 +286,7 @@ def test_replay_buffer_of_agents_goes_on_from_its_file(tmp_path: Path, buffer_si
     rows = torch.cat([observations[first], actions, observations[first + 1], rewards], dim=3)
 
     def empty() -> ReplayBuffer:
-        return ReplayBuffer(agents, sizes, min(10, buffer_size // 8 + 1), window, torch.device("cpu"))
+        return ReplayBuffer(agents, sizes, buffer_size, 80, torch.device("cpu"))
 
     def add(replay: ReplayBuffer, step: int) -> None:
         now, after = observations[first[step]], observations[first[step] + 1]

@@ -1,5 +1,4 @@
-"""Training of a policy through the simulator's gradient: keys, networks, state and scenes of ``shac`` and
-``pods``."""
+"""Training of one policy: networks, state and drawn scenes, as ``shac``, ``pods`` and ``bc`` have them."""
 
 from __future__ import annotations
 
@@ -190,7 +189,7 @@ class ActorTraining(Training):
 
 
 class ActorRunner(PolicyRunner):
-    """Trains a policy where the simulator is, in the run's scene or in drawn ones."""
+    """Base of the runners that train a policy by the gradient, in the run's scene or in drawn ones."""
 
     def require_torch_device(self) -> None:
         """Raise ConfigError if torch does not have the device, or it is not the simulator's."""
@@ -202,7 +201,6 @@ class ActorRunner(PolicyRunner):
             )
 
     def training_configs(self) -> list[Config]:
-        """Return the scenes of the first turn."""
         return training_scenes(self.tracks[0].cfg, self.method, self.method.num_envs)
 
 

@@ -175,7 +175,7 @@ class Agents:
 
     @classmethod
     def cycle_steps(cls, method: Any, horizon: int) -> int:
-        """Return after how many transitions training can pause: a batch of episodes, or an update."""
+        """Return the transitions after which training can pause: a batch of episodes, or an update."""
         return method.num_envs * horizon
 
     def begin(self, observations: Tensor) -> None:
@@ -192,7 +192,7 @@ class Agents:
 
     @abstractmethod
     def learn(self, rewards: Tensor, last: Tensor, observations: Tensor, *, over: bool) -> None:
-        """Take what the latest actions led to, rewards, shape [agent, env], and the observations after it,
+        """Take the results of the latest actions, rewards, shape [agent, env], and the observations after it,
         shape [agent, env, entry]; make the updates that are due. The next step starts from
         ``observations``, which are the last ones unless the episodes are ``over``."""
 
@@ -252,9 +252,8 @@ class OffPolicyAgents(Agents):
 
     def __init__(self, cfgs: Sequence[Config], spaces: Spaces, device: torch.device) -> None:
         super().__init__(cfgs, spaces, device)
-        window = max(self.method.buffer_size // self.sizes.envs, 1)
-        capacity = self.sizes.capacity(self.method, self.total_steps)
-        self.replay = ReplayBuffer(self.count, self.sizes, capacity, window, device)
+        size = self.method.buffer_size
+        self.replay = ReplayBuffer(self.count, self.sizes, size, self.total_steps, device)
 
     @abstractmethod
     def explore(self, observations: Tensor, noise: Tensor) -> Tensor:

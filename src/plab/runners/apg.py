@@ -45,7 +45,7 @@ class ApgConfig(MethodConfig):
 
 
 class ApgRunner(Runner):
-    """Trains a policy network; each iteration is an episode of it, with gradient."""
+    """Runner of a policy network; each iteration is an episode of it, with gradient."""
 
     @property
     def method(self) -> ApgConfig:
@@ -53,11 +53,9 @@ class ApgRunner(Runner):
         return self.tracks[0].cfg.method_as(ApgConfig)
 
     def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
         return torch_settings(self.method.torch_threads)
 
     def build(self) -> None:
-        """Make the environment."""
         (self._episode,) = shared_batches(self.cache, ([self.tracks[0].cfg], self.method.contact))
         self.problem = self._episode.problem
 

@@ -138,7 +138,7 @@ class PodsTraining(Imitation):
 
 
 class PodsRunner(ActorRunner):
-    """Trains a policy; each iteration is some rounds, then one episode of the policy."""
+    """Runner of a policy; each iteration is some rounds, then one episode of the policy."""
 
     training = PodsTraining
 

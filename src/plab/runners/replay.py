@@ -14,12 +14,10 @@ from plab.runners.libraries import torch
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from plab.runners.agents import OffPolicyConfig
-
 
 class Sizes(NamedTuple):
-    """Of an agent's episodes: environments N, steps T of an episode, entries of an observation, components
-    of an action."""
+    """Sizes of an agent's episodes: environments N, steps T, entries of an observation, components of an
+    action."""
 
     envs: int
     horizon: int
@@ -31,11 +29,15 @@ class Sizes(NamedTuple):
         """Numbers, all float32, of one episode in all N environments."""
         return self.envs * ((self.horizon + 1) * self.observed + self.horizon * (self.actions + 1))
 
-    def capacity(self, method: OffPolicyConfig, total_steps: int) -> int:
-        """Return how many episodes of N environments a buffer holds, in a training of so many transitions."""
-        window = max(method.buffer_size // self.envs, 1)
+    def window(self, buffer_size: int) -> int:
+        """Return the latest steps of N environments that can be sampled from so many transitions."""
+        return max(buffer_size // self.envs, 1)
+
+    def capacity(self, buffer_size: int, total_steps: int) -> int:
+        """Return the episodes of N environments that a buffer holds, in a training of so many transitions."""
         # One more: the oldest that can be sampled begin within an episode, as the latest end within one.
-        return min(math.ceil(total_steps / self.envs / self.horizon), math.ceil(window / self.horizon) + 1)
+        held = math.ceil(self.window(buffer_size) / self.horizon) + 1
+        return min(math.ceil(total_steps / self.envs / self.horizon), held)
 
 
 class Samples(NamedTuple):
@@ -54,11 +56,13 @@ class ReplayBuffer:
         added: Steps of all N environments that were added, the overwritten ones included.
     """
 
-    def __init__(self, agents: int, sizes: Sizes, capacity: int, window: int, device: torch.device) -> None:
-        """Make room for ``capacity`` episodes of each agent; of the steps of N environments the last
-        ``window`` can be sampled."""
+    def __init__(
+        self, agents: int, sizes: Sizes, buffer_size: int, total_steps: int, device: torch.device
+    ) -> None:
+        """Make room for the latest transitions of each agent, in a training of so many."""
         self.added = 0
-        self._agents, self._sizes, self._capacity, self._window = agents, sizes, capacity, window
+        self._agents, self._sizes, self._window = agents, sizes, sizes.window(buffer_size)
+        self._capacity = capacity = sizes.capacity(buffer_size, total_steps)
         n, horizon = sizes.envs, sizes.horizon
         shape = agents, capacity
         self._observations = torch.empty((*shape, horizon + 1, n, sizes.observed), device=device)

@@ -75,7 +75,7 @@ class Population(Training):
         spaces = Spaces.of(batch)
         if isinstance(method, OffPolicyConfig):
             sizes = Sizes(method.num_envs, batch.horizon, *spaces.sizes)
-            each = 4 * sizes.entries * sizes.capacity(method, self.total_steps)
+            each = 4 * sizes.entries * sizes.capacity(method.buffer_size, self.total_steps)
             _require_memory(len(cfgs), each, method.torch_device, cfgs[0].sim.memory_mb * 1e6)
         size = len(cfgs) if self._device.type == "cuda" else 1
         parts = [cfgs[k : k + size] for k in range(0, len(cfgs), size)]
@@ -208,12 +208,11 @@ def _require_memory(count: int, each: float, device: str, memory: float) -> None
 
 
 class RlRunner(PolicyRunner):
-    """Trains agents side by side."""
+    """Runner of agents, side by side."""
 
     training = Population
 
     def context(self) -> AbstractContextManager[Any]:
-        """Give torch its settings."""
         return population_settings(self.method)
 
 

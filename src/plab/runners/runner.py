@@ -85,7 +85,7 @@ class Runner:
         return track.iteration < self.iterations(track)
 
     def iterations(self, track: Track) -> int:
-        """Return how many iterations a run has."""
+        """Return the number of a run's iterations."""
         return cast(int, row_count(asdict(track.cfg.method)))
 
     def iterate(self, tracks: Sequence[Track]) -> Iterator[tuple[Track, Step]]:
@@ -337,7 +337,7 @@ def measures(result: Episodes, environment: int = 0) -> dict[str, float]:
 
 
 def episode_columns(term_names: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of what an episode is measured by, for a loss of these terms."""
+    """Return the columns of an episode's measures, for a loss of these terms."""
     first, *rest = COLUMNS
     return (first, *(f"loss_{name}" for name in term_names), *rest)
 

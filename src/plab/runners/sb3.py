@@ -38,7 +38,7 @@ from plab.runners.training import Learned, PolicyRunner, Training
 
 @dataclass(frozen=True)
 class ModelKind:
-    """A learning algorithm and how a configuration becomes its arguments.
+    """A learning algorithm, and the arguments that a configuration gives it.
 
     Attributes:
         model: Class with the interface of Stable-Baselines3's algorithms.
@@ -100,7 +100,7 @@ class Sb3Training(Training):
         self._env = VecMonitor(envs)
         arguments = self._kind.arguments(method, self._env)
         if isinstance(method, OffPolicyConfig):
-            kept = {"sizes": self._sizes, "capacity": self._sizes.capacity(method, self.total_steps)}
+            kept = {"sizes": self._sizes, "total_steps": self.total_steps}
             arguments |= {"replay_buffer_class": _Replay, "replay_buffer_kwargs": kept}
         self._device = device = method.torch_device
         self.model = self._kind.model("MlpPolicy", self._env, seed=cfg.seed, device=device, **arguments)
@@ -193,7 +193,7 @@ class Sb3Training(Training):
 
 
 class Sb3Runner(PolicyRunner):
-    """Trains a model."""
+    """Runner of a model."""
 
     training = Sb3Training
 
@@ -214,14 +214,13 @@ class _Replay(LibraryBuffer):
         n_envs: int = 1,
         *,
         sizes: Sizes,
-        capacity: int,
+        total_steps: int,
         **options: Any,
     ) -> None:
         # The base class allocates arrays of its own, here of one row each.
         super().__init__(n_envs, observation_space, action_space, device, n_envs, **options)
-        window = max(buffer_size // n_envs, 1)
         # The library's save makes a list of the tuple.
-        self.kept = ReplayBuffer(1, Sizes(*sizes), capacity, window, torch.device(self.device))
+        self.kept = ReplayBuffer(1, Sizes(*sizes), buffer_size, total_steps, torch.device(self.device))
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
         parts = (obs, action, reward, next_obs)
@@ -239,7 +238,7 @@ class _Replay(LibraryBuffer):
 
 
 class _Watch(BaseCallback):
-    """Follows the training step by step."""
+    """Callback of every step of the training."""
 
     def __init__(self, training: Sb3Training) -> None:
         super().__init__()

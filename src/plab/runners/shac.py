@@ -153,8 +153,7 @@ class ShacTraining(ActorTraining):
 
 
 class ShacRunner(ActorRunner):
-    """Trains policy and value function; each iteration is some episodes of training, then one of the
-    deterministic policy."""
+    """Runner of policy and value function."""
 
     training = ShacTraining
 

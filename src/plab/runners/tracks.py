@@ -1,4 +1,4 @@
-"""Runs of a batch and how each ended: tracks that runners move on, and outcomes that a sweep reports."""
+"""Runs of a batch: tracks, which runners move on, and outcomes, which a sweep reports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from plab.runners.loggers import RunLog
 
 
 class RunError(PlabError, RuntimeError):
-    """A run that cannot go on; the message says in which iteration and why."""
+    """A run that cannot go on; the message has iteration and reason."""
 
     exit_code = 1
 
@@ -135,7 +135,7 @@ class Track:
         return f"{text} in the hard contact model ({shown:.4f} in the {self.contact} one of its iterations)"
 
     def outcome(self) -> Outcome:
-        """Return how the run ended."""
+        """Return the end of the run."""
         error = self.error
         if error is None:
             status = "before" if self.finished_before else "finished"

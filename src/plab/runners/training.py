@@ -210,7 +210,7 @@ def whole_cycles(steps: int, cycle: int) -> int:
 
 
 class PolicyRunner(Runner):
-    """Trains policies side by side; each iteration is some episodes of training, then one of each policy.
+    """Runner of policies, side by side; each iteration is some episodes of training, then one of each policy.
 
     The runs stand at the same evaluation; once one has failed, the others begin again without it.
 
@@ -230,7 +230,6 @@ class PolicyRunner(Runner):
         return self.tracks[0].cfg.method
 
     def context(self) -> AbstractContextManager[Any]:
-        """Give torch its threads."""
         return torch_settings(self.method.torch_threads)
 
     def require_torch_device(self) -> None:
@@ -324,12 +323,12 @@ class PolicyRunner(Runner):
             )
 
     def extent(self) -> tuple[int, int, int]:
-        """Return how many episodes of training there are, and after how many there is an evaluation."""
+        """Return episodes done and in all, and those between two evaluations."""
         total = self.policies.total_steps // self.policies.batch.horizon
         return self.policies.episodes, total, self.method.evaluate_every
 
     def tell(self, rows: Sequence[Mapping[str, float]], tracks: Sequence[Track]) -> None:
-        """Report how the policies do on average, and the transitions of all per second."""
+        """Report reward and score on average, and the transitions of all policies per second."""
         reward, score = (np.mean([row[name] for row in rows]) for name in ("reward", "score"))
         mean = "" if len(rows) == 1 else "mean "
         self._shown = f"{mean}reward {reward:.4g} hard score {score:.3f}"

@@ -60,7 +60,7 @@ class TrajectoryConfig(MethodConfig):
 
 
 class TrajectoryRunner(Runner):
-    """Optimises a sequence of actions per run; each iteration is one rollout of all, with gradient.
+    """Runner of a sequence of actions per run; each iteration is one rollout of all, with gradient.
 
     A run whose loss, gradient or state stops being finite breaks off, and the others go on.
     """

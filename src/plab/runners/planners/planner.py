@@ -117,7 +117,7 @@ class CandidateStart:
     """
 
     def __init__(self, scene: Scene, target: np.ndarray, device: torch.device) -> None:
-        """Take note of scene and target, a mass tensor of shape [n, n, n]."""
+        """Keep scene and target, a mass tensor of shape [n, n, n]."""
         from plab.runners.planners.starts import ContactStarts
 
         self.shape, self.device = (scene.horizon, scene.action_dim), device
@@ -135,7 +135,7 @@ class CandidateStart:
 
 
 class Planner(ABC):
-    """A run's search. A subclass says how it begins and what an iteration is.
+    """A run's search; subclasses define its beginning and an iteration.
 
     Attributes:
         method: Its numbers.
@@ -145,7 +145,6 @@ class Planner(ABC):
     """
 
     def __init__(self, method: PlannerConfig, start: CandidateStart) -> None:
-        """Take note of what to do; nothing is drawn yet."""
         self.method, self.start = method, start
         self.memory: dict[str, Tensor] = {}
         self.iteration = 0
@@ -161,7 +160,7 @@ class Planner(ABC):
 
     @abstractmethod
     def iterate(self, random: torch.Generator) -> Asking:
-        """Do an iteration: ask for candidates to be tried, and return what it is told by."""
+        """Do an iteration: ask for candidates to be tried, and return the best one."""
 
     @abstractmethod
     def candidates(self) -> Tensor:
@@ -262,7 +261,7 @@ class Stages:
 
 
 class PlannerRunner(Runner):
-    """Tries the candidates of all runs of a batch together.
+    """Runner that tries the candidates of all runs of a batch together.
 
     The simulator has as many environments per run as the smallest population, or fewer if the memory has no
     room for more; what is more than that is tried one part after the other. A run ends when its score is the
@@ -289,7 +288,7 @@ class PlannerRunner(Runner):
         self._planners: dict[int, Any] = {}
 
     def start(self, track: Track, state: Mapping[str, Any] | None) -> None:
-        """Make the run's planner, as the file knows it if it does."""
+        """Make the run's planner, or restore it from the file."""
         number = track.number
         start = CandidateStart(self.problem.scenes[number], self.problem.target_mass[number], self._device)
         planner = self._planners[number] = make_planner(track.cfg.method, start)
@@ -372,7 +371,7 @@ class PlannerRunner(Runner):
         """Try as many candidates of each run as there are environments for, from candidate ``begin`` on.
 
         Returns:
-            What they gave by name, shape [candidate, run, ...]; in ``reasons``, by run, why one broke off.
+            Results by name, shape [candidate, run, ...]; ``reasons`` gets a reason per run with failures.
         """
         width, runs = self._width, len(self.tracks)
         tried = torch.zeros((width, runs, *first.actions.shape[1:]), dtype=torch.float64, device=self._device)

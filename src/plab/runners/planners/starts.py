@@ -62,10 +62,10 @@ def support(tool: Manipulator, direction: np.ndarray) -> float:
 
 
 class ContactStarts:
-    """Draws starts for a scene and its target."""
+    """Starts for a scene and its target."""
 
     def __init__(self, scene: Scene, target: np.ndarray) -> None:
-        """Take note of the scene, and of the target's mass tensor, shape [n, n, n]."""
+        """Keep the scene and the target's mass tensor, shape [n, n, n]."""
         self._scene, self._target = scene, target
         self._tools = [m for m in scene.tools if m.action_dim]
 
