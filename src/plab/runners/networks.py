@@ -7,7 +7,7 @@ launching them one by one from Python. On CUDA it is recorded once as a graph an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from plab.runners.libraries import torch
 
@@ -143,14 +143,6 @@ WARM_UP = 3
 """Updates before the first recording: libraries and optimisers allocate what they need."""
 
 
-class _Recording(NamedTuple):
-    """A graph, the tensors that it takes for its arguments, and the one that it returns."""
-
-    graph: torch.cuda.CUDAGraph
-    arguments: tuple[Tensor, ...]
-    result: Tensor
-
-
 class CapturedUpdate:
     """An update of a model, on CUDA recorded once for each shape of its arguments and replayed from then on.
 
@@ -161,7 +153,8 @@ class CapturedUpdate:
     def __init__(self, update: Callable[..., Tensor]) -> None:
         """Take over an update, a function of tensors that returns one."""
         self._update = update
-        self._recordings: dict[tuple[torch.Size, ...], _Recording] = {}
+        # By the arguments' shapes: a graph, the tensors that it takes, and the one that it returns.
+        self._recordings: dict[Any, tuple[torch.cuda.CUDAGraph, tuple[Tensor, ...], Tensor]] = {}
         self._calls = 0
 
     def __call__(self, *arguments: Tensor) -> Tensor:
@@ -189,12 +182,12 @@ class CapturedUpdate:
         current.wait_stream(stream)
         return result
 
-    def _record(self, *arguments: Tensor) -> _Recording:
+    def _record(self, *arguments: Tensor) -> tuple[torch.cuda.CUDAGraph, tuple[Tensor, ...], Tensor]:
         own = tuple(argument.clone() for argument in arguments)
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph):
             result = self._update(*own)
-        return _Recording(graph, own, result)
+        return graph, own, result
 
 
 def require_capturable(optimizer: Optimizer, lr: float) -> None:
